@@ -61,8 +61,8 @@ DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
   }
   const median = (at) => taken.map((times) => times[at]).sort((a, b) => a - b)[Math.floor(taken.length / 2)];
   const info = gl.getExtension('WEBGL_debug_renderer_info');
-  return { card: info === null ? 'unknown' : gl.getParameter(info.UNMASKED_RENDERER_WEBGL), sumMs: median(0), wholeMs: median(1),
-    gpuMs: renderer.timer.figures().gpuMs, lit: pixel[0] > 0 };
+  return { card: info === null ? 'unknown' : gl.getParameter(info.UNMASKED_RENDERER_WEBGL), pictures: taken.length,
+    sumMs: median(0), wholeMs: median(1), gpuMs: renderer.timer.figures().gpuMs, lit: pixel[0] > 0 };
 }"""
 
 
@@ -114,6 +114,7 @@ def frame_rate(browser: str | None, *, side: int, layers: int, seconds: float, s
     gpu = "not told by this browser" if found["gpuMs"] is None else f"{found['gpuMs']:.2f} ms"
     return [f"graphics       {found['card']}",
             f"picture        {side} x {side} ({side**2 / 1e6:.2f} megapixels), {layers} coefficient images, {read / 1e6:.0f} MB read",
+            f"pictures       {found['pictures']}, median of their times:",
             f"whole picture  {found['wholeMs']:.1f} ms: {rate:.1f} pictures a second, {rate * read / 1e9:.2f} GB/s",
             f"of it          {found['sumMs']:.1f} ms for the coefficients of {LIGHTS} lights on the processor; graphics card {gpu}"]
 

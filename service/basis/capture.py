@@ -71,6 +71,8 @@ class BasisResult(NamedTuple):
     """Root mean square of (image as the file gives it − image), divided by that of the images."""
     levels_rms: float | None
     """The same in steps of an 8-bit display, where the file holds display values."""
+    key_lights_rms: float | None
+    """Relative error of pictures under key lights from between the captured lights, where the file gives sums of images."""
 
 
 def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:

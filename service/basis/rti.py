@@ -116,7 +116,7 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
     facts = _write_facts(request, source, model, quantization, {name: numbers(value) for name, value in error.items()})
     timings.close()
     return BasisResult(request.out, facts, kind, terms, source.pixels, len(model.front), stack.light_count - len(model.front),
-                       source.near, float(error["relative_rms"]), float(error["levels_rms"]))
+                       source.near, float(error["relative_rms"]), float(error["levels_rms"]), None)
 
 
 def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Model:

@@ -6,13 +6,15 @@ matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis).
 
 import numpy as np
 
-from kernels.relight.basis import gram, principal, projection
+from kernels.errors import ArrayError
+from kernels.relight.basis import Basis, gram, principal, projection
 from kernels.relight.many_frames import combine_batch
 from kernels.relight.residual import squared_residual
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
+from service.viewing.held_out import KEY_LIGHTS, key_weights
 from stage.ingest import TOP_EXPONENT
 from stage.light_basis import layer_name, layer_types, numbers, write_facts, write_layers
 
@@ -59,6 +61,7 @@ def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: 
                  source.inside[: stack.pixel_count].reshape(rows, cols), color_space=source.space, metadata=source.provenance)
     tail = (basis.singular_values[:, count:] ** 2).sum()
     relative = _relative(left.sum(), whole.sum())
+    key_lights = _key_light_error(source, basis, products)
     facts = write_facts(request.out, {
         "kind": BasisKind.SVD, "capture": source.capture.name, "image": request.out.name, "resolution": [cols, rows], "count": count,
         "layers": [layer_name(k) for k in range(count)], "color_space": source.space,
@@ -69,11 +72,30 @@ def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: 
         "error": {"relative_rms": numbers(relative),
                   "relative_rms_rgb": numbers([_relative(*pair) for pair in zip(left, whole, strict=True)]),
                   "truncation": numbers(_relative(tail, whole.sum())), "truncation_rgb": numbers(basis.truncation),
+                  "key_lights": KEY_LIGHTS, "key_lights_relative_rms": None if key_lights is None else numbers(key_lights),
                   "pixels": source.pixels},
         "provenance": source.provenance,
     })
     timings.close()
-    return BasisResult(request.out, facts, BasisKind.SVD, count, source.pixels, lights, 0, source.near, relative, None)
+    return BasisResult(request.out, facts, BasisKind.SVD, count, source.pixels, lights, 0, source.near, relative, None, key_lights)
+
+
+def _key_light_error(source: BasisCapture, basis: Basis, products: np.ndarray) -> float | None:
+    """Return the relative error of pictures under key lights from between the captured lights, root mean square over the lights; None: a
+    captured light gives nothing in a channel, so that no other light can be shared out over them.
+
+    A picture of weights w has the squared norm wᵀ G w with the Gram matrix G of the images, and the basis leaves wᵀ P G P w of it, where P
+    projects on what it lacks.
+    """
+    try:
+        weights = key_weights(source.lights).astype(np.float64)
+    except ArrayError:
+        return None
+    lacks = np.eye(products.shape[1]) - np.einsum("ckl,ckm->clm", basis.matrix, basis.matrix)
+    lacking = np.einsum("clm,ncm->ncl", lacks, weights)
+    left = np.einsum("ncl,clm,ncm->n", lacking, products, lacking, optimize=True)
+    whole = np.einsum("ncl,clm,ncm->n", weights, products, weights, optimize=True)
+    return float(np.sqrt(np.mean(np.maximum(left, 0) / np.where(whole > 0, whole, 1))))
 
 
 def _relative(left: float, whole: float) -> float:

@@ -82,6 +82,8 @@ def _basis(request: BasisRequest) -> None:
     shown = "" if result.levels_rms is None else f" of what is shown, {result.levels_rms:.1f} of 255"
     print(f"error    {100 * result.relative_rms:.3g} % RMS{shown}: {result.terms} coefficients a channel, {result.lights} lights, "
           f"{result.pixels} pixels")
+    if result.key_lights_rms is not None:
+        print(f"error    {100 * result.key_lights_rms:.3g} % RMS of pictures under lights from between the captured ones")
     if result.left_out:
         print(f"lights   {result.left_out} are not in front of the object and are left out")
     if result.near_lights:

@@ -41,7 +41,7 @@ class HeldOutLights:
             ArrayError: a light gives nothing in a channel.
         """
         sky = np.einsum("dcl,d->cl", transfer.weights, transfer.solid_angle / transfer.solid_angle.sum())
-        keys = weights_of(key_directions(lights.direction)[:, None], np.ones((KEY_LIGHTS, 1)), lights)
+        keys = key_weights(lights)
         self.weights = np.concatenate([keys, sky[None]]).astype(np.float32)  # [pictures, 3, lights]
         pixels = np.flatnonzero(covered)
         radiance, _ = stack.pick_radiance(pixels[:: max(1, len(pixels) // SAMPLED)])
@@ -81,6 +81,15 @@ class HeldOutLights:
         pictures = np.moveaxis(np.stack([np.matmul(self.weights[:, c], images[:, c]) for c in range(3)], axis=-1), 1, 0)[:, inside]
         return [(picture, self._display[np.rint((STEPS - 1) * np.clip(picture * gain, 0, 1)).astype(np.int64)])
                 for picture, gain in zip(pictures, self._gains, strict=True)]
+
+
+def key_weights(lights: DistantLights) -> np.ndarray:
+    """Return the weights [KEY_LIGHTS, 3, lights] of the captured images under each key light of irradiance 1.
+
+    Raises:
+        ArrayError: a captured light gives nothing in a channel.
+    """
+    return weights_of(key_directions(lights.direction)[:, None], np.ones((KEY_LIGHTS, 1)), lights)
 
 
 def key_directions(captured: np.ndarray) -> np.ndarray:

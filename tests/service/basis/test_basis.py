@@ -105,6 +105,24 @@ def test_the_error_said_is_the_error_measured(relit, tmp_path, count):
     assert facts["error"]["truncation"] <= facts["error"]["relative_rms"] + 1e-6 and facts["error"]["pixels"] == mask.sum()
 
 
+def test_the_error_under_lights_between_the_captured_is_that_of_relit_frames(relit, tmp_path):
+    """Measured on lights halfway between neighbours, which share it about equally; the error that is said is of 32 others."""
+    images, directions, irradiance, mask = sample()
+    errors = []
+    outcome = relit("basis", LAMBERT, "--cache", tmp_path / "cache", "--out", tmp_path / "b.exr", "--count", 6)
+    facts, (channels, _) = facts_of(tmp_path / "b.exr"), exr.read(tmp_path / "b.exr")
+    layers = np.array([[channels[f"{name}.{c}"][mask] for c in "RGB"] for name in facts["layers"]], dtype=np.float64)
+    rebuilt = np.einsum("ckl,kcp->lpc", np.array(facts["matrix"]), layers)
+    for first, second in enumerate((directions @ directions.T - 2 * np.eye(len(directions))).argmax(axis=1)):
+        weights = 0.5 / irradiance[[first, second]]
+        whole, shown = (np.einsum("lc,lpc->pc", weights, values[[first, second]]) for values in (images, rebuilt))
+        errors.append(relative_rms(shown, whole))
+    error = facts["error"]["key_lights_relative_rms"]
+    assert facts["error"]["key_lights"] == 32
+    assert 0.5 < error / np.sqrt(np.mean(np.square(errors))) < 2
+    assert f"error    {100 * error:.3g} % RMS of pictures under lights from between the captured ones" in outcome.out
+
+
 @pytest.mark.parametrize(("kind", "name", "count", "most"), [
     # cast shadows and the edge of a ball lit up to 75 degrees are what is lost; figures of this run, rounded up
     ("ptm", "a.ptm", None, 0.12), ("lrgb-ptm", "a.ptm", None, 0.12), ("hsh", "a.rti", 4, 0.125), ("hsh", "a.rti", None, 0.10),

@@ -1,17 +1,20 @@
-"""Pages pass axe-core without a serious violation, in light and dark, and fit a narrow screen."""
+"""Pages are small, pass axe-core without a serious violation, in light and dark, and fit a narrow screen."""
 
 import pytest
 
 from tests.service.server.pages.axe import violations
+from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes
 
 PAGES = {"captures": "/captures", "jobs": "/jobs"}
 
 
 @pytest.mark.parametrize("name", [*PAGES, "capture", "job", "light", "maps"])
-def test_no_serious_violation_and_no_scrolling_to_the_side(browser, server, solved, name):
+def test_a_page_is_small_fits_and_has_no_serious_violation(browser, server, solved, name):
     page = browser.new_page(base_url=server.url, bypass_csp=True)  # axe is injected
+    loaded = count_bytes(page)
     page.goto((PAGES | solved.pages)[name])
     solved.wait_for_content(page, name)
+    assert 10_000 < sum(loaded) < PAGE_BYTES
     for width in (1280, 390):
         page.set_viewport_size({"width": width, "height": 844})
         page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)

@@ -119,7 +119,7 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
 
 
-def test_a_value_that_cannot_be_is_named_and_nothing_is_sent(page, capture):
+def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
     form.get_by_label("Least confidence").fill("2")
@@ -131,6 +131,8 @@ def test_a_value_that_cannot_be_is_named_and_nothing_is_sent(page, capture):
     page.wait_for_url("**/jobs/job_*")
     page.locator("#error").wait_for(timeout=JOB_MS)  # the service says what it is that it does not find
     assert page.locator("#error").inner_text().strip()
+    page.get_by_role("button", name="Retry").click()
+    page.locator("#state").get_by_text("attempt 2").wait_for(timeout=JOB_MS)
 
 
 def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):

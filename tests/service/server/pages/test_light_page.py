@@ -1,5 +1,6 @@
 """Live relighting shows what `relit relight` makes, and sends exactly that to the batch."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -39,6 +40,49 @@ def test_dragging_on_the_picture_moves_the_light(opened):
     opened.mouse.move(box["x"] + box["width"] / 2 - 0.3 * side, box["y"] + box["height"] / 2 - 0.2 * side)
     opened.mouse.up()
     assert np.allclose(opened.evaluate("() => relit.state().light.direction"), [-0.6, 0.4, np.sqrt(1 - 0.52)], atol=0.03)
+
+
+def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solved):
+    """The error is the one that was measured when the basis was made; the rate appears when something moves."""
+    with solved.server.client() as client:
+        view = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"]["kind"] == "view"
+                    and job["request"]["capture"] == solved.capture)
+        relight = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["relight"]
+    said = opened.locator(".figures").inner_text()
+    assert f"under {relight['held_out']['key_lights']} lights that the basis was not made from" in said
+    assert float(re.search(r": ([\d.e-]+) of 255 levels off", said)[1]) == pytest.approx(relight["held_out"]["mean_levels"], rel=0.05)
+    assert f"{relight['terms']} coefficient images of 0.016 megapixels" in said and relight["terms"] <= 32
+    assert opened.evaluate("() => relit.figures().framesPerSecond") is None
+    opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
+    opened.locator("canvas.preview").wait_for(timeout=60_000)
+    opened.get_by_role("button", name="Spin").click()
+    opened.locator("[data-shows=speed]", has_text="pictures a second").wait_for(timeout=60_000)
+
+
+def test_nothing_is_drawn_while_nothing_changes(page, solved):
+    page.add_init_script("""const draw = WebGL2RenderingContext.prototype.drawArrays;
+      globalThis.drawn = 0;
+      WebGL2RenderingContext.prototype.drawArrays = function (...given) { globalThis.drawn += 1; return draw.apply(this, given); };""")
+    frames = """() => new Promise((done) => {
+      let left = 10;
+      const next = () => (left-- > 0 ? requestAnimationFrame(next) : done(drawn));
+      next();
+    })"""
+    page.goto(solved.pages["light"])
+    solved.wait_for_content(page, "light")
+    before = page.evaluate(frames)
+    assert before > 0 and page.evaluate(frames) == before
+    page.get_by_label("Exposure in stops").fill("1")
+    page.wait_for_function("(before) => drawn === before + 1", arg=before)
+
+
+def test_the_first_page_opens_on_what_can_be_lit(page, solved):
+    page.goto("/")
+    page.wait_for_url("**/light/cap_*")
+
+
+def test_the_view_transform_is_named(opened):
+    opened.get_by_text("Shown through sRGB (linear Rec.709, clipped, no tone mapping)").wait_for()
 
 
 def test_arrow_keys_move_the_light(opened):

@@ -4,6 +4,7 @@ import { DataTexture, DirectionalLight, EquirectangularReflectionMapping, FloatT
 
 const LARGEST_COLS = 1024; // of a map: three.js makes cubes of a quarter of it
 const QUARTER = 4; // three.js has +x in the middle of a map, Relit +z: a quarter of the width
+const KEPT = 2; // filtered maps: the first, which is the room, and the one that was opened last
 const ROOM = { cols: 64, rows: 32, sky: 1.35, floor: 0.45, lamp: 5, lampAt: [0.45, 0.6, 0.66], lampCosine: 0.94 };
 
 /** Return a neutral room as an environment map: light from above, and a lamp before the object, above and to the right. */
@@ -72,7 +73,7 @@ export function latLongTexture(map) {
 export class Lighting {
   #scene;
   #renderer;
-  #filtered = null; // the environment, for all roughnesses
+  #filtered = new Map(); // of maps, for all roughnesses
   #light = new DirectionalLight();
 
   /** @param {import("three").Scene} scene @param {import("three").WebGLRenderer} renderer */
@@ -81,15 +82,27 @@ export class Lighting {
     this.#renderer = renderer;
   }
 
-  /** Light by an environment map, as `latLongTexture` takes it. */
+  /** Light by an environment map, as `latLongTexture` takes it; a map that is used again is not filtered again. */
   byMap(map) {
     this.#clear();
+    const filtered = this.#filtered.get(map) ?? this.#filter(map);
+    this.#filtered.set(map, filtered);
+    if (this.#filtered.size > KEPT) this.#forget([...this.#filtered.keys()][1]);
+    this.#scene.environment = filtered.texture;
+  }
+
+  #filter(map) {
     const texture = latLongTexture(map);
     const generator = new PMREMGenerator(this.#renderer);
-    this.#filtered = generator.fromEquirectangular(texture);
+    const filtered = generator.fromEquirectangular(texture);
     generator.dispose();
     texture.dispose();
-    this.#scene.environment = this.#filtered.texture;
+    return filtered;
+  }
+
+  #forget(map) {
+    this.#filtered.get(map).dispose();
+    this.#filtered.delete(map);
   }
 
   /** Turn the environment about +y: what shines from +z then shines from +x after 90 degrees. */
@@ -111,15 +124,19 @@ export class Lighting {
     this.#scene.add(this.#light);
   }
 
+  /** Give the filtered maps back, as after the graphics processor has lost them; nothing lights the scene then. */
+  forgetMaps() {
+    this.#clear();
+    for (const map of [...this.#filtered.keys()]) this.#forget(map);
+  }
+
   /** Give everything back. */
   destroy() {
-    this.#clear();
+    this.forgetMaps();
     this.#light.dispose();
   }
 
   #clear() {
-    this.#filtered?.dispose();
-    this.#filtered = null;
     this.#scene.environment = null;
     this.#light.removeFromParent();
   }

@@ -53,6 +53,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   parent.replaceChildren(element("div", { class: "viewer" }, stage, panel));
   stage.append(fault);
 
+  const room = neutralRoom();
   let map = null; // { name, ...pixels }
   const view = new OrbitScene(stage, `The asset ${file.name} in 3D`, { onclick: pick, onfault: (sentence) => { fault.textContent = sentence; } });
   const { scene, renderer } = view;
@@ -72,7 +73,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     const chosen = control.lit.value;
     let irradiance;
     if (chosen === ROOM || chosen === MAP) {
-      const shown = chosen === ROOM ? neutralRoom() : map;
+      const shown = chosen === ROOM ? room : map;
       lighting.byMap(shown);
       irradiance = meanIrradiance(shown);
     } else {
@@ -117,6 +118,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     light();
   }
 
+  view.canvas.addEventListener("webglcontextrestored", () => { lighting.forgetMaps(); light(); });
   control.lit.addEventListener("change", light);
   for (const each of [control.turn, control.exposure, control.markers]) each.addEventListener("input", change);
   control.environment.addEventListener("change", () => {
