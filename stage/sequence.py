@@ -1,6 +1,8 @@
 """A sequence: captures of one camera, or results of them, one for each time step; `sequence.json` with schema relit.sequence/1."""
 
+from collections.abc import Iterable
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -16,8 +18,9 @@ SCHEMA = "relit.sequence/1"
 SEQUENCE_FILE = "sequence.json"
 FRAME_RATE = 24.0
 """Steps per second where nobody says how many."""
-ALIKE = ("projection", "resolution", "focal_px", "principal_px", "distortion", "pixel_size_m", "surface_z_m", "world_from_camera")
-"""The fields of the camera that the steps of a sequence share."""
+ALIKE = (*(f"camera.{field}" for field in ("projection", "resolution", "focal_px", "principal_px", "distortion", "pixel_size_m",
+                                            "surface_z_m", "world_from_camera")), "color_space", "irradiance_scale")
+"""The fields of the manifest that the steps of a sequence share."""
 
 
 class Step(Strict):
@@ -72,6 +75,14 @@ class Sequence(NamedTuple):
     frames_per_second: float
     timed: bool
     """Whether a file says the rate and times; else the steps are folders in order of name."""
+
+
+class Difference(NamedTuple):
+    """A field in which two manifests differ, with both values as text."""
+
+    field: str
+    value: str
+    other: str
 
 
 def is_sequence(path: Path) -> bool:
@@ -144,13 +155,25 @@ def check_alike(sequence: Sequence) -> list[Manifest]:
         manifests.append(read_manifest(step.folder / FILE_NAME))
     first = manifests[0]
     for step, manifest in zip(sequence.steps, manifests, strict=True):
-        pairs = [(f"camera.{field}", getattr(manifest.camera, field), getattr(first.camera, field)) for field in ALIKE]
-        pairs += [(field, getattr(manifest, field), getattr(first, field)) for field in ("color_space", "irradiance_scale")]
-        for field, theirs, ours in pairs:
-            if theirs != ours:
-                raise ManifestError(f"{step.folder / FILE_NAME}: {field}: is {_shown(theirs)}, that of {sequence.steps[0].name} "
-                                    f"{_shown(ours)}: the steps of a sequence are of one camera, colour space and scale of light")
+        if (apart := difference(manifest, first, ALIKE)) is not None:
+            raise ManifestError(f"{step.folder / FILE_NAME}: {apart.field}: is {apart.value}, that of {sequence.steps[0].name} "
+                                f"{apart.other}: the steps of a sequence are of one camera, colour space and scale of light")
     return manifests
+
+
+def difference(manifest: Manifest, other: Manifest, fields: Iterable[str]) -> Difference | None:
+    """Return the first of some fields in which two manifests differ, or None.
+
+    Args:
+        manifest: the one.
+        other: the other.
+        fields: names, with dots between those that lead to a value.
+    """
+    for field in fields:
+        value, there = attrgetter(field)(manifest), attrgetter(field)(other)
+        if value != there:
+            return Difference(field, _shown(value), _shown(there))
+    return None
 
 
 def _shown(value: object) -> str:

@@ -5,14 +5,14 @@ devices are calibrated and images are warped.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
-from service.depth.solution import statistics, status_counts
+from service.depth.solution import PixelSolution, statistics
 from stage.camera import Camera
 from stage.depth_maps import CoordinateMaps
 from stage.model import Resolution
@@ -92,28 +92,14 @@ class Coordinates:
         return found
 
 
-@dataclass
-class DecodedSolution:
-    """Projector coordinates without depth: the result of a capture that is decoded and not triangulated."""
+@dataclass(kw_only=True)
+class DecodedSolution(PixelSolution):
+    """Projector coordinates without depth: the result of a capture that is decoded and not triangulated. Solved is where every coded axis
+    is decoded."""
 
-    method: str
-    """What was decoded, in words for the report."""
     coordinates: Coordinates
     extents: Resolution
     """Projector pixels along columns and rows."""
-    status: np.ndarray  # [rows, cols] uint8
-    confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
-    least_confidence: float = 0.0
-    """Least confidence of coordinates that count as solved, where the request names none."""
-    warnings: list[str] = field(default_factory=list)
-    """A sentence for each thing that does not fit on the whole scene."""
-    facts: dict[str, Any] = field(default_factory=dict)
-    """What was found out on the way, for the report."""
-
-    @property
-    def solved(self) -> np.ndarray:
-        """Return where every coded axis is decoded, [rows, cols] bool."""
-        return np.isin(self.status, SOLVED)
 
     @property
     def estimated(self) -> np.ndarray:
@@ -127,10 +113,6 @@ class DecodedSolution:
         each = [np.where(axis.sigma > 0, 1 / (1 + axis.sigma / (HALF_SURE * extent)), 0)
                 for axis, extent in zip((self.coordinates.columns, self.coordinates.rows), self.extents, strict=True) if axis is not None]
         return np.minimum.reduce(each).astype(np.float32)
-
-    def counts(self, mask: np.ndarray) -> dict[str, int]:
-        """Return how many pixels of the mask have each status, by name."""
-        return status_counts(self.status, mask)
 
     def statistics(self) -> dict[str, dict[str, float]]:
         """Return the spread of the deviations of the solved pixels' coordinates, for the report."""

@@ -13,30 +13,16 @@ HALF_SURE = 1e-3
 """Standard deviation of the depth over the depth, at which confidence is one half."""
 
 
-@dataclass
-class DepthSolution:
-    """Depth at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have a depth.
-
-    Projector coordinates are kept where they are decoded, also where triangulation fails.
-    """
+@dataclass(kw_only=True)
+class PixelSolution:
+    """What every way of measuring says of each pixel, and of the whole scene."""
 
     method: str
     """What was decoded, in words for the report."""
-    depth: np.ndarray  # [rows, cols] float32 metres
     status: np.ndarray  # [rows, cols] uint8
-    sigma: np.ndarray | None = None  # [rows, cols] float32 metres
-    range_m: np.ndarray | None = None  # [rows, cols] float32 metres along the ray
-    projector_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels
-    projector_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels
-    sigma_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels, standard deviation of the decoded column
-    sigma_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels, of the decoded row
-    amplitude: np.ndarray | None = None  # [rows, cols] float32, in the unit of the images
     confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
-    colour: np.ndarray | None = None  # [rows, cols, 3] float32 linear, of the scene under even light; None: the amplitude's grey
-    points: np.ndarray | None = None  # [n, 3] float32: measured places between pixel centres, in place of a point a pixel
-    pixels: np.ndarray | None = None  # [n, 2] int: row and column of each of these, for its colour
     least_confidence: float = 0.0
-    """Least confidence of a depth that counts as solved, where the request names none."""
+    """Least confidence of a pixel that counts as solved, where the request names none."""
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole scene: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
@@ -44,8 +30,32 @@ class DepthSolution:
 
     @property
     def solved(self) -> np.ndarray:
-        """Return where there is a depth, [rows, cols] bool."""
+        """Return which pixels are solved, [rows, cols] bool."""
         return np.isin(self.status, SOLVED)
+
+    def counts(self, mask: np.ndarray) -> dict[str, int]:
+        """Return how many pixels of the mask have each status, by name."""
+        return status_counts(self.status, mask)
+
+
+@dataclass(kw_only=True)
+class DepthSolution(PixelSolution):
+    """Depth at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have a depth.
+
+    Projector coordinates are kept where they are decoded, also where triangulation fails.
+    """
+
+    depth: np.ndarray  # [rows, cols] float32 metres
+    sigma: np.ndarray | None = None  # [rows, cols] float32 metres
+    range_m: np.ndarray | None = None  # [rows, cols] float32 metres along the ray
+    projector_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels
+    projector_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels
+    sigma_u: np.ndarray | None = None  # [rows, cols] float32 projector pixels, standard deviation of the decoded column
+    sigma_v: np.ndarray | None = None  # [rows, cols] float32 projector pixels, of the decoded row
+    amplitude: np.ndarray | None = None  # [rows, cols] float32, in the unit of the images
+    colour: np.ndarray | None = None  # [rows, cols, 3] float32 linear, of the scene under even light; None: the amplitude's grey
+    points: np.ndarray | None = None  # [n, 3] float32: measured places between pixel centres, in place of a point a pixel
+    pixels: np.ndarray | None = None  # [n, 2] int: row and column of each of these, for its colour
 
     @property
     def estimated(self) -> np.ndarray:
@@ -58,10 +68,6 @@ class DepthSolution:
             return self.confidence
         relative = self.sigma / np.maximum(self.depth * HALF_SURE, 1e-12)
         return np.where(self.estimated, 1 / (1 + relative), 0).astype(np.float32)
-
-    def counts(self, mask: np.ndarray) -> dict[str, int]:
-        """Return how many pixels of the mask have each status, by name."""
-        return status_counts(self.status, mask)
 
     def statistics(self) -> dict[str, dict[str, float]]:
         """Return the spread of the depth and of its deviation over the solved pixels, for the report."""

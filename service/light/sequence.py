@@ -17,7 +17,10 @@ from stage.lighting import lights_from_centre
 from stage.manifest import FILE_NAME, read_manifest
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights
-from stage.sequence import is_sequence, read_sequence
+from stage.sequence import difference, is_sequence, read_sequence
+
+SHARED = {"camera.resolution": "resolution", "color_space": "colour space"}
+"""Fields of the manifest that the captures of a relit sequence share, and their words."""
 
 
 class OpenedCapture(NamedTuple):
@@ -53,11 +56,9 @@ def time_steps(path: Path) -> list[Path]:
     folders = [step.folder for step in read_sequence(path).steps]
     first = read_manifest(folders[0] / FILE_NAME)
     for folder in folders[1:]:
-        manifest = read_manifest(folder / FILE_NAME)
-        for what, theirs, ours in (("resolution", _size(manifest.camera.resolution), _size(first.camera.resolution)),
-                                   ("colour space", manifest.color_space, first.color_space)):
-            if theirs != ours:
-                raise RequestError(f"{folder}: is {theirs}, {folders[0].name} {ours}: the captures of a sequence share one {what}")
+        if (apart := difference(read_manifest(folder / FILE_NAME), first, SHARED)) is not None:
+            raise RequestError(f"{folder}: is {apart.value}, {folders[0].name} {apart.other}: the captures of a sequence share one "
+                               f"{SHARED[apart.field]}")
     return folders
 
 
@@ -98,7 +99,3 @@ def open_capture(folder: Path, request: RelightRequest, captures: int, frames: S
     maps = None if request.maps is None else maps_file(request.maps, folder, captures)
     return OpenedCapture(capture, lights_from_centre(capture), len(capture.lit_by(PointLight)),
                          Ingest.of(capture, cache=cache, tracking=tracking), maps, linear_space(capture.manifest.color_space))
-
-
-def _size(resolution: tuple[int, int]) -> str:
-    return "x".join(map(str, resolution))

@@ -204,6 +204,23 @@ def commands(group: Any, words: tuple[str, ...] = ()) -> Any:
         yield from commands(command, (*words, name)) if hasattr(command, "commands") else [((*words, name), command)]
 
 
+NO_JOBS = {
+    "demo": "makes files of this machine from the shipped sample", "bench": "measures this machine",
+    "farm": "writes job templates of other queues",
+    "import": "describes files before they are uploaded", "simulate": "makes raw frames, which are uploaded as any others",
+    "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "submit": "asks the service",
+    "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",
+    "restore": "is for its operator", "keys": "is for its operator",
+}
+"""Why commands are no jobs of the service, by their first word (docs/service.md)."""
+
+
+def test_every_command_is_a_job_or_says_why_not():
+    names = {words for words, _ in commands(get_command(PROGRAM))}
+    assert {words[0] for words in names if "-".join(words) not in jobs.JOBS} == NO_JOBS.keys()
+    assert jobs.JOBS.keys() - {"-".join(words) for words in names} == {"pipeline"}
+
+
 @pytest.mark.parametrize("words", [words for words, _ in commands(get_command(PROGRAM))], ids=" ".join)
 def test_a_help_shows_every_word(relit, monkeypatch, words):
     """The names of options too, at the usual width of a terminal."""
