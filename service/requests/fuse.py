@@ -23,6 +23,8 @@ class FuseOptions(Options):
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
     """What becomes of scans that lie beside the surface of the others by more than their σ explain."""
+    join_normals: bool = False
+    """Whether vertices are moved until the surface has the photometric normals of the maps of the scans, without their drift."""
     tiles: bool = False
     """Whether the surface is written as tiles (site.usda with payloads, and PLY files) in place of mesh.ply and asset.usdc, so that memory
     does not grow with its size. Tiles have the colours of their vertices and no textures."""
@@ -35,6 +37,8 @@ class FuseOptions(Options):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.tiles and self.join_normals:
+            raise ValueError("join_normals: is given with tiles, which are written one by one: normals are joined on the whole mesh")
         for name in ("texture_faces", "texture_px"):
             if self.tiles and getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{name}: is given with tiles, which have no texture: leave one of them out")

@@ -16,6 +16,7 @@ from service.requests.fuse import FuseRequest
 from service.scans.bake import bake
 from service.scans.fused_bricks import FusedBricks, fused_bricks
 from service.scans.fused_mesh import SEEN_BY, scan_facts, short, triangle_mesh
+from service.scans.join import with_joined_normals
 from service.scans.pieces import SharedPieces
 from service.scans.surface import Surface, joined_surface
 from service.scans.tiles import write_tiles
@@ -95,6 +96,13 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
     timings.stage("join", 1)
     surface = joined_surface(fused.bricks(), len(fused.used))
     _require_surface(file, len(surface.faces), fused.voxel)
+    joined = None
+    if request.join_normals:
+        if not surface.photometric.any():
+            raise RequestError(f"--join-normals: no scan of {file} has photometric normals: name results of relit solve as maps of the "
+                               "scans")
+        timings.stage("normals", 1)
+        surface, joined = with_joined_normals(surface, fused)
     baked = None
     if request.texture:
         timings.stage("texture", 1)
@@ -103,7 +111,7 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
         baked = textured, bake(textured.mesh, scans, fused.names, fused.voxel, request.texture_px, device=device)
     timings.stage("holes", 1)
     holes = find_holes(surface.points, surface.faces)
-    facts = _facts(fused, surface, holes)
+    facts = _facts(fused, surface, holes) | ({} if joined is None else {"joined_normals": joined})
     timings.stage("write", 1)
     mesh = triangle_mesh(surface, fused.names)
     asset_path = None

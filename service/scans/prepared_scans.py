@@ -30,6 +30,7 @@ class ScanSummary(NamedTuple):
     noise: float  # metres, standard deviation of the depth, median
     centre: np.ndarray  # [3] metres, world
     photometric: bool
+    normal_sigma: float  # radians, as of `PreparedScan`
     camera: Camera
     camera_from_world: np.ndarray  # [4, 4]
     sample: Sample
@@ -38,7 +39,8 @@ class ScanSummary(NamedTuple):
         """Return the summary as bytes."""
         known = {"name": self.name, "names": self.names, "photometric": self.photometric, "camera": self.camera.model_dump(mode="json")}
         return packed({"known": np.frombuffer(json.dumps(known).encode(), dtype=np.uint8), "pitch": self.pitch, "noise": self.noise,
-                       "centre": self.centre, "camera_from_world": self.camera_from_world, **self.sample._asdict()})
+                       "normal_sigma": self.normal_sigma, "centre": self.centre, "camera_from_world": self.camera_from_world,
+                       **self.sample._asdict()})
 
     @staticmethod
     def unpacked(content: bytes) -> "ScanSummary":
@@ -46,8 +48,8 @@ class ScanSummary(NamedTuple):
         found = unpacked(content)
         known = json.loads(found["known"].tobytes())
         return ScanSummary(known["name"], tuple(known["names"]), float(found["pitch"]), float(found["noise"]), found["centre"],
-                           known["photometric"], Camera.model_validate(known["camera"]), found["camera_from_world"],
-                           Sample(found["points"], found["normals"], found["variance"]))
+                           known["photometric"], float(found["normal_sigma"]), Camera.model_validate(known["camera"]),
+                           found["camera_from_world"], Sample(found["points"], found["normals"], found["variance"]))
 
     def outline(self) -> PreparedScan:
         """Return the scan without what it measured, to ask whether it can see a place."""
@@ -103,7 +105,7 @@ class PreparedScans:
         cell = np.asarray(scan.image.cell)
         pitch = float(np.median(np.asarray(scan.image.depth)[cell])) / min(scan.image.focal)
         return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
-                           scan.photometric, scan.camera, scan.image.camera_from_world, sample_of(scan, number))
+                           scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, sample_of(scan, number))
 
     def _read(self, number: int) -> PreparedScan:
         folder = self._folder / str(number)

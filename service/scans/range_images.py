@@ -43,6 +43,8 @@ class PreparedScan(NamedTuple):
     layers: np.ndarray  # [rows, cols, C] float32, as `channels` orders them
     feather: np.ndarray  # [rows, cols] float32, 0…1
     photometric: bool
+    normal_sigma: float = float("nan")
+    """Median standard error of the normals of solved maps, radians; NaN: there are none, or their maps do not say it."""
 
 
 def channels(names: tuple[str, ...]) -> dict[str, slice]:
@@ -93,7 +95,14 @@ def prepare_scan(scan: Scan, folder: Path, where: str) -> PreparedScan:
                        stored("clear", clear), np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
     return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
-                        stored("feather", feather), scan.normals_source == "photometric")
+                        stored("feather", feather), scan.normals_source == "photometric",
+                        _normal_sigma(maps))
+
+
+def _normal_sigma(maps: SurfaceMaps | None) -> float:
+    if maps is None or maps.sigma is None or not maps.mask.any():
+        return float("nan")
+    return float(np.radians(np.median(maps.sigma[maps.mask].astype(np.float64))))
 
 
 def with_layers(scan: PreparedScan, names: tuple[str, ...], folder: Path) -> PreparedScan:

@@ -25,6 +25,8 @@ WINDOW_PIXELS = 4
 """Pixels around the window of a view in which a brick can lie."""
 HISTOGRAM_STEP, HISTOGRAM_END = 0.05, 20.0
 """Width and end of the bins, in standard deviations, in which residuals are counted."""
+PHOTOMETRIC = 0.5
+"""Length of the blended normal from which on it is mostly photometric: normals fitted to depths count a hundredth in it."""
 NO_QUADS = np.zeros((0, 4), dtype=np.int32)
 
 
@@ -43,6 +45,7 @@ class Surface(NamedTuple):
     normals: np.ndarray  # [V, 3] float32, unit: of the views, where one sees the vertex, else of the faces
     sigma: np.ndarray  # [V] float32 metres
     seen: np.ndarray  # [V] uint16, scans that see each vertex
+    photometric: np.ndarray  # [V] bool, whether the normal is mostly that of solved maps
     values: np.ndarray  # [V, C] float32, the blended layers behind the normal, each followed by its weight
     faces: np.ndarray  # [F, 3] int32
     tallies: list["Tally"]  # one a scan
@@ -103,6 +106,7 @@ class BrickSurface(NamedTuple):
     normals: np.ndarray  # [V, 3] float32
     sigma: np.ndarray  # [V] float32 metres
     seen: np.ndarray  # [V] uint16
+    photometric: np.ndarray  # [V] bool
     values: np.ndarray  # [V, C] float32
     edge: np.ndarray  # [V, 4] int32, the edge of the lattice on which each vertex lies
     faces: np.ndarray  # [F, 3] int32
@@ -110,7 +114,7 @@ class BrickSurface(NamedTuple):
     blocks: int
 
 
-VERTEX = ("points", "normals", "sigma", "seen", "values")
+VERTEX = ("points", "normals", "sigma", "seen", "photometric", "values")
 """The arrays of a surface with one entry for each vertex."""
 
 
@@ -148,9 +152,10 @@ def fuse_brick(brick: np.ndarray, watching: list[Watching], names: tuple[str, ..
         tallies[number] = tally.numbers()
     width = channels(names)[names[-1]].stop + (names[-1] != NORMAL) - channels(names)[NORMAL].stop
     values, normals, seen = np.zeros((0, width), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint16)
+    photometric = np.zeros(0, dtype=bool)
     if len(triangles.faces):
-        values, normals, seen = _shown(triangles, watching, views, names, voxel, device)
-    return BrickSurface(triangles.points.astype(np.float64) + origin, normals, triangles.sigma, seen, values, triangles.edge,
+        values, normals, photometric, seen = _shown(triangles, watching, views, names, voxel, device)
+    return BrickSurface(triangles.points.astype(np.float64) + origin, normals, triangles.sigma, seen, photometric, values, triangles.edge,
                         triangles.faces, tallies, found.count)
 
 
@@ -249,8 +254,9 @@ def upload_layers(watching: list[Watching], device: str) -> tuple[Any, Any]:
 
 
 def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: tuple[str, ...],
-           voxel: float, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the blended layers behind the normal, the normals, and how many views see each vertex of a brick."""
+           voxel: float, device: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the blended layers behind the normal of the vertices of a brick, their normals, whether these are photometric, and how many
+    views see each."""
     with np.errstate(invalid="ignore"):  # faces of one vertex may cancel each other
         of_faces = np.nan_to_num(vertex_normals(triangles.points, NO_QUADS, triangles.faces))
     layers, feathers = upload_layers(watching, device)
@@ -261,7 +267,7 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
     normals = values[:, place]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1), of_faces).astype(np.float32)
-    return values[:, place.stop:], normals, shown.seen.numpy().astype(np.uint16)
+    return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, shown.seen.numpy().astype(np.uint16)
 
 
 def _welded(edge: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

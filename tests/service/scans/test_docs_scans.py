@@ -20,5 +20,5 @@ def test_the_json_is_read():
 def test_the_options_of_the_table_exist():
     named = set(re.findall(r"^\| `(--[a-z-]+)", DOCS, re.MULTILINE))
     assert named == {"--poses", "--turntable", "--reference", "--markers", "--board", "--cache", "--memory-gb",
-                     "--tiles", "--voxel-m", "--texture-faces", "--misplaced"}
+                     "--tiles", "--voxel-m", "--texture-faces", "--join-normals", "--misplaced"}
     assert named <= {option.flag for request in (RegisterRequest, FuseRequest) for option in options_of(request)}
