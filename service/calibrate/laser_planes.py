@@ -1,19 +1,20 @@
-"""Calibration of the planes of a laser from poses of a chessboard on which its stripes are seen."""
+"""Calibration of the planes of a laser from poses of a chessboard, or of a step, on which its stripes are seen."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
+from service.calibrate.laser_step import check_step, planes_on_step
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.depth.stripes import stripe_signal
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
-from stage.calibration.laser_plane import LightPlane, board_plane, fit_light_plane, inside_board
+from stage.calibration.laser_plane import board_plane, fit_light_plane, inside_board
 from stage.calibration.procam import find_corners
 from stage.capture import Capture
 from stage.colour import GREY_WEIGHTS
@@ -24,6 +25,9 @@ from stage.patterns.base import UniformPattern
 from stage.ranging import LaserPlane
 from stage.triangulation_check import check_perspective
 
+LEAST_BOARDS = 2
+"""The fewest poses of a board: its stripe in one is a line, through which any plane goes."""
+
 
 class LaserPlanes(NamedTuple):
     """The files that were written, and the planes."""
@@ -32,7 +36,25 @@ class LaserPlanes(NamedTuple):
     report_path: Path
     """Beside the first manifest; each manifest has one."""
     rows: list[tuple[str, ...]]
-    """Frame, tilt, residual and number of points of each plane, the least sure first."""
+    """Frame, tilt and residual of each plane, and its points or how sure depths on it are, the least sure first."""
+
+
+class MeasuredPlane(NamedTuple):
+    """A plane as it is written."""
+
+    point: np.ndarray  # [3] metres
+    normal: np.ndarray  # [3] unit
+    sigma_degrees: float
+    facts: dict[str, float]
+    """Its entries of the report."""
+    words: tuple[str, str]
+
+
+class _OnTarget(NamedTuple):
+    """The planes that a target gives, and what the report says of its poses."""
+
+    planes: list[MeasuredPlane]
+    seen: dict[str, Any]
 
 
 def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, *,
@@ -64,33 +86,57 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
     if not count:
         raise ManifestError(f"{captures[0].folder / FILE_NAME}: frames: none has a laser plane: give each a placeholder, such as "
                             '{"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}')
-    stripes: list[list[np.ndarray]] = [[] for _ in range(count)]
+    if request.step_m is not None:
+        step = planes_on_step(captures, [_laser_frames(capture) for capture in captures], request.step_m, device, timings)
+        check_step(step.fit, [frame.image for frame in _laser_frames(captures[0])])
+        found = _OnTarget(
+            [MeasuredPlane(plane.point, plane.normal, plane.sigma_degrees,
+                           {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"),
+                            "sigma_depth": float(f"{plane.sigma:.3g}"), "poses": plane.stripes},
+                           (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth")) for plane in step.fit.planes],
+            {"steps": step.poses})
+    else:
+        found = _on_boards(captures, request, device, timings)
+    timings.close()
+    targets = [*captures, *others]
+    return _write(request, targets, manifests_to_replace(targets, manifest_paths), found)
+
+
+def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str, timings: Timings) -> "_OnTarget":
+    """Measure the planes on a chessboard."""
+    assert request.board is not None and request.square_m is not None
+    if len(captures) < LEAST_BOARDS:
+        raise CalibrationError(f"{captures[0].folder}: is one pose of the board, which shows a line of each plane: give {LEAST_BOARDS} "
+                               "poses or more")
+    frames = _laser_frames(captures[0])
+    stripes: list[list[np.ndarray]] = [[] for _ in frames]
     boards = []
     timings.stage("boards", len(captures))
     for number, capture in enumerate(captures, start=1):
-        plane_rms, found = _stripes_on_board(capture, request, device)
+        plane_rms, found = _stripes_on_board(capture, request.board, request.square_m, device)
         boards.append({"capture": str(capture.folder), "rms_px": round(plane_rms, 4), "stripes": sum(len(one) > 0 for one in found)})
         for index, points in enumerate(found):
             if len(points):
                 stripes[index].append(points)
         timings.advance(number)
     planes = []
-    for index, frame in enumerate(_laser_frames(captures[0])):
+    for index, frame in enumerate(frames):
         try:
-            planes.append(fit_light_plane(stripes[index]))
+            plane = fit_light_plane(stripes[index])
         except CalibrationError as error:
             raise CalibrationError(f"{captures[0].folder}: frames of {frame.image}: {error}") from error
-    timings.close()
-    targets = [*captures, *others]
-    paths = manifests_to_replace(targets, manifest_paths)
-    return _write(request, targets, paths, planes, boards)
+        planes.append(MeasuredPlane(
+            plane.point, plane.normal, plane.sigma_degrees,
+            {"residual_m": float(f"{plane.residual_m:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points},
+            (f"{1000 * plane.residual_m:.3f} mm", f"{plane.points} points")))
+    return _OnTarget(planes, {"boards": boards})
 
 
 def _laser_frames(capture: Capture) -> list[Frame]:
     return [frame for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane)]
 
 
-def _stripes_on_board(capture: Capture, request: LaserPlanesRequest, device: str) -> tuple[float, list[np.ndarray]]:
+def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, device: str) -> tuple[float, list[np.ndarray]]:
     """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
     correction = Correction.of(capture)
     even = {frame.pattern.code: frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern)}
@@ -99,11 +145,11 @@ def _stripes_on_board(capture: Capture, request: LaserPlanesRequest, device: str
     if not isinstance(shown, np.ndarray):
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none shows the board without the laser: add one under a white "
                             'projection, or under the light of the room, {"type": "off"}')
-    corners = find_corners(shown @ np.array(GREY_WEIGHTS, np.float32), request.board)
+    corners = find_corners(shown @ np.array(GREY_WEIGHTS, np.float32), board)
     if corners is None:
-        raise CalibrationError(f"{capture.folder}: the board of {request.board[0]}x{request.board[1]} inner corners is not found")
-    plane = board_plane(corners, request.board, request.square_m, capture.camera)
-    inside = inside_board(corners, request.board, shown.shape[:2])
+        raise CalibrationError(f"{capture.folder}: the board of {board[0]}x{board[1]} inner corners is not found")
+    plane = board_plane(corners, board, square_m, capture.camera)
+    inside = inside_board(corners, board, shown.shape[:2])
     found = []
     # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
     albedo = np.where(inside, np.maximum(shown @ np.array(GREY_WEIGHTS, np.float32), 0), 0).astype(np.float32)
@@ -122,10 +168,9 @@ def _stripes_on_board(capture: Capture, request: LaserPlanesRequest, device: str
     return plane.rms_px, found
 
 
-def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Path, ...], planes: list[LightPlane],
-           boards: list[dict[str, object]]) -> LaserPlanes:
-    entries = [{"point_m": digits(plane.point), "normal": digits(plane.normal), "residual_m": float(f"{plane.residual_m:.3g}"),
-                "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"), "points": plane.points} for plane in planes]
+def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Path, ...], found: _OnTarget) -> LaserPlanes:
+    planes = found.planes
+    entries = [{"point_m": digits(plane.point), "normal": digits(plane.normal), **plane.facts} for plane in planes]
     reports = []
     for target, path in zip(targets, paths, strict=True):
         waiting = iter(planes)
@@ -138,10 +183,8 @@ def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Pat
                 frame = frame.model_copy(update={"laser": laser})
             frames.append(frame)
         reports.append(write_results("laser-planes", request, target.manifest.model_copy(update={"frames": tuple(frames)}),
-                                     path, {"boards": boards, "planes": entries}))
+                                     path, {**found.seen, "planes": entries}))
     order = sorted(range(len(planes)), key=lambda index: planes[index].sigma_degrees, reverse=True)
     names = [frame.image for frame in _laser_frames(targets[0])]
-    rows: list[tuple[str, ...]] = [
-        (names[index], f"{planes[index].sigma_degrees:.3f}°", f"{1000 * planes[index].residual_m:.3f} mm", str(planes[index].points))
-        for index in order]
+    rows: list[tuple[str, ...]] = [(names[index], f"{planes[index].sigma_degrees:.3f}°", *planes[index].words) for index in order]
     return LaserPlanes(paths, reports[0], rows)

@@ -145,7 +145,7 @@ def _laser_planes(request: LaserPlanesRequest) -> None:
     with ProgressBar() as bar:
         result = laser_planes(request, bar)
     _print_files(result.manifest_paths, result.report_path)
-    print_table([("frame", "tilt sure to", "residual", "points"), *result.rows[:LIGHT_ROWS]])
+    print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
 
 
 def _response(request: ResponseRequest) -> None:

@@ -69,7 +69,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     near_m, far_m = request.near_m or 0.0, request.far_m or np.inf
     frames = [frame for frame in capture.manifest.frames if frame.laser is not None]
     correction = Correction.of(capture)
-    background, source = _background(capture, correction, frames, timings)
+    background, source = ambient_light(capture, correction, frames, timings)
     camera, shape = capture.camera, mask.shape
     sweeps = _sweeps(frames, correction, background, mask, timings)
     samples: dict[str, list[StripeSamples]] = {"row": [], "column": []}
@@ -141,8 +141,8 @@ def _sweeps(frames: list[Frame], correction: Correction, background: np.ndarray,
     return sweeps
 
 
-def _background(capture: Capture, correction: Correction, frames: list[Frame], timings: Timings) -> tuple[np.ndarray, str]:
-    """Return the ambient light to take off each frame, [rows, cols, 3] float32, and in words where it comes from."""
+def ambient_light(capture: Capture, correction: Correction, frames: list[Frame], timings: Timings) -> tuple[np.ndarray, str]:
+    """Return the ambient light to take off each laser frame, [rows, cols, 3] float32, and in words where it comes from."""
     dark = [frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern) and frame.pattern.code == "black"]
     shape = (capture.camera.height, capture.camera.width, 3)
     if dark:

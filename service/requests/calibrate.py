@@ -1,9 +1,9 @@
 """What `relit calibrate` takes: one frozen model for each kind."""
 
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from service.requests.base import CAPTURE, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
@@ -253,11 +253,39 @@ class StereoRequest(BoardOptions):
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
 
 
-class LaserPlanesRequest(BoardOptions, DeviceRequest):
-    """The planes of a laser from its stripes on a chessboard in two poses or more, before a calibrated camera."""
+def _height(height_m: float | None) -> float | None:
+    if height_m is not None and height_m > LARGEST_SQUARE_M:
+        _refuse(f"--step-m {height_m:g}: is {height_m:g} m, more than a step has: give metres, such as {height_m / 1000:g} for "
+                f"{height_m:g} mm")
+    return height_m
 
-    captures: Annotated[tuple[Path, ...], Field(min_length=2), Role.INPUT, POSES]
-    """Folders with a capture.json, one for each pose of the board: a frame without the laser, and the same laser frames in each."""
+
+class LaserPlanesOptions(Options):
+    """What the stripes of the laser fall on: a chessboard, or a step."""
+
+    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(_board), Spelling(metavar="9x6")] = None
+    """Inner corners of the chessboard, across and down."""
+    square_m: Annotated[Positive | None, AfterValidator(lambda side: side and _square(side))] = None
+    """Side of a square of the chessboard in metres."""
+    step_m: Annotated[Positive | None, AfterValidator(_height)] = None
+    """Height in metres of a right-angled block on a flat base, which needs no board."""
+
+    @model_validator(mode="after")
+    def _one_target(self) -> Self:
+        if (self.board is None) != (self.square_m is None):
+            _refuse("--board and --square-m belong together: give both, or --step-m")
+        if (self.board is None) == (self.step_m is None):
+            _refuse("give --board and --square-m for a chessboard, or --step-m for a step of known height")
+        return self
+
+
+class LaserPlanesRequest(LaserPlanesOptions, DeviceRequest):
+    """The planes of a laser from its stripes on a chessboard in two poses or more, or on a step of known height, before a calibrated
+    camera."""
+
+    captures: Annotated[tuple[Path, ...], Field(min_length=1), Role.INPUT, POSES]
+    """Folders with a capture.json, one for each pose of the board or step, the same laser frames in each; with a board also a frame
+    without the laser."""
     apply_to: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
 

@@ -12,6 +12,7 @@ from service.requests.calibrate import (
     BoardOptions,
     GreyBallOptions,
     IntensityOptions,
+    LaserPlanesOptions,
     LightPositionsOptions,
     MirrorBallOptions,
     ProcamOptions,
@@ -136,14 +137,15 @@ class StereoCalibrationJob(JobRequest):
 
 
 class LaserPlanesJob(JobRequest):
-    """The planes of a laser from its stripes on a chessboard in two poses or more: ID.capture.json for each capture, calibration.json."""
+    """The planes of a laser from its stripes on a chessboard in two poses or more, or on a step of known height: ID.capture.json for each
+    capture, calibration.json."""
 
     kind: Literal["calibrate-laser-planes"]
-    captures: Annotated[tuple[CaptureId, ...], Field(min_length=2, max_length=MOST_CAPTURES), Role.INPUT, POSES]
-    """The captures, one for each pose of the board: a frame without the laser, and the same laser frames in each."""
+    captures: Annotated[tuple[CaptureId, ...], Field(min_length=1, max_length=MOST_CAPTURES), Role.INPUT, POSES]
+    """The captures, one for each pose of the board or step, the same laser frames in each; with a board also a frame without the laser."""
     apply_to: Annotated[tuple[CaptureId, ...], Field(max_length=MOST_CAPTURES), Role.INPUT, Spelling(metavar="CAPTURE")] = ()
     """Another capture under the same laser planes in the same order, whose manifest is written too; may be repeated."""
-    options: BoardOptions
+    options: LaserPlanesOptions
 
 
 class ResponseJob(JobRequest):
