@@ -263,7 +263,7 @@ def _height(height_m: float | None) -> float | None:
 class LaserPlanesOptions(Options):
     """What the stripes of the laser fall on: a chessboard, or a step."""
 
-    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(_board), Spelling(metavar="9x6")] = None
+    board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
     """Inner corners of the chessboard, across and down."""
     square_m: Annotated[Positive | None, AfterValidator(lambda side: side and _square(side))] = None
     """Side of a square of the chessboard in metres."""
