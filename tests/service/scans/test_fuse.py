@@ -11,6 +11,7 @@ from service.errors import RequestError
 from service.requests.fuse import FuseRequest
 from service.scans.fuse import fuse
 from stage.camera import Camera
+from stage.depth_maps import DepthMaps
 from stage.depth_normals import depth_normals
 from stage.maps import SurfaceMaps
 from stage.scans.ply_points import read_ply_points
@@ -108,6 +109,11 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     data["scans"][0]["sigma_m"] = SIGMA
     (points / "scan-set.json").write_text(json.dumps(data))
     refused(r"scans\[0\] \(view 0\): is a set of points: fusion needs range images", scan_set=points)
+    flat = Camera(projection="orthographic", resolution=shots[0].side[::-1], pixel_size_m=0.0075)
+    file = write_scans(tmp_path / "flat", shots[:1])
+    DepthMaps(camera=flat, mask=shots[0].mask, depth=shots[0].depth.astype(np.float32),
+              sigma=np.full(shots[0].side, SIGMA, dtype=np.float32)).write(file.parent / "scan0" / "depth.exr")
+    refused(r"scans\[0\] \(view 0\): its camera is orthographic: fusion takes perspective cameras", scan_set=file)
     assert not (tmp_path / "out").exists()
 
 
