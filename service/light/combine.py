@@ -77,12 +77,15 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
     if places is not None:
         placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
         placed[list(places)] = weights
-    frames = np.empty((len(weights), channels, end - begin), dtype=np.float32)
-    for start, stop in stack.bands(4 * channels * CHUNK_FRAMES) if pixels is None else [(begin, end)]:
+    bands = list(stack.bands(4 * channels * CHUNK_FRAMES)) if pixels is None else [(begin, end)]
+    kept = slice(None) if places is None or len(placed) == len(weights) else list(places)
+    frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float32)
+    for start, stop in bands:
         band = packs.upload(stack.band(start, stop), device=device)
-        place = slice(start - begin, stop - begin)
-        if places is None:
-            frames[0, :, place] = combine(band, weights[0]).numpy()
+        found = combine(band, weights[0]).numpy()[None] if places is None else combine_batch(band, placed).numpy()[kept]
+        if frames is None:
+            frames = found
         else:
-            frames[:, :, place] = combine_batch(band, placed).numpy()[list(places)]
+            frames[:, :, start:stop] = found
+    assert frames is not None
     return frames[:, :, : min(end, stack.pixel_count) - begin]
