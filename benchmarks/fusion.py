@@ -6,6 +6,7 @@
 """
 
 import argparse
+import resource
 import tempfile
 import time
 from pathlib import Path
@@ -38,6 +39,11 @@ def table(name: str, points: np.ndarray, sigma: np.ndarray | None = None) -> Non
             print(row(each, points[here], None if sigma is None else sigma[here]))
 
 
+def peak_gib() -> float:
+    """Return the most memory that this process has held, GiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=320)
@@ -55,13 +61,16 @@ def main() -> None:
                  pose=np.stack([shot.world_from_camera for shot in shots]), focal=np.array([shot.focal for shot in shots]))
     with tempfile.TemporaryDirectory() as folder:
         file = write_scans(Path(folder), shots)
+        before = peak_gib()
         start = time.perf_counter(), time.process_time()
         result = fuse(FuseRequest(scan_set=file, out=Path(folder) / "out", voxel_m=1e-3 * given.voxel_mm, texture=False,
                                   device=given.device))
         wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
+        peak = peak_gib()
         ply = read_ply_points(result.mesh_path)
-    table(f"relit fuse: {wall:.1f} s, {cpu:.1f} s of processors, {sum(s['fused'] for s in result.facts['scans'])} scans fused", ply.points,
-          ply.sigma)
+    table(f"relit fuse: {wall:.1f} s, {cpu:.1f} s of processors, {sum(s['fused'] for s in result.facts['scans'])} scans fused, "
+          f"{result.facts['blocks']} blocks in {result.facts['bricks']} bricks, {result.facts['faces']} faces, peak {peak:.2f} GiB "
+          f"({before:.2f} GiB before)", ply.points, ply.sigma)
     if given.other:
         table(str(given.other), np.load(given.other)["points"])
     for warning in result.warnings:

@@ -12,9 +12,10 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.fusion.views import (
-    LEAST_COSINE,
+    ALONG,
     TILE,
     TRUNCATION_VOXELS,
+    WIDER,
     Cell,
     View,
     ViewArrays,
@@ -146,7 +147,8 @@ def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place:
         seen = bool(near <= radius)  # so close that its outline is not bounded
         if near > radius:
             uv = image_point(view, point)
-            reach = wp.max(view.focal[0], view.focal[1]) * radius / near * (1.0 + wp.length(point) / near) + 2.0
+            slope = wp.sqrt(point[0] * point[0] + point[1] * point[1]) / near
+            reach = wp.max(view.focal[0], view.focal[1]) * radius / near * (1.0 + slope) * wp.where(view.distorted, WIDER, 1.0) + 2.0
             across = uv[0] - float(view.first_col)
             down = uv[1] - float(view.first_row)
             c0 = wp.max(int(wp.floor((across - reach) / float(TILE))), 0)
@@ -158,7 +160,7 @@ def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place:
             for r in range(r0, r1 + 1):
                 for c in range(c0, c1 + 1):
                     far = wp.max(far, farthest[view.first_tile + r * tiles + c])
-            seen = far > 0.0 and near - TRUNCATION_VOXELS / LEAST_COSINE * voxel < far
+            seen = far > 0.0 and near - ALONG * TRUNCATION_VOXELS * voxel < far
         if seen:
             watched[i, found] = wp.int16(number)
             found += 1

@@ -19,16 +19,13 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, SIDE, VOXELS, Blocks, block_place, find_watching
-from kernels.fusion.views import Cell, View, ViewArrays, image_point, read_view, to_camera, truncation, turned_back
+from kernels.fusion.views import ALONG, Cell, View, ViewArrays, image_point, read_view, to_camera, truncation, turned_back
 
 AGREEING = 0.85
 """Length of the weighted mean of the normals from which on all of them count: they then lie within some 45° of each other."""
 TURNED = 0.5
 """Cosine between a normal and that of the nearest surface from which on its view counts where normals disagree: 60°."""
 
-ALONG = 1.5
-"""Farthest that a voxel may lie behind the measured point on the line of sight, in truncations: a distance from a plane says nothing
-far beside the point where it was measured, as behind an edge."""
 NEAR_SIGMAS = 3.0
 """Distance from a measured surface in standard deviations within which a voxel may be that surface. A voxel farther behind it is hidden
 from the view, which is no evidence against another that sees the voxel to be empty."""

@@ -13,7 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 
-TILE = 16
+TILE = 4
 """Side in pixels of the squares whose farthest depth tells whether a block of voxels is hidden from a view."""
 LATERAL = 0.1
 """Standard deviation of the place of a reading across the line of sight, in pixels, as calibrations and optics leave it. Seen at a grazing
@@ -23,11 +23,16 @@ SPACING = 0.29
 by a chord, by the more the more grazing it is seen; that error does not average out."""
 UNDISTORT_ITERATIONS = 10
 """Rounds of the iteration that undoes the distortion: ordinary lenses converge to single precision in about six."""
+WIDER = 1.3
+"""How much longer than without distortion lines of sight are taken to be, where only their greatest length matters."""
 LEAST_NORMAL = 2.0
 """Least length of the sum of the normals of the four pixels of a cell: shorter, they show no one surface."""
 LEAST_COSINE = 0.2
 """Smallest cosine between the normal and the line of sight at which a reading counts: 78°."""
 
+ALONG = 1.5
+"""Farthest that a voxel may lie behind the measured point on the line of sight, in truncations: a distance from a plane says nothing
+far beside the point where it was measured, as behind an edge."""
 TRUNCATION_VOXELS = 3.0
 """Least distance from a measured surface, in voxels, over which its distances are kept: two on each side of a surface are needed, and one
 for what views differ by."""
@@ -147,7 +152,7 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
             planes[name].append(np.asarray(getattr(image, name), dtype=np.float32).reshape(rows * cols, -1))
         planes["place"].append((first + row * cols + col).astype(np.int32))
         planes["owner"].append(np.full(len(row), number, dtype=np.int32))
-        tiles = _farthest(np.maximum(np.where(used, image.depth + TRUNCATION_SIGMAS / LEAST_COSINE * image.sigma, 0), image.clear))
+        tiles = _farthest(np.maximum(np.where(used, image.depth + _behind(image), 0), image.clear))
         planes["farthest"].append(tiles.ravel())
         starts.append(first)
         shapes.append((rows, cols))
@@ -165,6 +170,15 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
                    [cell, cells], device=device)
     return ViewArrays(views, cell, cells, held["clear"], held["farthest"], len(structs), first, tuple(shapes), tuple(starts),
                       tuple(first_cells))
+
+
+def _behind(image: RangeImage) -> np.ndarray:
+    """Return [rows, cols] metres, at least how far behind its depth a pixel says anything, but for the truncation in voxels."""
+    rows, cols = image.depth.shape
+    x, y = ((np.array([first, first + count]) - middle) / focal for first, count, middle, focal in (
+        (image.first_col, cols, image.principal[0], image.focal[0]), (image.first_row, rows, image.principal[1], image.focal[1])))
+    stretch = WIDER * float(np.sqrt(1 + np.abs(x).max() ** 2 + np.abs(y).max() ** 2))
+    return ALONG * TRUNCATION_SIGMAS * (stretch * image.sigma + SPACING * image.depth / min(image.focal))
 
 
 def corners_of(cell: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from service.scans.tiles import write_tiles
 from service.usd.fused_asset import write_fused
 from stage.files import write_text
 from stage.fingerprint import digest
-from stage.meshes.holes import Holes, face_areas, find_holes
+from stage.meshes.holes import Holes, find_holes
 from stage.meshes.mesh import write_mesh_ply
 from stage.scans.records import ScanSet, read_scan_set
 
@@ -142,7 +142,7 @@ def _require_surface(file: Path, faces: int, voxel: float) -> None:
 
 def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]:
     """Return what the report says."""
-    area = face_areas(surface.points, surface.faces)
+    area = holes.face_areas_m2
     least = surface.seen[surface.faces].min(axis=1)
     missing = sum(hole.area_m2 for hole in holes.holes)
     return {

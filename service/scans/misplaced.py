@@ -17,6 +17,8 @@ REACH = 0.02
 """Largest distance between two surfaces that are still compared, in the median extent of the scans."""
 LARGEST_SIGMAS = 2.0
 """Displacement, in median standard deviations of the comparison, from which on a scan counts as misplaced; smaller ones harm little."""
+UNDETERMINED = 1e-10
+"""Directions in which a motion is determined less than this part of the best determined one do not move."""
 ROUNDS = 5
 """Rounds of reweighting of the fit of a motion."""
 
@@ -119,15 +121,16 @@ def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, left_ou
     seen = known.any(axis=1)
     if np.count_nonzero(seen) < LEAST_COMMON:
         return Placing(int(seen.sum()), 0.0, 0.0, 0.0, False)
-    offset = np.nanmedian(np.where(known[seen], distance[seen], np.nan), axis=1).astype(np.float64)
+    ordered = np.sort(np.where(known[seen], distance[seen], np.inf).astype(np.float64), axis=1)
+    count = known[seen].sum(axis=1)
+    offset = np.take_along_axis(ordered, np.stack([(count - 1) // 2, count // 2], axis=1), axis=1).mean(axis=1)  # the median
     sigma = float(np.median(expected[seen][known[seen]]))
     place, normal = sample.points[seen] - sample.points[seen].mean(axis=0), sample.normals[seen]
-    rows = np.concatenate([np.cross(place, normal), normal], axis=1)
-    scale = np.array([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
+    rows = np.concatenate([np.cross(place, normal), normal], axis=1) * ([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
     weight, fit = np.ones(len(rows)), np.zeros(len(rows))
     for _ in range(ROUNDS):
-        motion = np.linalg.lstsq((rows * scale) * weight[:, None], offset * weight, rcond=1e-6)[0]
-        fit = (rows * scale) @ motion
+        weighted = rows * (weight**2)[:, None]
+        fit = rows @ (np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ offset))
         rest = np.abs(offset - fit)
         weight = np.sqrt(1 / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2))
     displacement = float(np.sqrt(np.mean(fit**2)))

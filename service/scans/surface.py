@@ -179,9 +179,9 @@ def joined_surface(bricks: Iterable[BrickSurface], scans: int) -> Surface:
         for name in parts:
             parts[name].append(getattr(brick, name) if name != "faces" else brick.faces.astype(np.int64) + count)
         count += len(brick.points)
-    joined = {name: np.concatenate(given) for name, given in parts.items()}
-    kept, faces = _welded(joined.pop("edge"), joined.pop("faces"))
-    return Surface(**{name: given[kept] for name, given in joined.items()}, faces=faces, tallies=tallies, bricks=total, blocks=blocks)
+    kept, faces = _welded(np.concatenate(parts.pop("edge")), parts.pop("faces"))
+    joined = {name: np.concatenate(parts.pop(name))[kept] for name in VERTEX}  # one after another, so that few exist twice
+    return Surface(**joined, faces=faces, tallies=tallies, bricks=total, blocks=blocks)
 
 
 def centre_of(scan: PreparedScan) -> np.ndarray:
@@ -270,19 +270,18 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
     return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, shown.seen.numpy().astype(np.uint16)
 
 
-def _welded(edge: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices that are kept, [n] int64, and the faces with their numbers: those of one edge of the lattice become one."""
+def _welded(edge: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return which vertices are kept, [V] bool, and the faces with their numbers, [F, 3] int32: those of one edge of the lattice become
+    one."""
+    kept = np.ones(len(edge), dtype=bool)
+    owner = np.arange(len(edge), dtype=np.int32)
     shared = np.flatnonzero((edge[:, :3] % BRICK_VOXELS == 0).any(axis=1))  # others lie inside of one brick
-    if len(shared) == 0:
-        return np.arange(len(edge)), faces.astype(np.int32)
-    low = edge[shared].min(axis=0)
-    names = np.ravel_multi_index(tuple((edge[shared] - low).T.astype(np.int64)), tuple(np.ptp(edge[shared], axis=0).astype(np.int64) + 1))
-    _, first, number = np.unique(names, return_index=True, return_inverse=True)
-    owner = np.arange(len(edge))
-    owner[shared] = shared[first][number.ravel()]
-    kept = np.flatnonzero(owner == np.arange(len(edge)))
-    renumbered = np.zeros(len(edge), dtype=np.int64)
-    renumbered[kept] = np.arange(len(kept))
-    return kept, renumbered[owner[faces]].astype(np.int32)
-
-
+    if len(shared):
+        low, size = edge[shared].min(axis=0), np.ptp(edge[shared], axis=0).astype(np.int64) + 1
+        names = np.ravel_multi_index(tuple((edge[shared] - low).T), tuple(size))
+        _, first, number = np.unique(names, return_index=True, return_inverse=True)
+        kept[shared] = False
+        kept[shared[first]] = True
+        owner[shared] = shared[first][number.ravel()]
+    renumbered = (np.cumsum(kept, dtype=np.int32) - 1)[owner]
+    return kept, np.concatenate([renumbered[each] for each in faces])

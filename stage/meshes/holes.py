@@ -4,6 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+BATCH = 1 << 22
+"""The number of faces or edges that are looked at together, which bounds the memory."""
+
 
 class Hole(NamedTuple):
     """One boundary of a mesh."""
@@ -21,23 +24,16 @@ class Holes(NamedTuple):
     """The boundaries of a mesh, and what the whole of it is."""
 
     holes: list[Hole]  # the longest first
-    area_m2: float
+    face_areas_m2: np.ndarray  # [F] float64
     open_edges: int
     open_length_m: float
     shared_edges: int
     """Edges with more than two faces."""
 
-
-def face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the area of each face, [F] float64."""
-    return np.asarray(np.linalg.norm(area_vectors(points, faces), axis=1) / 2)
-
-
-def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return for each face the vector along its normal that is twice as long as the face is large, [F, 3] float64."""
-    first, second, third = (points.astype(np.float64, copy=False).T[:, corner] for corner in faces.T)
-    (ax, ay, az), (bx, by, bz) = second - first, third - first
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    @property
+    def area_m2(self) -> float:
+        """The area of the mesh."""
+        return float(self.face_areas_m2.sum())
 
 
 def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
@@ -47,19 +43,62 @@ def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
         points: [V, 3] metres.
         faces: [F, 3] vertex numbers, wound alike.
     """
-    count = np.int64(max(len(points), 1))
-    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel().astype(np.int64)
-    # each edge as its two vertices, the smaller first, and whether they have changed places: sorted, those of one edge lie side by side
-    keys = np.sort(2 * (np.minimum(start, end) * count + np.maximum(start, end)) + (start > end))
-    first = np.flatnonzero(np.diff(keys >> 1, prepend=-1))
-    number = np.diff(first, append=len(keys))
-    border = keys[first[number == 1]]
-    smaller, larger = (border >> 1) // count, (border >> 1) % count
-    begin, finish = np.where(border & 1, larger, smaller), np.where(border & 1, smaller, larger)
-    lengths = np.linalg.norm(points[finish].astype(np.float64) - points[begin], axis=1)
-    holes = [_hole(points, begin[chain], finish[chain], closed) for chain, closed in _chains(begin, finish)]
-    return Holes(sorted(holes, key=lambda hole: -hole.length_m), float(face_areas(points, faces).sum()), len(border), float(lengths.sum()),
-                 int(np.count_nonzero(number > 2)))
+    begin, finish, shared = _border(len(points), faces)
+    chains = _chains(begin, finish)
+    order = np.concatenate([chain for chain, _ in chains] or [[]]).astype(np.int64)
+    holes = _measured(points[begin[order]].astype(np.float64), points[finish[order]].astype(np.float64),
+                      np.array([len(chain) for chain, _ in chains], dtype=np.int64), [closed for _, closed in chains])
+    return Holes(sorted(holes, key=lambda hole: -hole.length_m), _face_areas(points, faces), len(begin),
+                 float(sum(hole.length_m for hole in holes)), shared)
+
+
+def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return for each face the vector along its normal that is twice as long as the face is large, [F, 3] float64."""
+    first, second, third = (points[corner].astype(np.float64) for corner in faces.T)
+    return _cross(second - first, third - first)
+
+
+def _face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the area of each face, [F] float64."""
+    areas = np.empty(len(faces))
+    for start in range(0, len(faces), BATCH):
+        areas[start:start + BATCH] = np.linalg.norm(area_vectors(points, faces[start:start + BATCH]), axis=1) / 2
+    return areas
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the cross products of vectors [n, 3]."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def _border(count: int, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the first and last vertices of the edges with one face, and how many edges have more than two."""
+    keys = np.empty((3, len(faces)), dtype=np.int64)  # the smaller vertex, the larger, and whether they have changed places
+    for edge in range(3):
+        start, end = faces[:, edge], faces[:, (edge + 1) % 3]
+        keys[edge] = np.minimum(start, end)
+        keys[edge] *= count
+        keys[edge] += np.maximum(start, end)
+        keys[edge] *= 2
+        keys[edge] += start > end
+    sorted_keys = keys.reshape(-1)
+    sorted_keys.sort()  # those of one edge lie side by side
+    single, shared = [], 0
+    first = 0
+    while first < len(sorted_keys):
+        last = min(first + BATCH, len(sorted_keys))
+        while last < len(sorted_keys) and sorted_keys[last] >> 1 == sorted_keys[last - 1] >> 1:
+            last += 1  # no edge is cut
+        part = sorted_keys[first:last]
+        runs = np.flatnonzero(np.diff(part >> 1, prepend=-1))
+        number = np.diff(runs, append=len(part))
+        single.append(part[runs[number == 1]])
+        shared += int(np.count_nonzero(number > 2))
+        first = last
+    border = np.concatenate(single) if single else np.zeros(0, dtype=np.int64)
+    smaller, larger = (border >> 1) // max(count, 1), (border >> 1) % max(count, 1)
+    return np.where(border & 1, larger, smaller), np.where(border & 1, smaller, larger), shared
 
 
 def _chains(begin: np.ndarray, finish: np.ndarray) -> list[tuple[list[int], bool]]:
@@ -88,8 +127,19 @@ def _chains(begin: np.ndarray, finish: np.ndarray) -> list[tuple[list[int], bool
     return chains
 
 
-def _hole(points: np.ndarray, begin: np.ndarray, finish: np.ndarray, closed: bool) -> Hole:
-    a, b = points[begin].astype(np.float64), points[finish].astype(np.float64)
-    centre = a.mean(axis=0)
-    fan = np.linalg.norm(np.cross(a - centre, b - centre), axis=1).sum() / 2
-    return Hole(float(np.linalg.norm(b - a, axis=1).sum()), float(fan), len(begin), centre, closed)
+def _measured(a: np.ndarray, b: np.ndarray, edges: np.ndarray, closed: list[bool]) -> list[Hole]:
+    """Return the holes whose edges lead from a to b, [n, 3] metres, those of one hole side by side.
+
+    Args:
+        a, b: [n, 3] metres.
+        edges: [holes] how many edges each hole has.
+        closed: of each hole.
+    """
+    if len(edges) == 0:
+        return []
+    first = np.cumsum(edges) - edges
+    centre = np.add.reduceat(a, first) / edges[:, None]
+    middle = np.repeat(centre, edges, axis=0)
+    fan = np.add.reduceat(np.linalg.norm(_cross(a - middle, b - middle), axis=1), first) / 2
+    length = np.add.reduceat(np.linalg.norm(b - a, axis=1), first)
+    return [Hole(float(length[k]), float(fan[k]), int(edges[k]), centre[k], closed[k]) for k in range(len(edges))]
