@@ -24,6 +24,8 @@ STILL, NEARLY_STILL = 0.1, 0.2
 standard deviation of the distances."""
 FEW = 3000
 """The most points that are matched at all reaches but the last."""
+EDGE = 5.0
+"""Normals are at an edge if fewer neighbours change them by more than this many times the median. A vase, a figure: next to none."""
 BLOCK = 6.0
 """The side of the blocks within which errors may be alike, in distances of neighbouring points."""
 LEAST_MATCHES = 30
@@ -40,6 +42,7 @@ class Fit(NamedTuple):
     normal: np.ndarray  # [6, 6] the matrix of the normal equations of `rows`
     noise: np.ndarray  # [6, 6] the part of it that noise in the normals alone would make
     bend: np.ndarray  # [6, 6] the part that normals would make which are as wrong as the choice of their neighbours changes them
+    even_bend: np.ndarray  # [6, 6] the same without what edges add, where the choice of the neighbours changes normals most
     residual: float  # metres: the robust standard deviation of the distances
     ratio: float  # the robust standard deviation of the distances in units of their σ
     together: float  # by which factor errors of neighbours that are alike widen σ of the pose
@@ -111,7 +114,8 @@ def _result(a: Cloud, found: "_Matches", pose: np.ndarray) -> Fit:
     rows = Rows(found.at, found.of, system.weighted.astype(np.float32), found.sigma_a.astype(np.float32), found.sigma_b.astype(np.float32))
     scale_sigma = float(np.sqrt(squared / left)) if left > 0 else float("inf")
     return Fit(pose=pose, pivot=system.pivot, doubt=np.zeros(6), information=system.information / squared, normal=system.information,
-               noise=system.noise, bend=system.bend, residual=found.scale, ratio=found.ratio, together=together, scale=scale,
+               noise=system.noise, bend=system.bend, even_bend=system.even_bend, residual=found.scale, ratio=found.ratio,
+               together=together, scale=scale,
                scale_sigma=scale_sigma, rows=rows, matches=int((found.weight > 0).sum()))
 
 
@@ -155,6 +159,7 @@ class _System(NamedTuple):
     gradient: np.ndarray
     noise: np.ndarray
     bend: np.ndarray
+    even_bend: np.ndarray
     weighted: np.ndarray
 
 
@@ -196,8 +201,9 @@ def _system(found: _Matches) -> _System:
     local = found.placed - pivot
     jacobian = np.concatenate([np.cross(local, found.normal), found.normal], axis=1)
     weighted = jacobian * weight[:, None]
+    even = np.minimum(found.bent, EDGE * np.median(found.bent))
     return _System(pivot, weighted.T @ jacobian, weighted.T @ found.distance, _turned(local, weight * found.tilt**2),
-                   _turned(local, weight * found.bent**2), weighted)
+                   _turned(local, weight * found.bent**2), _turned(local, weight * even**2), weighted)
 
 
 def _turned(local: np.ndarray, off: np.ndarray) -> np.ndarray:

@@ -37,7 +37,8 @@ A vase has 4 about its axis; the statue of tests/scenes has 140 and more at over
 BENT, WEAKLY_BENT = 0.3, 1.5
 """The same against what normals make that are as wrong as those of 8 neighbours differ from those of 16: that is too much, but grows with
 the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .1 to .2 about its axis at
-spacings of 6 to 17 mm, the statue .5 and more."""
+spacings of 6 to 17 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
+details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
 SHIFTS = (0.1, -0.1, 0.3)
 """By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
@@ -211,10 +212,11 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
     units = np.array([1 / size] * 3 + [1.0] * 3)  # a step of length 1 moves points by about 1 m
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
     for value, axis in zip(values, axes.T, strict=True):
-        noise, bend = (float(axis @ (part * np.outer(units, units)) @ axis) for part in (best.fit.noise, best.fit.bend))
+        noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
+                                  for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
         step = units * axis
         weak = value < WEAK * noise or value < WEAKLY_BENT * bend
-        if value < NOT_DETERMINED * noise or value < BENT * bend or (weak and _slides(a, b, best, size * step, cell_m, least_overlap)):
+        if value < NOT_DETERMINED * noise or value < BENT * even_bend or (weak and _slides(a, b, best, size * step, cell_m, least_overlap)):
             kind = "turned about an axis" if np.linalg.norm(axis[:3]) > 0.5 else "shifted along itself"
             return best._replace(state=PairState.AMBIGUOUS,
                                  reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")

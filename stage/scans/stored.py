@@ -16,8 +16,8 @@ from stage.scans.pairs import Evidence, Pair, PairState, Prepared
 
 CLOUD = ("points", "normals", "near_normals", "directions", "sigma", "spacing")
 """The arrays of a cloud that are stored in single precision, as scans are."""
-FIT = ("pose", "pivot", "doubt", "information", "normal", "noise", "bend", "residual", "ratio", "together", "scale", "scale_sigma",
-       "matches")
+FIT = ("pose", "pivot", "doubt", "information", "normal", "noise", "bend", "even_bend", "residual", "ratio", "together", "scale",
+       "scale_sigma", "matches")
 ROWS = tuple(Rows._fields)
 
 
