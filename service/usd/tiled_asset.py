@@ -61,6 +61,7 @@ def write_site(tiles: Sequence[Tile], path: Path, *, name: str, provenance: dict
     """
     def define(usd_stage: Usd.Stage) -> None:
         _set_up(usd_stage)
+        usd_stage.SetLoadRules(Usd.StageLoadRules.LoadNone())  # the layer is written in another folder first, where the tiles are not
         usd_stage.GetRootLayer().customLayerData = dict(provenance)
         root = UsdGeom.Xform.Define(usd_stage, Sdf.Path(f"/{prim_name(name)}"))
         Usd.ModelAPI(root.GetPrim()).SetKind(Kind.Tokens.assembly)

@@ -7,6 +7,7 @@ from pxr import Usd, UsdGeom
 from service.requests.fuse import FuseRequest
 from service.scans import fused_bricks
 from service.scans.fuse import FuseResult, fuse
+from service.usd.tiled_asset import Tile, write_site
 from stage.scans.ply_points import read_ply_points
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
@@ -76,6 +77,12 @@ def test_a_fusion_that_was_interrupted_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(fused_bricks, "fuse_brick", lambda brick, *given, **options: bricks.append(brick) or fuse_brick(
         brick, *given, **options))
     assert fuse(request).mesh_path.read_bytes() == first and len(bricks) == 1 and lost
+
+
+def test_usd_complains_of_nothing(tmp_path, capfd):
+    point = np.zeros(3)
+    write_site([Tile(tmp_path / "tiles" / "0_0_0.usdc", point, point)], tmp_path / "site.usda", name="site", provenance={})
+    assert capfd.readouterr() == ("", "") and (tmp_path / "site.usda").exists()
 
 
 def test_options_of_textures_are_refused_with_tiles(tmp_path):
