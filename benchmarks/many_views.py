@@ -1,14 +1,16 @@
 """Scans without poses to one surface, against Open3D's multiway registration and TSDF on the same scans: a table of docs/scans.md.
 
-python -m benchmarks.many_views --open3d PYTHON [--rows 160] [--voxel-mm 4] [--write docs/scans.md]
+OPENBLAS_NUM_THREADS=1 python -m benchmarks.many_views --open3d PYTHON [--rows 160] [--voxel-mm 4] [--write docs/scans.md]
 
 The figure of tests/scenes/turntable.py is ray-marched from 18 places 20° apart; each depth has independent noise of 0.25 mm.
 `relit register` and `relit fuse` are timed as whole commands, from the files of the scans to those of the mesh, but for the start of Python
 and the compilation of kernels; Open3D from arrays in memory to the mesh in memory. Seconds are those of all processors together.
+`relit` itself runs BLAS on one thread, because several that wait for each other double them; Open3D is left its threads.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import tempfile
 import time
@@ -93,17 +95,20 @@ def by_relit(views: list[View], voxel_m: float, device: str) -> str:
 def by_open3d(python: str, views: list[View], voxel_m: float) -> str:
     """Return the line of Open3D, which runs in another interpreter."""
     here = Path(__file__)
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     with tempfile.TemporaryDirectory() as name:
         scans, images, mesh = (Path(name) / f"{part}.npz" for part in ("scans", "images", "mesh"))
         arrays = {f"{number:03d}": view.camera.points(-view.depth)[view.mask].astype(np.float32) for number, view in enumerate(views)}
         np.savez(scans, **arrays)
-        done = subprocess.run([python, here.with_name("scans_open3d.py"), scans], capture_output=True, text=True, check=True)
+        done = subprocess.run([python, here.with_name("scans_open3d.py"), scans], capture_output=True, text=True, check=True,
+                              env=environment)
         found = json.loads(done.stdout.splitlines()[-1])
         poses = {int(number): np.array(rows) for number, rows in found["poses"].items()}
         np.savez(images, depth=np.stack([views[k].depth for k in poses]), pose=np.stack(list(poses.values())),
-                 focal=np.array([views[k].camera.focal_px[0] for k in poses]))
+                 focal=np.full(len(poses), views[0].camera.image_coordinates(np.array([[1.0, 0.0, -1.0]]))[0][0]
+                                                  - views[0].camera.principal_point[0]))
         done = subprocess.run([python, here.with_name("fusion_open3d.py"), images, mesh, str(voxel_m)], capture_output=True, text=True,
-                              check=True)
+                              check=True, env=environment)
         return row("Open3D", views, poses, found["seconds"], json.loads(done.stdout.splitlines()[-1])["seconds"],
                    np.load(mesh)["points"])
 
