@@ -220,6 +220,9 @@ def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarra
 
 PNG_ROWS = 256
 """Rows of a PNG that are handed to its writer at one time: they bound its memory."""
+PNG16_LEVEL = 2
+"""Level at which deflate packs 16-bit images, whose lower bytes are noise: it takes two thirds of the time of the usual 6, for 0.4 % more
+bytes. Images of 8 bits keep the usual level, which saves a tenth of their bytes."""
 
 
 def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
@@ -237,6 +240,8 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     rows, cols, channels = pixels.shape
     spec = oiio.ImageSpec(cols, rows, channels, str(codes.dtype))
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if srgb else "data")  # without it the file would claim to be sRGB
+    if codes.dtype == np.uint16:
+        spec.attribute("png:compressionLevel", PNG16_LEVEL)
     output = oiio.ImageOutput.create(str(path))
     if output is None:
         raise OSError(f"{path.name}: {oiio.geterror()}")
