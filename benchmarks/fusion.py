@@ -1,7 +1,7 @@
 """`relit fuse` on a simulated turntable, measured against the closed form of the statue; all vertices count.
 
     python -m benchmarks.fusion --rows 480 --voxel-mm 1
-    python -m benchmarks.fusion --rows 480 --voxel-mm 1 --depths shots.npz            # the same scans for another program
+    python -m benchmarks.fusion --rows 480 --voxel-mm 1 --depths shots.npz            # the same scans for fusion_open3d.py
     python -m benchmarks.fusion --rows 480 --voxel-mm 1 --other mesh.npz              # and its `points`, measured alike
 """
 

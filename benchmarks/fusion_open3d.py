@@ -1,9 +1,10 @@
-"""TSDF fusion of range images with Open3D's VoxelBlockGrid; run by benchmarks/many_views.py and on the files of benchmarks.fusion --depths.
+"""TSDF fusion of range images with Open3D's VoxelBlockGrid; run by benchmarks/many_views.py and benchmarks/scan_pictures.py.
 
 python fusion_open3d.py IMAGES.npz MESH.npz VOXEL_M
 
 Every image is integrated into the blocks that its depths touch, with a truncation of four voxels, and the mesh is extracted where at
-least one image measured. Writes the vertices (`points`) and faces; prints the seconds of all processors as JSON, without reading.
+least one image measured. IMAGES.npz is as `benchmarks.fusion --depths` writes it. Writes the vertices (`points`) and faces; prints the
+seconds of all processors as JSON, without reading.
 """
 
 import json
@@ -30,7 +31,8 @@ def main() -> None:
                                          block_resolution=8, block_count=BLOCKS, device=o3c.Device("CPU:0"))
     for depth, pose, focal in zip(depths, poses, focals, strict=True):
         rows, cols = depth.shape
-        camera = o3c.Tensor([[focal, 0, cols / 2 - 0.5], [0, focal, rows / 2 - 0.5], [0, 0, 1]], dtype=o3c.float64)
+        # a voxel takes the depth of the pixel that it falls into by truncation, so that whole numbers are the corners of pixels
+        camera = o3c.Tensor([[focal, 0, cols / 2], [0, focal, rows / 2], [0, 0, 1]], dtype=o3c.float64)
         camera_from_world = o3c.Tensor(np.ascontiguousarray(np.linalg.inv(pose @ looks_along)))
         image = o3d.t.geometry.Image(o3c.Tensor(np.ascontiguousarray(depth[..., None])))
         blocks = grid.compute_unique_block_coordinates(image, camera, camera_from_world, 1.0, FARTHEST_M, TRUNCATION_VOXELS)
