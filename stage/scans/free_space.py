@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.camera import Camera
+from stage.scans.cloud import Cloud
 from stage.scans.rigid import applied, inverse
 from stage.scans.scan import Scan
 
@@ -20,6 +21,15 @@ class DepthRange(NamedTuple):
     """Side of a square in pixels."""
     nearest: np.ndarray  # [rows, cols] float32 metres, of squares; 0 where any pixel of the square or around it has no depth
     farthest: np.ndarray  # [rows, cols]
+
+
+ALIKE_AROUND = 8
+"""Neighbours of a point that are asked whether they are contradicted too."""
+MOST_ALIKE = 0.75
+"""Part of them that must be, for the point to count as one of a part of the surface: single points float before edges."""
+FACING = 0.35
+"""Cosine of the angle between the normal of a surface and a line of sight from which on the camera cannot have missed the surface: a sheet
+seen edge-on lies between its pixels."""
 
 
 class Sight(NamedTuple):
@@ -69,6 +79,13 @@ def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
         pose: [4, 4] from the frame of the points to that of the image.
         tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
     """
+    before, on, judged = _seen(image, points, pose, tolerance)
+    return Sight(int(on.sum()), int(before.sum()), int(judged.sum()))
+
+
+def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which points lie before the surface of a range image, on it, and at pixels with a depth; arguments as of `sight`."""
     camera = image.camera
     placed = applied(pose, points)
     front = placed[:, 2] < 0 if camera.projection == "perspective" else np.ones(len(placed), dtype=bool)
@@ -81,8 +98,39 @@ def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
     judged = inside & (near != 0)
     depth = -placed[:, 2]
     before = judged & (depth < near - tolerance)
-    on = judged & ~before & (depth <= far + tolerance)
-    return Sight(int(on.sum()), int(before.sum()), int(judged.sum()))
+    return before, judged & ~before & (depth <= far + tolerance), judged
+
+
+def seen_through(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float) -> float:
+    """Return the part of the points in sight that belong to a part of the surface which the other camera saw through.
+
+    Points on borders and single points do not count: they lie on no surface where a pixel takes in the edge of one and what is behind it.
+    Neither do points of a surface that the other camera sees edge-on.
+
+    Args:
+        a, b: the range images; None: a set of points, which says nothing.
+        cloud_a, cloud_b: in the frames of a and b.
+        pose: [4, 4] a_from_b.
+        tolerance: metres.
+    """
+    through = in_sight = 0
+    for image, cloud, way in ((a, cloud_b, pose), (b, cloud_a, inverse(pose))):
+        if image is None:
+            continue
+        before, on, _ = _seen(image, cloud.points, way, tolerance)
+        at = np.flatnonzero(before & ~cloud.border & (_facing(image, cloud, way) > FACING))
+        if len(at):
+            around, _ = cloud.tree.nearest(cloud.points[at], ALIKE_AROUND + 1)
+            through += int((before[around[:, 1:]].mean(axis=1) >= MOST_ALIKE).sum())
+        in_sight += int(before.sum() + on.sum())
+    return through / max(in_sight, 1)
+
+
+def _facing(image: DepthRange, cloud: Cloud, pose: np.ndarray) -> np.ndarray:
+    """Return the cosine of the angle, up to 90°, between the normal of each point and the line of sight of a range image."""
+    to_camera = -applied(pose, cloud.points) if image.camera.projection == "perspective" else np.array([[0.0, 0.0, 1.0]])
+    along = np.abs((cloud.normals @ pose[:3, :3].T * to_camera).sum(axis=1))
+    return np.asarray(along / np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12))
 
 
 def both_sights(a: DepthRange | None, b: DepthRange | None, points_a: np.ndarray, points_b: np.ndarray, pose: np.ndarray,
