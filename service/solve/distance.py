@@ -114,7 +114,7 @@ def find_distance(capture: Capture, stack: Stack, device: str) -> Distance:
         if capture.camera.projection == "perspective":
             raise
         return Distance(capture, {}, f"{error}; 0 was taken, the default of an orthographic camera: heights, normals and albedo are wrong "
-                        "where it is", 0.0)
+                        "if the surface is elsewhere", 0.0)
 
 
 def _found(capture: Capture, stack: Stack, device: str) -> Distance:
@@ -123,6 +123,9 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
         raise NotTold(f"{where} of {stack.light_count} lights do not tell it ({LEAST_LIGHTS} or more do): measure the mean z of the "
                             "object in the camera frame")
     span = _span(capture)
+    if span <= 0:
+        raise NotTold(f"{where} do not tell it, because all near lights are in one place: measure the mean z of the object in the camera "
+                      "frame")
     depths = np.geomspace(NEAREST * span, FARTHEST * span, TRIALS)
     costs: dict[float, np.ndarray] = {}
     sample = _sample(capture, stack)
@@ -181,16 +184,9 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
 
 
 def _span(capture: Capture) -> float:
-    """Return the largest distance between two of the near lights, metres.
-
-    Raises:
-        ManifestError: they are all in one place.
-    """
+    """Return the largest distance between two of the near lights, metres."""
     places = np.array([light.position_m for _, light in capture.lit_by(PointLight)])
-    span = float(np.linalg.norm(places[:, None] - places, axis=2).max())
-    if span <= 0:
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light.position_m: all near lights are in one place")
-    return span
+    return float(np.linalg.norm(places[:, None] - places, axis=2).max())
 
 
 def _sample(capture: Capture, stack: Stack) -> _Sample:

@@ -35,7 +35,14 @@ def test_the_maps_of_each_step_are_looked_at(page, walk):
     page.get_by_role("heading", name="Maps of step02", level=1).wait_for(timeout=CONTENT_MS)
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
     assert page.get_by_role("button", name="Step after").is_disabled()
+
+
+def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
+    page = browser.new_page(base_url=server.url, bypass_csp=True)  # axe is injected
+    page.goto(f"/jobs/{walk[1]}/maps")
+    page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
     assert violations(page) == []
+    page.close()
 
 
 def test_the_frames_of_each_step_are_on_the_page_of_the_capture(page, walk):
