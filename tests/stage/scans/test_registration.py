@@ -127,20 +127,34 @@ def test_other_objects_and_other_sides_are_not_joined(points_only):
             registered(views, points_only=points_only)
 
 
+def statues(count: int, rows: int, numbers: range | tuple[int, ...]) -> list[View]:
+    """Some of the scans of a turntable with a statue whose body and foot fit as well when they are turned by a quarter or a half."""
+    focal, side = 0.83 * rows * 2.0, (rows, rows * 3 // 4)
+    shots = [statue.shoot(statue.place(2 * np.pi * k / count, (0.1, 1.1, -0.5)[k % 3], 2.0), side, focal, seed=k) for k in numbers]
+    camera = Camera(projection="perspective", resolution=side[::-1], focal_px=(focal, focal))
+    return [View(camera, shot.depth.astype(np.float32), shot.mask, np.full(side, statue.SIGMA, dtype=np.float32), shot.world_from_camera,
+                 shot.true) for shot in shots]
+
+
 @pytest.mark.parametrize("pair", [(3, 6), (2, 5), (0, 8)], ids=["quarter turn", "quarter turn, high", "half turn"])
-def test_a_round_body_on_a_square_foot_is_told_by_its_arm(pair):
-    """Turned by a quarter or a half, body and foot fit as well over more of the surface; arm, blade and plates say that this is wrong."""
-    focal = 0.83 * 240 * 2.0
-    shots = [statue.shoot(statue.place(2 * np.pi * k / 18, (0.1, 1.1, -0.5)[k % 3], 2.0), (240, 180), focal, seed=k) for k in pair]
-    camera = Camera(projection="perspective", resolution=(180, 240), focal_px=(focal, focal))
-    views = [View(camera, shot.depth.astype(np.float32), shot.mask, np.full(shot.side, statue.SIGMA, dtype=np.float32),
-                  shot.world_from_camera, shot.true) for shot in shots]
+def test_a_body_is_told_from_its_turned_self_by_what_sticks_out(pair):
+    """The turned pose matches more of the surface; it would put arm, blade and plates where the other camera saw through."""
+    views = statues(18, 240, pair)
     try:
         wrong = off(views, registered(views))[1]
-    except ScanError as refused:
-        assert "saw through" in str(refused)
-    else:
-        assert np.degrees(np.linalg.norm(wrong[:3])) < 0.1
+    except ScanError:
+        return  # refused, as a pair may be
+    assert np.degrees(np.linalg.norm(wrong[:3])) < 0.1
+
+
+@pytest.mark.long
+def test_a_statue_whose_body_is_symmetric_is_joined_all_around():
+    """Some pairs without much in common are still joined wrongly; the loops through others leave them out."""
+    views = statues(12, 160, range(12))
+    found = registered(views)
+    assert len(found.poses) == 12
+    wrong = off(views, found)
+    assert np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.1 * MM and np.degrees(np.linalg.norm(wrong[:, :3], axis=1)).max() < 0.02
 
 
 def test_outliers_do_not_move_poses():
