@@ -106,8 +106,8 @@ def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch)
 
 
 def test_a_connection_that_has_ended_waits_for_no_collector():
-    """asyncio's transports refer to themselves: the event streams of ten minutes stayed until the oldest generation was collected. Of 21 one
-    or two may stay that ended while the loop was at another step; all of them stayed."""
+    """asyncio's transports refer to themselves: the event streams of ten minutes stayed until the oldest generation was collected. Of 21
+    one or two may stay that ended while the loop was at another step; all of them stayed."""
     with running(ConnectionLimits(20, 20)) as (port, _):
         answered(port)  # what is made once
         gc.collect()
