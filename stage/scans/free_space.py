@@ -42,6 +42,20 @@ class Sight(NamedTuple):
     judged: int
     """Points that fall into the image at pixels with a depth."""
 
+    @property
+    def contradicted_part(self) -> float:
+        """The contradicted part of the points on or before the surface."""
+        return self.contradicted / max(self.agreeing + self.contradicted, 1)
+
+
+class Contradiction(NamedTuple):
+    """The parts of the points of two scans, on or before the surface of the other, that the other contradicts."""
+
+    points: float
+    """All of them."""
+    surface: float
+    """Those of a part of the surface which the other camera cannot have missed."""
+
 
 def depth_range(scan: Scan) -> DepthRange | None:
     """Return the range of depths around each pixel of a range image, or None for a set of points."""
@@ -101,11 +115,12 @@ def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
     return before, judged & ~before & (depth <= far + tolerance), judged
 
 
-def seen_through(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float) -> float:
-    """Return the part of the points in sight that belong to a part of the surface which the other camera saw through.
+def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float
+                  ) -> Contradiction:
+    """Return which parts of the points in sight lie where the other camera saw through.
 
-    Points on borders and single points do not count: they lie on no surface where a pixel takes in the edge of one and what is behind it.
-    Neither do points of a surface that the other camera sees edge-on.
+    On a part of the surface lie points whose neighbours are contradicted too, that are on no border and that the other camera does not see
+    edge-on: where a pixel takes in the edge of a surface and what is behind it, its point lies on neither.
 
     Args:
         a, b: the range images; None: a set of points, which says nothing.
@@ -113,23 +128,25 @@ def seen_through(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, clo
         pose: [4, 4] a_from_b.
         tolerance: metres.
     """
-    through = in_sight = 0
+    through = contradicted = in_sight = 0
     for image, cloud, way in ((a, cloud_b, pose), (b, cloud_a, inverse(pose))):
         if image is None:
             continue
         before, on, _ = _seen(image, cloud.points, way, tolerance)
-        at = np.flatnonzero(before & ~cloud.border & (_facing(image, cloud, way) > FACING))
+        at = np.flatnonzero(before & ~cloud.border)
+        at = at[_facing(image, cloud.points[at], cloud.normals[at], way) > FACING]
         if len(at):
             around, _ = cloud.tree.nearest(cloud.points[at], ALIKE_AROUND + 1)
             through += int((before[around[:, 1:]].mean(axis=1) >= MOST_ALIKE).sum())
+        contradicted += int(before.sum())
         in_sight += int(before.sum() + on.sum())
-    return through / max(in_sight, 1)
+    return Contradiction(contradicted / max(in_sight, 1), through / max(in_sight, 1))
 
 
-def _facing(image: DepthRange, cloud: Cloud, pose: np.ndarray) -> np.ndarray:
+def _facing(image: DepthRange, points: np.ndarray, normals: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Return the cosine of the angle, up to 90°, between the normal of each point and the line of sight of a range image."""
-    to_camera = -applied(pose, cloud.points) if image.camera.projection == "perspective" else np.array([[0.0, 0.0, 1.0]])
-    along = np.abs((cloud.normals @ pose[:3, :3].T * to_camera).sum(axis=1))
+    to_camera = -applied(pose, points) if image.camera.projection == "perspective" else np.array([[0.0, 0.0, 1.0]])
+    along = np.abs((normals @ pose[:3, :3].T * to_camera).sum(axis=1))
     return np.asarray(along / np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12))
 
 

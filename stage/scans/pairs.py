@@ -11,7 +11,7 @@ from stage.scans.cloud import Cloud, prepared
 from stage.scans.coarse import is_near, rough_poses
 from stage.scans.features import fpfh
 from stage.scans.fine import TUKEY, Fit, fit
-from stage.scans.free_space import DepthRange, Sight, both_sights, depth_range, seen_through
+from stage.scans.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
 from stage.scans.rigid import inverse, moved, step_between
 from stage.scans.scan import Scan
 
@@ -108,6 +108,11 @@ class Prepared:
         return float(np.median(self.fine.spacing))
 
 
+def is_contradicted(found: Contradiction) -> bool:
+    """Return whether the free space of two scans refuses a pose."""
+    return found.points > CONTRADICTED or found.surface > SEEN_THROUGH
+
+
 def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
     """Thin a scan to both scales and describe its rough points.
 
@@ -144,7 +149,7 @@ def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -
     """Yield the poses after a fit at the rough scale, each once, without those that the free space contradicts."""
     seen: list[np.ndarray] = []
     for pose in poses:
-        if _part(both_sights(a.image, b.image, a.rough.points, b.rough.points, pose, cell_m)) > MATCHED_CONTRADICTED:
+        if both_sights(a.image, b.image, a.rough.points, b.rough.points, pose, cell_m).contradicted_part > MATCHED_CONTRADICTED:
             continue
         found = fit(a.rough, b.rough, pose, [4 * cell_m, 2 * cell_m])
         if found is None or any(is_near(found.pose, other, b.rough.middle, cell_m) for other in seen):
@@ -153,7 +158,8 @@ def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -
         noise = float(np.median(np.hypot(a.rough.sigma.mean(), b.rough.sigma)))
         if found.residual > max(ROUGH_BEND * cell_m, RATIO * noise):
             continue
-        if _part(both_sights(a.image, b.image, a.rough.points, b.rough.points, found.pose, cell_m / 2)) <= ROUGH_CONTRADICTED:
+        sight = both_sights(a.image, b.image, a.rough.points, b.rough.points, found.pose, cell_m / 2)
+        if sight.contradicted_part <= ROUGH_CONTRADICTED:
             yield found.pose
 
 
@@ -184,21 +190,20 @@ def _judged(a: Prepared, b: Prepared, start: np.ndarray, numbers: tuple[int, int
     area = found.matches / len(b.fine.sample) * b.area
     overlap = min(area / min(a.area, b.area), 1.0)
     tolerance = max(TUKEY * found.residual, 0.5 * spacing)
-    part = _part(both_sights(a.image, b.image, a.fine.points, b.fine.points, found.pose, tolerance))
-    through = seen_through(a.image, b.image, a.fine, b.fine, found.pose, tolerance)
+    against = contradiction(a.image, b.image, a.fine, b.fine, found.pose, tolerance)
     state, reason = PairState.JOINED, ""
     if found.residual > BEND * spacing and found.ratio > RATIO:
         state = PairState.MISFIT
         reason = f"the surfaces lie {1e3 * found.residual:.3g} mm apart (standard deviation): {found.ratio:.3g} times what σ explains"
         if SCALE_LEAST < abs(found.scale) < SCALE_MOST and abs(found.scale) > SCALE_SIGMAS * found.scale_sigma:
             reason += f", and one is {abs(found.scale):.2%} larger than the other: check its scale"
-    elif part > CONTRADICTED or through > SEEN_THROUGH:
-        state, reason = PairState.CONTRADICTED, f"{part:.1%} of the points in sight lie where the other camera saw through"
+    elif is_contradicted(against):
+        state, reason = PairState.CONTRADICTED, f"{against.points:.1%} of the points in sight lie where the other camera saw through"
     elif overlap < least_overlap:
         state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
     if state is PairState.JOINED:
         found = _doubted(a.fine, b.fine, found, 1.5 * spacing)
-    return Pair(*numbers, state, found, overlap, part, reason)
+    return Pair(*numbers, state, found, overlap, against.points, reason)
 
 
 def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
@@ -248,7 +253,3 @@ def _as_good(pair: Pair, best: Pair) -> bool:
 def _same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:
     assert pair.fit is not None and other.fit is not None
     return is_near(pair.fit.pose, other.fit.pose, b.rough.middle, cell_m)
-
-
-def _part(sight: Sight) -> float:
-    return sight.contradicted / max(sight.agreeing + sight.contradicted, 1)

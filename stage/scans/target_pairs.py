@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stage.frames import cross_matrix
-from stage.scans.free_space import both_sights
-from stage.scans.pairs import CONTRADICTED, Evidence, Pair, PairState, Prepared
+from stage.scans.free_space import contradiction
+from stage.scans.pairs import Evidence, Pair, PairState, Prepared, is_contradicted
 from stage.scans.rigid import about, applied, inverse, step_between
 from stage.scans.scan import Target
 from stage.scans.targets import pose_by_targets
@@ -21,7 +21,7 @@ LEAST_TURN = 1e-4
 
 
 class TargetPlace(NamedTuple):
-    """Where a target is by all scans that show it."""
+    """The place of a target, as all scans say that show it."""
 
     name: str
     scans: tuple[int, ...]
@@ -72,11 +72,10 @@ def against_surfaces(pair: Pair, surface: Pair | None, ready: Callable[[int], Pr
         return pair
     a, b = ready(pair.a), ready(pair.b)
     spacing = max(a.spacing, b.spacing)
-    sight = both_sights(a.image, b.image, a.fine.points, b.fine.points, pair.fit.pose, spacing)
-    part = sight.contradicted / max(sight.agreeing + sight.contradicted, 1)
-    if part > CONTRADICTED:
-        return pair._replace(state=PairState.CONTRADICTED, contradicted=part, reason=(
-            f"at the pose of their targets {part:.0%} of the points in sight lie where the other camera saw through"))
+    against = contradiction(a.image, b.image, a.fine, b.fine, pair.fit.pose, spacing)
+    if is_contradicted(against):
+        return pair._replace(state=PairState.CONTRADICTED, contradicted=against.points, reason=(
+            f"at the pose of their targets {against.points:.1%} of the points in sight lie where the other camera saw through"))
     return pair
 
 
