@@ -44,7 +44,7 @@ class Stage(NamedTuple):
     name: str
     seconds: float
     cpu_seconds: float
-    """Of all threads, user and system: what the stage costs however busy the machine is."""
+    """Time of all threads, user and system: what the stage costs however busy the machine is."""
     peak_gib: float
 
 

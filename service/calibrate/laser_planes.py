@@ -9,6 +9,7 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
+from service.calibrate.even_light import even_light, uniform
 from service.calibrate.laser_step import check_step, planes_on_step
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.depth.stripes import stripe_signal
@@ -17,11 +18,9 @@ from service.requests.calibrate import LaserPlanesRequest
 from stage.calibration.laser_plane import board_plane, fit_light_plane, inside_board
 from stage.calibration.procam import find_corners
 from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
 from stage.correction import Correction
 from stage.errors import CalibrationError, ManifestError
 from stage.manifest import FILE_NAME, Frame
-from stage.patterns.base import UniformPattern
 from stage.ranging import LaserPlane
 from stage.triangulation_check import check_perspective
 
@@ -139,22 +138,20 @@ def _laser_frames(capture: Capture) -> list[Frame]:
 def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, device: str) -> tuple[float, list[np.ndarray]]:
     """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
     correction = Correction.of(capture)
-    even = {frame.pattern.code: frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern)}
-    black = correction.apply(even["black"]).pixels if "black" in even else np.float32(0)
-    shown = correction.apply(even["white"]).pixels if "white" in even else correction.ambient if correction.ambient is not None else black
-    if not isinstance(shown, np.ndarray):
+    grey, black = even_light(capture, correction), uniform(capture, correction, "black")
+    if grey is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none shows the board without the laser: add one under a white "
                             'projection, or under the light of the room, {"type": "off"}')
-    corners = find_corners(shown @ np.array(GREY_WEIGHTS, np.float32), board)
+    corners = find_corners(grey, board)
     if corners is None:
         raise CalibrationError(f"{capture.folder}: the board of {board[0]}x{board[1]} inner corners is not found")
     plane = board_plane(corners, board, square_m, capture.camera)
-    inside = inside_board(corners, board, shown.shape[:2])
+    inside = inside_board(corners, board, grey.shape)
     found = []
     # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
-    albedo = np.where(inside, np.maximum(shown @ np.array(GREY_WEIGHTS, np.float32), 0), 0).astype(np.float32)
+    albedo = np.where(inside, np.maximum(grey, 0), 0).astype(np.float32)
     for frame in _laser_frames(capture):
-        signal = stripe_signal(correction.apply(frame).pixels - black, inside)
+        signal = stripe_signal(correction.apply(frame).pixels - (np.float32(0) if black is None else black), inside)
         best = np.zeros((0, 2))
         for along in ("row", "column"):
             stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)

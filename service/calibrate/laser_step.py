@@ -6,17 +6,16 @@ import numpy as np
 
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
+from service.calibrate.even_light import even_light
 from service.depth.laser import ambient_light
 from service.depth.stripes import stripe_signal
 from service.reporting.progress import Timings
 from stage.calibration.laser_step import StepFit, fit_step
 from stage.calibration.step_stripe import StepStripe, split_stripe
 from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
 from stage.correction import Correction
 from stage.errors import CalibrationError
 from stage.manifest import Frame
-from stage.patterns.base import UniformPattern
 
 LEAST_EVEN = 0.02
 """Part of the brightest light of the room below which a pixel says nothing of its albedo."""
@@ -29,7 +28,7 @@ class StepPoses(NamedTuple):
 
     fit: StepFit
     poses: list[dict[str, Any]]
-    """Of each capture for the report: folder, stripes that were used, those that show the riser, the base's distance."""
+    """What the report says of each capture: folder, stripes that were used, those that show the riser, the base's distance."""
 
 
 def planes_on_step(captures: list[Capture], frames: list[list[Frame]], height_m: float, device: str, timings: Timings) -> StepPoses:
@@ -86,13 +85,11 @@ def _stripes(capture: Capture, frames: list[Frame], device: str, pixel: float) -
 
 
 def _albedo(capture: Capture, correction: Correction, mask: np.ndarray) -> np.ndarray | None:
-    """Return how bright the scene is under even light, by which stripes are divided; None where no frame or too little of it shows it."""
-    even = next((frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern) and frame.pattern.code == "white"),
-                None)
-    light = correction.apply(even).pixels if even is not None else correction.ambient
+    """Return how bright the scene is under even light, by which stripes are divided; None: none shows it, or parts are too dark."""
+    light = even_light(capture, correction)
     if light is None:
         return None
-    grey = np.where(mask, light @ np.array(GREY_WEIGHTS, np.float32), 0).astype(np.float32)
+    grey = np.where(mask, light, 0)
     least = LEAST_EVEN * float(grey.max())
     return np.maximum(grey, 0) if least > 0 and (grey[mask] > least).all() else None
 

@@ -66,11 +66,14 @@ def fuse(request: FuseRequest, progress: Progress | None = None, sharing: Shared
     if request.texture and not request.tiles:
         unwrapper()
     with fused_bricks(request, timings, sharing) as fused:
-        made = _tiles(request, scan_set, file, fused, timings) if request.tiles else _whole(request, scan_set, file, fused, timings, device)
+        inputs = digest(file)
+        provenance = metadata(request, capture=scan_set.name, inputs=inputs)
+        made = (_tiles(request, scan_set, file, fused, provenance, timings) if request.tiles else
+                _whole(request, scan_set, file, fused, provenance, timings, device))
     facts = made.facts
     warnings = [*fused.warnings, *_fusion_warnings(facts)]
     report_path = request.out / REPORT_FILE
-    write_text(report_path, report(request, inputs={"name": scan_set.name, "scan_set": digest(file)},
+    write_text(report_path, report(request, inputs={"name": scan_set.name, "scan_set": inputs},
                                    device=devices.describe(device), timings_s=timings.close(), **facts, warnings=warnings))
     return FuseResult(made.mesh_path, made.asset_path, report_path, facts, tuple(warnings))
 
@@ -91,7 +94,8 @@ class _Made(NamedTuple):
     facts: dict[str, Any]
 
 
-def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, timings: Timings, device: str) -> _Made:
+def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, provenance: dict[str, str], timings: Timings,
+           device: str) -> _Made:
     """Write one mesh, and the asset with its textures."""
     timings.stage("join", 1)
     surface = joined_surface(fused.bricks(), len(fused.used))
@@ -119,17 +123,16 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
         asset_path = request.out / ASSET_FILE
         facts["texture"] = {"vertices": int(baked[0].place.max()) + 1, "faces": len(baked[0].mesh.triangles),
                             "seen_share": round(baked[1].seen_share, 4)}
-        write_fused(baked[0], baked[1], asset_path, name=scan_set.name,
-                    provenance=metadata(request, capture=scan_set.name, inputs=digest(file)))
+        write_fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance)
     write_mesh_ply(mesh, request.out / MESH_FILE, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
     return _Made(request.out / MESH_FILE, asset_path, facts)
 
 
-def _tiles(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, timings: Timings) -> _Made:
+def _tiles(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, provenance: dict[str, str], timings: Timings
+           ) -> _Made:
     """Write one mesh for each brick, and a layer that refers to all."""
     timings.stage("tiles", max(len(fused.places), 1))
-    written = write_tiles(fused, request.out, name=scan_set.name,
-                          provenance=metadata(request, capture=scan_set.name, inputs=digest(file)), advance=timings.advance)
+    written = write_tiles(fused, request.out, name=scan_set.name, provenance=provenance, advance=timings.advance)
     _require_surface(file, written.facts["faces"], fused.voxel)
     return _Made(None, written.path, written.facts | {"scans": scan_facts(fused, written.tallies)})
 

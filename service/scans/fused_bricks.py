@@ -17,15 +17,15 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.fuse import FuseRequest, Misplaced
 from service.scans.misplaced import Placing, Readings, place_scans, reach_of, readings_of
-from service.scans.pieces import FolderPieces, SharedPieces
+from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.scans.placing_words import placing_warnings
 from service.scans.prepared_scans import PreparedScans, ScanSummary
 from service.scans.range_images import WIDTHS, PreparedScan
-from service.scans.stored_arrays import packed, packed_brick, unpacked, unpacked_brick
+from service.scans.stored_bricks import packed_brick, unpacked_brick
 from service.scans.surface import BrickSurface, box_of, bricks_of, fuse_brick, origin_of, watching_views
 from service.solve.sharing import digest, kind_of_worker
-from stage.depth_maps import DEPTH_FILE
-from stage.scans.records import ScanSet, read_scan_set
+from stage.packed_arrays import packed, unpacked
+from stage.scans.records import read_scan_set
 
 
 class FusedBricks(NamedTuple):
@@ -68,15 +68,10 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
         work = Path(held.enter_context(TemporaryDirectory(prefix="relit-fuse-")))
         pieces = sharing or SharedPieces(FolderPieces(request.cache or work / "pieces"))
         device = devices.resolve(request.device)
-        pieces.identify(scan_set.model_dump_json(), _stamps(file, scan_set, timed=sharing is None), kind_of_worker(device))
+        places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
+        pieces.identify(scan_set.model_dump_json(), stamps(places, timed=sharing is None), kind_of_worker(device))
         (work / "scans").mkdir()
         yield _phases(request, file, PreparedScans(file, scan_set, work / "scans"), pieces, timings, device)
-
-
-def _stamps(file: Path, scan_set: ScanSet, *, timed: bool) -> tuple[tuple[int, int], ...]:
-    places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
-    files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
-    return tuple((path.stat().st_size, path.stat().st_mtime_ns if timed else 0) for path in files)
 
 
 def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:

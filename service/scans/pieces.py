@@ -5,21 +5,30 @@ name of its phase and its own, from where all read it. A run that is begun again
 follows from is part of its name, so that nothing of another run is taken for it.
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from service.errors import DivergedError
-from service.solve.sharing import LOOK_S, PieceStore, digest
+from service.solve.piece_store import LOOK_S, PieceStore, agree, opened, sealed
+from service.solve.sharing import digest
+from stage.depth_maps import DEPTH_FILE
 from stage.errors import storage
 from stage.files import replacing
 
-DIGEST_BYTES = 32
-"""Length of the SHA-256 before the content of a piece."""
 DONE, CLAIM = ".done", ".claim"
 """Suffixes of the names under which it is kept that a piece is done, and who does it."""
+
+
+def stamps(places: Sequence[Path], *, timed: bool) -> tuple[tuple[int, int], ...]:
+    """Return the size and the time of the last change of the files of scans, by which a run that is begun again knows them.
+
+    Args:
+        places: files, and folders of depth results; what is not there is left out.
+        timed: whether times count: workers on several machines have copies of other times.
+    """
+    files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
+    return tuple((path.stat().st_size, path.stat().st_mtime_ns if timed else 0) for path in files)
 
 
 class FolderPieces:
@@ -95,16 +104,21 @@ class SharedPieces:
         follows = digest((name, follows_from))
         phase = f"{self._run[:16]}/{self._phases:03d}-{name}"
         folder = f"{phase}-{follows[:16]}"
-        self._agree(phase, follows)
+        agree(self._store, phase, follows, leads=self._leads, is_begun=not self._has_agreed)
+        self._has_agreed = True
         if len(pieces) > 1:
             self._invite(len(pieces))
         left = list(pieces) if self._leads else list(pieces)[::-1]  # who helps begins at the other end: neighbours read the same scans
         running: dict[Future[None], str] = {}
 
         def made(piece: str) -> None:
-            content = make(piece)
-            self._store.write(f"{folder}/{piece}", hashlib.sha256(content).digest() + content)
+            self._made(f"{folder}/{piece}", piece, make)
             self._store.write(f"{folder}/{piece}{DONE}", b"")
+
+        def content(piece: str) -> bytes:
+            """Return what is kept of a piece, which is made once more if its file was damaged or removed."""
+            name = f"{folder}/{piece}"
+            return opened(self._store.read(name)) or self._made(name, piece, make)
 
         with ThreadPoolExecutor(threads) as pool:
             try:
@@ -123,7 +137,7 @@ class SharedPieces:
                 for future in running:
                     future.cancel()
         advance(len(pieces))
-        return lambda piece: self._content(f"{folder}/{piece}") or self._again(folder, piece, make)
+        return content
 
     def _begin(self, left: Sequence[str], folder: str, threads: int, begin: Callable[[str], None], running: dict[Future[None], str]
                ) -> list[str]:
@@ -140,29 +154,8 @@ class SharedPieces:
                 others.append(piece)
         return others
 
-    def _content(self, name: str) -> bytes | None:
-        """Return the content of a piece, or None if it is not there or damaged."""
-        stored = self._store.read(name)
-        if stored is None or hashlib.sha256(stored[DIGEST_BYTES:]).digest() != stored[:DIGEST_BYTES]:
-            return None
-        return stored[DIGEST_BYTES:]
-
-    def _again(self, folder: str, piece: str, make: Callable[[str], bytes]) -> bytes:
-        """Make a piece once more whose file was damaged or removed."""
+    def _made(self, name: str, piece: str, make: Callable[[str], bytes]) -> bytes:
+        """Make a piece, keep and return it."""
         content = make(piece)
-        self._store.write(f"{folder}/{piece}", hashlib.sha256(content).digest() + content)
+        self._store.write(name, sealed(content))
         return content
-
-    def _agree(self, phase: str, follows: str) -> None:
-        """Record what a phase follows from, or compare it with what the worker that leads has recorded.
-
-        Raises:
-            DivergedError: this worker does not lead, and has something else.
-        """
-        found = self._store.read(phase)
-        if self._leads:
-            if found != follows.encode():
-                self._store.write(phase, follows.encode())
-        elif found != follows.encode() and (not self._has_agreed or found is not None):
-            raise DivergedError("inputs, versions or findings are not those of the worker that has the job")
-        self._has_agreed = True

@@ -12,9 +12,9 @@ from service.errors import RequestError
 from service.scans.misplaced import Sample, sample_of
 from service.scans.range_images import PreparedScan, prepare_scan, with_layers
 from service.scans.read import read_scan
-from service.scans.stored_arrays import packed, unpacked
 from service.scans.surface import centre_of
 from stage.camera import Camera
+from stage.packed_arrays import packed, unpacked
 from stage.scans.records import ScanSet
 
 LEAST_PIXELS = 100

@@ -110,9 +110,8 @@ def depth_number(request: DepthRequest, number: int, progress: Progress) -> None
 def _checked(request: SolveRequest | DepthRequest, number: int) -> Sequence:
     """Return the sequence, all of which is checked before its first step, and one step with the first before another."""
     sequence = read_sequence(request.capture, frames_per_second=request.frame_rate)
-    if number > len(sequence.steps):
-        raise RequestError(f"{request.capture}: has {len(sequence.steps)} steps now, and had more when it was checked")
-    check_alike(sequence if number == 1 else sequence._replace(steps=(sequence.steps[0], sequence.steps[number - 1])))
+    step = sequence.step(number, request.capture)
+    check_alike(sequence if number == 1 else sequence._replace(steps=(sequence.steps[0], step)))
     check_outputs(request.out, sequence)
     return sequence
 

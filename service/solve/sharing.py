@@ -11,37 +11,20 @@ import hashlib
 import io
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.relight import cublas
-from service.errors import DivergedError
 from service.reporting.provenance import versions
+from service.solve.piece_store import LOOK_S, PieceStore, agree, opened, sealed
 from service.solve.several_devices import deal
 
 Piece = TypeVar("Piece")
-LOOK_S = 0.2
-"""Seconds between two looks for the pieces that others do."""
 LEAST_PIECES = 2
 """A pass of fewer pieces is done by every worker."""
-DIGEST_BYTES = 32
-"""Length of the SHA-256 before the arrays of a piece."""
-
-
-class PieceStore(Protocol):
-    """Where the workers of a solve store what they find. The methods are called by several threads."""
-
-    def read(self, name: str) -> bytes | None:
-        """Return what was stored under a name, or None."""
-
-    def write(self, name: str, content: bytes) -> None:
-        """Store something under a name, whole or not at all."""
-
-    def claim(self, name: str) -> bool:
-        """Return whether this worker is to do a piece: False while another, which is still at work, has claimed it."""
 
 
 class Results(NamedTuple):
@@ -120,28 +103,16 @@ class _Pass:
 
     def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
         self._store, self._name, self._leads, self._arrays = store, name, leads, arrays
-        self._follows_from = follows_from.encode()
+        self._follows_from = follows_from
         self._folder = f"{name}-{follows_from[:16]}"
 
     def agree(self, *, is_begun: bool = False) -> None:
-        """Record what the pass follows from, or compare it with what the worker that leads has recorded.
-
-        Args:
-            is_begun: whether the worker that leads has begun this pass, if it solves the same.
-
-        Raises:
-            DivergedError: this worker does not lead, and has something else.
-        """
-        found = self._store.read(self._name)
-        if self._leads and found != self._follows_from:
-            self._store.write(self._name, self._follows_from)
-        elif not self._leads and found != self._follows_from and (is_begun or found is not None):
-            raise DivergedError("inputs, versions, device or findings are not those of the worker that has the job")
+        """Record what the pass follows from, or compare it with what the worker that leads has recorded; as of piece_store.agree."""
+        agree(self._store, self._name, self._follows_from, leads=self._leads, is_begun=is_begun)
 
     def read(self, number: int, pixels: Any) -> bool:
         """Take over what another worker has found in a piece; return False if it is not there."""
-        content = self._store.read(self._file(number))
-        found = None if content is None else _unpacked(content)
+        found = _unpacked(self._store.read(self._file(number)))
         places = [array[..., pixels] for array in self._arrays]
         if found is None or [(a.shape, a.dtype) for a in found] != [(a.shape, a.dtype) for a in places]:
             return False
@@ -200,16 +171,15 @@ def _add(value: object, add: Callable[[bytes], None]) -> None:
 
 
 def _packed(arrays: Sequence[np.ndarray]) -> bytes:
-    """Return arrays as bytes, with their SHA-256 before them."""
+    """Return arrays as sealed bytes."""
     buffer = io.BytesIO()
     np.savez(buffer, *arrays, allow_pickle=False)
-    content = buffer.getvalue()
-    return hashlib.sha256(content).digest() + content
+    return sealed(buffer.getvalue())
 
 
-def _unpacked(content: bytes) -> list[np.ndarray] | None:
-    """Return the arrays of `_packed`, or None if the bytes are not what was written."""
-    if hashlib.sha256(content[DIGEST_BYTES:]).digest() != content[:DIGEST_BYTES]:
+def _unpacked(stored: bytes | None) -> list[np.ndarray] | None:
+    """Return the arrays of `_packed`, or None if the bytes are not there or not what was written."""
+    if (content := opened(stored)) is None:
         return None
-    with np.load(io.BytesIO(content[DIGEST_BYTES:]), allow_pickle=False) as found:
+    with np.load(io.BytesIO(content), allow_pickle=False) as found:
         return [found[name] for name in found.files]

@@ -12,9 +12,9 @@ from stage.scans.rigid import applied
 ALL_PAIRS = 32
 """Up to so many scans every pair is tried."""
 PARTNERS = 12
-"""Of more scans a pair is tried if it is among so many of one of its scans that overlap most."""
+"""A pair of more scans is tried if it is among so many of one of its scans that overlap most."""
 ALIKE_AT_ONCE = 6
-"""Of more scans without poses, the most similar that each is tried with before the poses of those that are found are used."""
+"""The most similar scans with which each of more scans without poses is tried, before the poses that are found are used."""
 SAMPLE = 200
 """The most features of a scan that are compared with those of others."""
 CELL_LIMIT = 1 << 20

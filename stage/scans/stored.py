@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from stage.camera import Camera
+from stage.packed_arrays import packed
 from stage.scans.cloud import Cloud
 from stage.scans.fine import Fit, Rows
 from stage.scans.free_space import DepthRange
@@ -30,7 +31,7 @@ def packed_scan(ready: Prepared) -> bytes:
     if ready.image is not None:
         arrays |= {"nearest": ready.image.nearest, "farthest": ready.image.farthest, "step": ready.image.step,
                    "camera": np.frombuffer(ready.image.camera.model_dump_json(by_alias=True).encode(), dtype=np.uint8)}
-    return _saved(arrays)
+    return packed(arrays)
 
 
 def unpacked_scan(content: bytes) -> Prepared:
@@ -59,7 +60,7 @@ def packed_pair(pair: Pair) -> bytes:
         assert pair.fit.rows is not None
         arrays |= {name: np.asarray(getattr(pair.fit, name), dtype=np.float64) for name in FIT}
         arrays |= {f"rows_{name}": getattr(pair.fit.rows, name) for name in ROWS}
-    return _saved(arrays)
+    return packed(arrays)
 
 
 def unpacked_pair(content: bytes) -> Pair:
@@ -78,9 +79,3 @@ def unpacked_rows(content: bytes) -> Rows:
     """Return the rows of a pair of `packed_pair`."""
     with np.load(io.BytesIO(content), allow_pickle=False) as found:
         return Rows(*(found[f"rows_{name}"] for name in ROWS))
-
-
-def _saved(arrays: dict[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()

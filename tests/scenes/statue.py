@@ -13,6 +13,7 @@ from stage.camera import Camera
 from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
 from stage.ply import PointCloud, write_ply
+from tests.reference.projector import look_at
 
 SIGMA = 2.5e-4
 """Standard deviation of every depth, metres."""
@@ -73,12 +74,7 @@ class Shot(NamedTuple):
 def place(angle: float, height: float, range_m: float, *, target: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """World from camera of a camera that looks at the target from an angle about +y."""
     eye = np.array(target) + [range_m * np.sin(angle), height, range_m * np.cos(angle)]
-    back = (eye - target) / np.linalg.norm(eye - target)
-    right = np.cross([0, 1, 0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
-    return pose
+    return look_at(eye, target)
 
 
 def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float = SIGMA, seed: int = 0, scene=distance) -> Shot:

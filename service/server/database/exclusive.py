@@ -21,7 +21,10 @@ def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
     """
     if connection.dialect.name == "postgresql":
         connection.execute(sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :space))"), {"name": name, "space": kind})
-    elif not connection.connection.dbapi_connection.in_transaction:  # type: ignore[union-attr]
+        return
+    driver = connection.connection.dbapi_connection
+    assert driver is not None, "the connection is open"
+    if not driver.in_transaction:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 

@@ -57,12 +57,9 @@ def time_step(sequence: Path, number: int) -> TimeStep:
         number: of the step, from 1.
 
     Raises:
-        RequestError: it has fewer steps.
+        ManifestError: it has fewer steps by now.
     """
-    steps = read_sequence(sequence).steps
-    if number > len(steps):
-        raise RequestError(f"{sequence}: has {len(steps)} steps now, and had more when it was checked")
-    return steps[number - 1]
+    return read_sequence(sequence).step(number, sequence)
 
 
 def intake_place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, Path | None]:

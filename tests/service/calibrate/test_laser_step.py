@@ -19,7 +19,7 @@ def calibrated(relit, *words):
 
 
 def errors(folder):
-    """Of each plane: error of its tilt in degrees, of depths as a part, and both in their standard errors."""
+    """Errors of each plane: of its tilt in degrees, of depths as a part, and both in their standard errors."""
     found = [frame.laser for frame in Capture.open(folder).manifest.frames if frame.laser is not None]
     entries = json.loads((folder / "calibration.json").read_text())["laser-planes"]["planes"]
     rows = []

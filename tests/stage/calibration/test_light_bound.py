@@ -7,7 +7,7 @@ from tests.reference.light_directions import least_error_degrees
 
 @pytest.mark.parametrize("count", [12, 16, 24])
 def test_what_all_lights_share_is_left(count):
-    """Of 3 × 3 numbers one is a common strength, which turns no light: eight of 2n are those of the table. A turn, three, is left where the
+    """One of 3 × 3 numbers is a common strength, which turns no light: eight of 2n are those of the table. A turn, three, is left where the
     strengths are known, and a little more by readings of half a per cent."""
     assert least_error_degrees(count, table_degrees=5.0, strength=10.0) == pytest.approx(5 * (8 / (2 * count)) ** 0.5, rel=0.01)
     known = least_error_degrees(count, table_degrees=5.0, strength=0.001)

@@ -14,7 +14,7 @@ from tests.stage.scans.test_registration import off, scan_of, seen
 FEW = 3
 """Scans up to which all pairs are tried here."""
 MIDDLE = np.array([0.14, 0.1, 0.08])
-"""Of an arm of the figure."""
+"""The middle of an arm of the figure, metres."""
 
 
 def bounded(monkeypatch, partners: int) -> None:
@@ -46,7 +46,7 @@ def test_a_part_of_all_pairs_is_enough(known, monkeypatch):
 
 
 def test_scans_are_thinned_to_a_bound(monkeypatch):
-    """Of 5000 points 1500 are kept, and of a range image of 10 800 pixels 1000 squares."""
+    """1500 of 5000 points are kept, and 1000 squares of a range image of 10 800 pixels."""
     monkeypatch.setattr(cloud, "MOST_POINTS", 1500)
     monkeypatch.setattr(free_space, "MOST_PIXELS", 1000)
     views = seen(figure, 0, 40)

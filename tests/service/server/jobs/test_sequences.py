@@ -6,7 +6,6 @@ import signal
 import numpy as np
 import pytest
 
-from service.errors import RequestError
 from service.reporting.provenance import places_named
 from service.requests.base import SequenceOptions
 from service.requests.identifiers import CAPTURE, new_id
@@ -19,6 +18,7 @@ from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
+from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step
 from tests.service.server.jobs.harness import PROJECT, harness
@@ -100,7 +100,7 @@ def test_without_joining_there_are_the_steps_alone(idle_harness, sequence):
 def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):
     capture = idle_harness.register(sequence, CAPTURE, captures=STEPS + 1, steps=STEPS + 1)
     job = Job(new_id("job"), PROJECT, DepthJob(kind="depth", capture=capture), 1)
-    with pytest.raises(RequestError, match="has 4 steps now, and had more when it was checked"):
+    with pytest.raises(ManifestError, match="has 4 steps now, and had more when it was checked"):
         run(job, context_of(idle_harness, idle_harness.settings, sequence), f"step {STEPS + 1}")
 
 

@@ -47,7 +47,7 @@ def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
 
 
 def test_the_frames_of_each_step_are_on_the_page_of_the_capture(page, walk):
-    """Whose view is prepared first, as that of every capture that is opened for the first time."""
+    """The view of the capture is prepared first, as for every capture that is opened for the first time."""
     page.goto(f"/captures/{walk[0]}?step=2")
     page.locator("#frames canvas").first.wait_for(timeout=CONTENT_MS)
     assert page.get_by_label("Time step").input_value() == "2"

@@ -1,27 +1,11 @@
-"""Arrays as bytes, and the surfaces of bricks as such."""
-
-import io
-from collections.abc import Mapping
-from typing import Any
+"""The surfaces of bricks as bytes."""
 
 import numpy as np
 
 from service.scans.surface import VERTEX, BrickSurface
+from stage.packed_arrays import packed, unpacked
 
 TALLIES = "tallies"
-
-
-def packed(arrays: Mapping[str, Any]) -> bytes:
-    """Return arrays and numbers by their names as bytes."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
-
-
-def unpacked(content: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of `packed`."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as found:
-        return {name: found[name] for name in found.files}
 
 
 def packed_brick(surface: BrickSurface) -> bytes:
