@@ -157,6 +157,8 @@ class Memory(NamedTuple):
     last: float
     per_minute: float
     """Slope of a line through what was seen since it settled."""
+    by_minute: list[float]
+    """Medians of each minute from the first."""
 
 
 def watch_memory(pid: int, seconds: float) -> Memory:
@@ -170,7 +172,8 @@ def watch_memory(pid: int, seconds: float) -> Memory:
     tenth = max(1, len(late) // 10)
     slope = np.polyfit(late[:, 0] / 60, late[:, 1], 1)[0]
     half = late[late[:, 0] >= seconds / 2]
-    return Memory(*(float(np.median(part[:, 1])) for part in (late[:tenth], half[:tenth], late[-tenth:])), float(slope))
+    by_minute = [float(np.median([size for at, size in seen if at // 60 == minute])) for minute in range(int(seconds // 60))]
+    return Memory(*(float(np.median(part[:, 1])) for part in (late[:tenth], half[:tenth], late[-tenth:])), float(slope), by_minute)
 
 
 def _resident(pid: int) -> float:
@@ -204,6 +207,7 @@ def load_rows(minutes: float, clients: int, interval_s: float, uploads: int, cor
                   f"{reads.max():.0f} | {counts['events']} | {counts['jobs']} of {FRAMES} frames | {counts['files']} | "
                   f"{sum(load.errors.values())} | {memory.settled:.1f} | {memory.half:.1f} | {memory.last:.1f} | "
                   f"{memory.per_minute:+.2f} |",
+            f"\nMemory in each minute, medians, MiB: {', '.join(f'{size:.1f}' for size in memory.by_minute)}",
             *(f"\n{count} × {error}" for error, count in load.errors.items())]
 
 
