@@ -17,7 +17,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import pack_type
 from kernels.relight.borders import LatLongSamples, Shares, divide, reach
-from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
+from kernels.relight.latlong import SampleGrid, check, first_of_equals
+from kernels.relight.turned_sums import LightEnergy, gather
 
 COSINE_STEP = 1e-6
 """Largest error of a cosine, or of the difference of two cosines, in float32."""

@@ -1,18 +1,16 @@
-"""A lat-long map cut into samples, and their energy summed over lights.
+"""A lat-long map cut into samples, and rotations of it that share them.
 
 Samples lie at most half a degree apart, so that a coarse map is cut finer than its texels. Nothing is resampled when the map turns:
-the lights are turned the other way instead. Sums are taken on the host in float64, so that the parts of a sample, whichever lights
-they go to, are the whole of it.
+the lights are turned the other way instead.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.relight.borders import Shares
 
 SAMPLE_PITCH_DEGREES = 0.5
 """Largest width of a sample, degrees: a sample is then so nearly flat that the areas of its parts are off by 3e-5 of its area."""
@@ -27,13 +25,6 @@ BAND_SAMPLES = 1 << 19
 EQUAL_COLUMNS = 1e-6
 """Rotations whose difference is a whole number of columns to within this part of one column, less than a thousandth of a second of arc,
 share one split of the samples."""
-
-
-class LightEnergy(NamedTuple):
-    """Energy of an environment that each light stands for."""
-
-    energy: np.ndarray  # [frames, lights, 3] float64: ∫ w L dω, W/m² of the map's unit; w is the light's part of each direction
-    solid_angle: np.ndarray  # [frames, lights] float64 steradians: ∫ w dω
 
 
 class SampleGrid(NamedTuple):
@@ -137,34 +128,3 @@ def shared_turns(rotations: np.ndarray, columns: int) -> Iterator[Turn]:
         cosine, sine = np.cos(angle), np.sin(angle)
         rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
         yield Turn(rotation, tuple(frame for frame, _ in members), tuple(whole for _, whole in members))
-
-
-def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
-           split: Callable[[np.ndarray, SampleGrid], Iterable[Shares]]) -> LightEnergy:
-    """Sum the energy of the samples of a map over lights.
-
-    Args:
-        environment: [rows, cols, 3] scene-linear radiance.
-        rotations: [frames, 3, 3] of the map.
-        lights: how many there are.
-        split: (rotation, band) → which parts of the band's samples go where; the shares of a sample add up to one.
-
-    Returns:
-        Energy and solid angle of each light; both sum to those of the whole map.
-    """
-    energy, areas = np.zeros((len(rotations), lights, 3)), np.zeros((len(rotations), lights))
-    for band in cut(*environment.shape[:2]).bands():
-        solid_angle = np.repeat(band.solid_angle, len(band.azimuth))
-        amounts = [np.repeat(environment[band.texel_row, :, channel].astype(np.float64), band.across, axis=1)
-                   * band.solid_angle[:, None] for channel in range(3)]
-        for turn in shared_turns(rotations, len(band.azimuth)):
-            parts = [part._replace(light=part.light.astype(np.intp), share=np.ascontiguousarray(part.share))
-                     for part in split(turn.rotation, band)]  # as they are read for every frame
-            for part in parts:
-                areas[list(turn.frames)] += np.bincount(part.light, weights=solid_angle[part.sample] * part.share, minlength=lights)
-            for frame, columns in zip(turn.frames, turn.columns, strict=True):
-                for channel, amount in enumerate(amounts):
-                    moved = np.roll(amount, -columns, axis=1).reshape(-1)
-                    for part in parts:
-                        energy[frame, :, channel] += np.bincount(part.light, weights=moved[part.sample] * part.share, minlength=lights)
-    return LightEnergy(energy, areas)

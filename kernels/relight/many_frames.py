@@ -86,8 +86,8 @@ def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
     padded = _padded(weights, GROUP)
     for channel in range(channels):
         for first in range(0, count, GROUP):
-            last = min(first + GROUP, count)
-            sums[first:last, channel] = np.matmul(padded[first : first + GROUP, channel], planes[channel])[: last - first]
+            last, group = min(first + GROUP, count), padded[first : first + GROUP, channel]
+            sums[first:last, channel] = np.matmul(group, planes[channel])[: last - first] if group.any() else 0
     return frames
 
 

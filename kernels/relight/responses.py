@@ -26,6 +26,11 @@ class Responses(NamedTuple):
     matt: wp.array  # [n, P] float32 packs: visibility · n·l / π; times albedo it is the diffuse part of the radiance
     gloss: wp.array  # [3 n, P] float32 packs: the specular part, R of all directions, then G, then B
 
+    def room(self, count: int, packs: int) -> "Responses":
+        """Return the same memory, for the responses of as many packs or fewer to as many directions or fewer."""
+        return Responses(*(plane.flatten()[: rows * packs].reshape((rows, packs))
+                           for plane, rows in zip(self, (count, 3 * count), strict=True)))
+
 
 def empty_responses(count: int, packs: int, device: str) -> Responses:
     """Return memory for the responses of some packs to some directions."""

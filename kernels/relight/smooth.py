@@ -15,8 +15,9 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.relight.borders import Shares
-from kernels.relight.latlong import LightEnergy, SampleGrid, check, first_of_equals, gather
+from kernels.relight.latlong import SampleGrid, check, first_of_equals
 from kernels.relight.triangulation import SphereTriangles, edge_planes, find_faces, triangulate_sphere
+from kernels.relight.turned_sums import LightEnergy, gather
 
 RUN = 64
 """Number of neighbouring samples that one thread locates: it seeks the triangle of the first over the whole sphere, and that of each other

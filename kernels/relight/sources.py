@@ -37,6 +37,10 @@ class Sources(NamedTuple):
         """Number of samples."""
         return len(self.place)
 
+    def taken(self, chosen: np.ndarray) -> "Sources":
+        """Return some of the samples, by their numbers [m]."""
+        return Sources(*(values[chosen] for values in self))
+
     def scaled(self, part: np.ndarray) -> "Sources":
         """Return the samples with a part [n] of their energy, without those that have none."""
         kept = part > 0

@@ -32,10 +32,10 @@ class RowBlock(NamedTuple):
     """Their pixels in the stack; those of the last rows include its padding."""
 
 
-def chunk_frames(stack: Stack) -> int:
-    """Return how many whole frames a chunk holds."""
+def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:
+    """Return how many whole frames a chunk holds, `most` at most."""
     channels, _, pixels = stack.shape
-    return max(1, min(CHUNK_FRAMES, CHUNK_BYTES // (4 * channels * pixels)))
+    return max(1, min(most, CHUNK_BYTES // (4 * channels * pixels)))
 
 
 def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:

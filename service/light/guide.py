@@ -78,7 +78,7 @@ class Guide:
         except ArrayError as error:
             raise ResultError(f"{where}: cannot guide this capture: a model helps between four lights or more that are not all in one "
                               "plane") from error
-        self._model, self._lights, self._stack = SurfaceModel(maps, where, device), lights, stack
+        self._model, self._lights, self._stack = SurfaceModel(maps, where, device, by_normal=True), lights, stack
         self._place = np.concatenate([lights.direction, np.zeros((len(lights.direction), 1))], axis=1)
         self._keep = len(self._place) * len(self._model.pixels) <= KEPT_BYTES
         self._seen: dict[int, wp.array] = {}
@@ -178,11 +178,16 @@ class Guide:
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         chunk = self._range.chunk(lights, places)
+        if chunk.beyond is not None:
+            _ = self.trust_beyond  # before several threads ask for it
         done = 0
         for batch in self._model.batches():
             band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
-            for at, lit in self._range.light(batch, band, self.stack.scale, self._visible(batch), chunk):
+
+            def use(at: slice, lit: LitModel, batch: ModelBatch = batch, done: int = done) -> None:
                 self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
+
+            self._range.light(batch, band, self.stack.scale, self._visible(batch), chunk, use)
             done += len(batch.pixels)
         return mirrored
 

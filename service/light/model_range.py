@@ -1,7 +1,11 @@
 """The model of a surface under the light of many frames: what depends on the surface is computed once for all of them, one portion of
-its pixels after another; what depends on a frame is a matrix product and a few samples."""
+its pixels after another; what depends on a frame is a matrix product and a few samples. The pixels of a portion have like normals, so that
+the directions behind all of them, where responses are 0, are left out."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +27,12 @@ from service.light.range_light import RangeBeyond, RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
 from stage.point_lights import DistantLights
 
-RESPONSE_BYTES = 64 << 20
-"""Most bytes of responses that are in memory at one time; they choose how many pixels a portion has."""
-
+RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 64 << 20
+"""Most bytes of responses that a CPU thread and a CUDA device keep at one time; they choose how many pixels a portion has."""
+HORIZON_FRAMES = 32
+"""Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
+ROUNDING = 1e-4
+"""A direction whose cosine to every normal of a portion is below minus this lights none of its pixels, in float32 neither."""
 
 NO_SOURCES = far(np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -45,6 +52,10 @@ class FrameEnergy(NamedTuple):
             weights[place] = each.T
         return FrameEnergy(weights, list(places))
 
+    def at(self, directions: np.ndarray) -> "FrameEnergy":
+        """Return the energy at some of the directions, by their numbers."""
+        return self._replace(weights=self.weights[:, :, directions])
+
     def matt(self, responses: Responses, albedo: np.ndarray) -> np.ndarray:
         """Return [frames, 3, n] the diffuse part of the radiance of pixels of an albedo [3, n]."""
         count, _, terms = self.weights.shape
@@ -56,13 +67,21 @@ class FrameEnergy(NamedTuple):
         return np.asarray(combine_rows(rows, self.weights).numpy()[self.places, :, :count])
 
 
+class SmallLights(NamedTuple):
+    """The small bright places of neighbouring frames."""
+
+    frames: slice
+    """Which of the frames that are made."""
+    sources: FrameSources
+    direction: np.ndarray  # [n, 3] of the samples of all these frames
+
+
 class ChunkLight(NamedTuple):
     """The light of the frames of a chunk, on the device as far as it is shaded."""
 
     broad: FrameEnergy
     captured: FrameEnergy
-    small: FrameSources
-    small_directions: np.ndarray  # [n, 3] of the small samples of all frames
+    small: tuple[SmallLights, ...]
     added: FrameEnergy | None
     beyond: "ChunkBeyond | None"
 
@@ -83,7 +102,9 @@ class Portion(NamedTuple):
     surface: Surface
     band: Band
     visible: wp.array  # [lights, P] of the captured lights
-    horizons: Horizons | None
+    horizons: tuple[Horizons | None, ...]
+    """For each group of small lights; None where it has none."""
+    normal: np.ndarray  # [n, 3]
     albedo: np.ndarray  # [3, n]
 
 
@@ -98,10 +119,10 @@ class ModelRange:
         Raises:
             ArrayError: fewer than four lights, or all in one plane.
         """
-        towards = direction_grid().direction
-        grid = FarSamples(towards, np.ones((len(towards), 3)), np.zeros(len(towards), dtype=bool))
+        self._towards = direction_grid().direction
+        grid = FarSamples(self._towards, np.ones((len(self._towards), 3)), np.zeros(len(self._towards), dtype=bool))
         self._model, self._lights = model, lights
-        self._grid = upload_sources(hidden_as_captured(grid, lights.direction), model.device)
+        self._grid = hidden_as_captured(grid, lights.direction)
         self._captured = upload_sources(captured_lights(lights.direction, lights.irradiance), model.device)
 
     def chunk(self, lights: Sequence[RangeLight], places: Sequence[int]) -> ChunkLight:
@@ -112,7 +133,6 @@ class ModelRange:
             places: position of each frame in the full chunk.
         """
         nothing = np.zeros_like(lights[0].captured)
-        samples = own_rows(join([each.small for each in lights]))
         added = [nothing if each.added is None else each.added for each in lights]
         beyond = None
         if any(each.beyond is not None for each in lights):
@@ -120,14 +140,24 @@ class ModelRange:
             small = upload_frames(join([each.small for each in parts]), [each.small.count for each in parts], self._model.device)
             beyond = ChunkBeyond(FrameEnergy.of([each.broad for each in parts], places),
                                  FrameEnergy.of([each.captured for each in parts], places), small)
+        has_added = any(each.added is not None for each in lights)
         return ChunkLight(FrameEnergy.of([each.broad for each in lights], places),
-                          FrameEnergy.of([each.captured for each in lights], places),
-                          upload_frames(samples, [each.small.count for each in lights], self._model.device), samples.place[:, :3],
-                          FrameEnergy.of(added, places) if any(each.added is not None for each in lights) else None, beyond)
+                          FrameEnergy.of([each.captured for each in lights], places), tuple(self._small_lights(lights, places)),
+                          FrameEnergy.of(added, places) if has_added else None, beyond)
 
-    def light(self, batch: ModelBatch, band: Band, scale: np.ndarray, visible: wp.array,
-              light: ChunkLight) -> Iterator[tuple[slice, LitModel]]:
-        """Yield the model under the light of frames, portion by portion of a batch, with the pixels of the batch that a portion has.
+    def _small_lights(self, lights: Sequence[RangeLight], places: Sequence[int]) -> Iterator[SmallLights]:
+        """Yield the small lights of frames, some neighbouring frames at a time."""
+        done = 0
+        for _, members in groupby(places, key=lambda place: place // HORIZON_FRAMES):
+            frames = slice(done, done + len(list(members)))
+            samples = own_rows(join([each.small for each in lights[frames]]))
+            sources = upload_frames(samples, [each.small.count for each in lights[frames]], self._model.device)
+            yield SmallLights(frames, sources, samples.place[:, :3])
+            done = frames.stop
+
+    def light(self, batch: ModelBatch, band: Band, scale: np.ndarray, visible: wp.array, light: ChunkLight,
+              use: Callable[[slice, LitModel], None]) -> None:
+        """Light the model for frames, portion by portion of a batch; on the CPU every thread lights portions of its own.
 
         Args:
             batch: pixels.
@@ -135,23 +165,36 @@ class ModelRange:
             scale: [lights padded] radiance of a stored 1.0.
             visible: [lights, P] of the captured lights.
             light: of the frames.
+            use: called, by several threads, with the pixels of the batch that a portion has, and the model there.
         """
-        responses = seen = None
-        for portion in self._portions(batch, band, visible, light.small_directions):
-            packs = portion.surface.packs
-            if responses is None or seen is None or responses.matt.shape[1] != packs:
-                responses = empty_responses(len(self._grid.place), packs, self._model.device)
-                seen = empty_responses(len(self._captured.place), packs, self._model.device)
-            respond(portion.surface, self._grid, portion.visible, responses)
-            respond(portion.surface, self._captured, portion.visible, seen)
-            shown = shown_gloss(portion.band, portion.surface, seen, self._lights.direction, self._lights.irradiance, scale)
-            yield portion.pixels, _lit(portion, responses, seen, shown, light)
+        device = self._model.device
+        threads = devices.worker_count() if device == "cpu" else 1
+        packs = self._portion_packs
+        memory: SimpleQueue[tuple[Responses, Responses]] = SimpleQueue()
+        for _ in range(threads):
+            memory.put((empty_responses(self._grid.count, packs, device), empty_responses(len(self._captured.place), packs, device)))
 
-    def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: np.ndarray) -> Iterator[Portion]:
+        def work(portion: Portion) -> None:
+            room = memory.get()
+            try:
+                use(portion.pixels, self._lit(portion, *room, scale, light))
+            finally:
+                memory.put(room)
+
+        with ThreadPoolExecutor(threads, thread_name_prefix="relit-model") as pool:
+            list(pool.map(work, self._portions(batch, band, visible, light.small)))
+
+    @property
+    def _portion_packs(self) -> int:
+        """Return how many packs a portion has, at most."""
+        limit = RESPONSE_BYTES if self._model.device == "cpu" else CUDA_RESPONSE_BYTES
+        return max(1, limit // (4 * 4 * devices.pack_width(self._model.device) * self._grid.count))
+
+    def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: Sequence[SmallLights]) -> Iterator[Portion]:
         """Cut a batch into portions whose responses fit into RESPONSE_BYTES."""
         pack, count = devices.pack_width(self._model.device), len(batch.pixels)
-        step = max(1, RESPONSE_BYTES // (4 * 4 * pack * len(self._grid.place)))
-        horizons = self._model.horizons(small, batch) if len(small) else None
+        step = self._portion_packs
+        horizons = [self._model.horizons(each.direction, batch) if len(each.direction) else None for each in small]
         for first in range(0, batch.surface.packs, step):
             packs = slice(first, min(first + step, batch.surface.packs))
             pixels = slice(first * pack, min(packs.stop * pack, count))
@@ -159,28 +202,47 @@ class ModelRange:
             surface = batch.surface._replace(values=batch.surface.values[:, packs], pixel_count=size)
             images = band._replace(values=band.values[:, packs], saturated=band.saturated[:, packs], pixel_count=size)
             yield Portion(pixels, surface, images, visible[:, packs],
-                          None if horizons is None else horizons._replace(tangent=horizons.tangent[:, packs]),
-                          self._model.albedo(batch.pixels[pixels]))
+                          tuple(None if each is None else each._replace(tangent=each.tangent[:, packs]) for each in horizons),
+                          self._model.normals(batch.pixels[pixels]), self._model.albedo(batch.pixels[pixels]))
+
+    def _lit(self, portion: Portion, grid_room: Responses, captured_room: Responses, scale: np.ndarray, light: ChunkLight) -> LitModel:
+        """Return the model of a portion under the light of frames.
+
+        Args:
+            portion: the pixels.
+            grid_room, captured_room: memory for the responses to the directions of the grid and of the captured lights.
+            scale: [lights padded] radiance of a stored 1.0.
+            light: of the frames.
+        """
+        facing = np.flatnonzero((self._towards @ portion.normal.T).max(axis=1) > -ROUNDING)  # the responses to all others are 0
+        grid = grid_room.room(len(facing), portion.surface.packs)
+        captured = captured_room.room(len(self._captured.place), portion.surface.packs)
+        respond(portion.surface, upload_sources(self._grid.taken(facing), self._model.device), portion.visible, grid)
+        respond(portion.surface, self._captured, portion.visible, captured)
+        shown = shown_gloss(portion.band, portion.surface, captured, self._lights.direction, self._lights.irradiance, scale)
+        return _summed(portion, grid, facing, captured, shown, light)
 
 
-def _lit(portion: Portion, grid: Responses, captured: Responses, shown: wp.array, light: ChunkLight) -> LitModel:
-    """Return the model of a portion under the light of frames."""
+def _summed(portion: Portion, grid: Responses, facing: np.ndarray, captured: Responses, shown: wp.array, light: ChunkLight) -> LitModel:
+    """Return the model of a portion under the light of frames, from its responses to the directions of the grid that are `facing`."""
     albedo, count = portion.albedo, portion.albedo.shape[1]
-    energy = light.captured
-    matt, gloss = light.broad.matt(grid, albedo), light.broad.gloss(grid.gloss, count)
-    if portion.horizons is not None:
-        visible = see_above(light.small_directions, portion.surface, portion.horizons)
-        small = shade_frames(portion.surface, light.small, visible).numpy()[..., :count].reshape(-1, 2, 3, count)
-        matt += small[:, 0]
-        gloss += small[:, 1]
+    energy, broad = light.captured, light.broad.at(facing)
+    matt, gloss = broad.matt(grid, albedo), broad.gloss(grid.gloss, count)
+    for lights, horizons in zip(light.small, portion.horizons, strict=True):
+        if horizons is not None:
+            visible = see_above(lights.direction, portion.surface, horizons)
+            small = shade_frames(portion.surface, lights.sources, visible).numpy()[..., :count].reshape(-1, 2, 3, count)
+            matt[lights.frames] += small[:, 0]
+            gloss[lights.frames] += small[:, 1]
     positive = energy._replace(weights=np.maximum(energy.weights, 0))
     ratio = ratio_of_sums(positive.gloss(shown, count), positive.gloss(captured.gloss, count))
     added = beyond = None
     if light.added is not None:
         added = np.stack([light.added.matt(captured, albedo), light.added.gloss(captured.gloss, count)], axis=1)
     if light.beyond is not None:
-        shine = light.beyond.broad.gloss(grid.gloss, count)
-        whole = light.beyond.broad.matt(grid, albedo) + shine
+        outside = light.beyond.broad.at(facing)
+        shine = outside.gloss(grid.gloss, count)
+        whole = outside.matt(grid, albedo) + shine
         small = shade_frames(portion.surface, light.beyond.small, portion.visible).numpy()[..., :count].reshape(-1, 2, 3, count)
         stands_in = light.beyond.captured.matt(captured, albedo) + light.beyond.captured.gloss(captured.gloss, count)
         beyond = LitBeyond(whole + small.sum(axis=1), shine + small[:, 1], stands_in)

@@ -34,6 +34,8 @@ from stage.brackets import merge_brackets
 from stage.files import write_text
 from stage.stack import Stack
 
+MODEL_CHUNK_FRAMES = 128
+"""Most frames of a chunk that a model guides: its responses to light are computed once for all of them."""
 RANGE_FRAMES = 4
 """Least number of frames of a chunk whose model is computed once for all of them; for fewer, each frame is shaded with its own samples."""
 
@@ -154,7 +156,8 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     in_rows = guide is None and not alone and chunk_frames(stack) < CHUNK_FRAMES  # a model looks at whole frames
-    size = max(1, (CHUNK_FRAMES if in_rows else chunk_frames(stack)) // max(1, len(plan.groups)))
+    whole = chunk_frames(stack, CHUNK_FRAMES if guide is None else MODEL_CHUNK_FRAMES)
+    size = max(1, (CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, model=use)

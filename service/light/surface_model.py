@@ -24,6 +24,10 @@ BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
 
 
+NORMAL_CELLS = 32
+"""Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
+
+
 class ModelBatch(NamedTuple):
     """Some pixels of the surface on the device."""
 
@@ -34,7 +38,7 @@ class ModelBatch(NamedTuple):
 class SurfaceModel:
     """A surface that can be lit."""
 
-    def __init__(self, maps: SurfaceMaps, where: Path, device: str, *, chosen: np.ndarray | None = None) -> None:
+    def __init__(self, maps: SurfaceMaps, where: Path, device: str, *, chosen: np.ndarray | None = None, by_normal: bool = False) -> None:
         """Keep solved maps for lighting.
 
         Args:
@@ -43,6 +47,7 @@ class SurfaceModel:
             where: their file, for messages.
             device: where.
             chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
+            by_normal: True to make pixels of like normals neighbours within each batch; else pixels ascend.
 
         Raises:
             ResultError: a layer is not there, or none of the pixels is solved.
@@ -56,7 +61,8 @@ class SurfaceModel:
         self.maps, self.device = maps, device
         normal = maps.normal.reshape(-1, 3)
         whole = maps.mask.reshape(-1) & np.isfinite(maps.height).reshape(-1) & (np.abs(normal).sum(axis=1) > 0)
-        self.pixels = np.flatnonzero(whole if chosen is None else whole & chosen.reshape(-1))
+        pixels = np.flatnonzero(whole if chosen is None else whole & chosen.reshape(-1))
+        self.pixels = _by_normal(pixels, normal) if by_normal else pixels
         """[n] Row-major positions of the solved pixels that will be lit."""
         if not len(self.pixels):
             raise ResultError(f"{where}: no pixel is solved")
@@ -111,6 +117,11 @@ class SurfaceModel:
         """
         return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, device=self.device)
 
+    def normals(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [m, 3] float32 normals of pixels [m]."""
+        assert self.maps.normal is not None
+        return self.maps.normal.reshape(-1, 3)[pixels].astype(np.float32, copy=False)
+
     def albedo(self, pixels: np.ndarray) -> np.ndarray:
         """Return [3, m] float32 diffuse albedo of pixels [m]."""
         assert self.maps.diffuse_albedo is not None
@@ -128,3 +139,24 @@ class SurfaceModel:
     def _field(self) -> HeightField:
         """The height on the device, for finding horizons."""
         return height_field(self._height.numpy(), self._mask.numpy() != 0, self._projection, self.device)
+
+
+def _by_normal(pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the pixels [n] of each batch sorted by the cell of their normal, the cells in Morton order: a far light leaves neighbours dark
+    together (service.light.model_range).
+
+    Args:
+        pixels: row-major positions.
+        normal: [all pixels, 3] unit vectors.
+    """
+    ordered = []
+    for start in range(0, len(pixels), BATCH_PIXELS):
+        batch = pixels[start : start + BATCH_PIXELS]
+        x, y, z = normal[batch].T
+        equal_area = np.stack([x, y]) / np.sqrt(np.maximum(1 + z, 1e-3))  # -1…1 where z is 0 or above
+        cell = np.clip((equal_area + 1) / 2 * NORMAL_CELLS, 0, NORMAL_CELLS - 1).astype(np.int32)
+        place = np.zeros(len(batch), dtype=np.int32)
+        for bit in range(NORMAL_CELLS.bit_length() - 1):
+            place |= ((cell[0] >> bit & 1) << (2 * bit)) | ((cell[1] >> bit & 1) << (2 * bit + 1))
+        ordered.append(batch[np.argsort(place, kind="stable")])
+    return np.concatenate(ordered) if ordered else pixels

@@ -48,6 +48,20 @@ def test_they_are_the_twin(count, device):
     assert matt.max() > 0.1 and gloss.max() > 0.01
 
 
+def test_memory_has_room_for_fewer_directions_and_pixels(device):
+    """The same to the last bit, and in the memory that was there."""
+    pixels, given, visible = scattered_pixels(40, seed=4), hidden_samples(9, 5, 4), np.full((5, 40), 255, np.uint8)
+    matt, gloss, _ = responses(pixels, given, visible, device)
+    chosen = np.array([0, 3, 8])
+    surface = upload(pixels, device)
+    memory = empty_responses(given.count, surface.packs + 3, device)
+    room = memory.room(len(chosen), surface.packs)
+    respond(surface, upload_sources(given.taken(chosen), device), pack_bytes(visible, device), room)
+    np.testing.assert_array_equal(room.matt.numpy().reshape(3, -1)[:, :40], matt[chosen])
+    np.testing.assert_array_equal(room.gloss.numpy().reshape(3, 3, -1)[:, :, :40], gloss[:, chosen])
+    assert room.matt.ptr == memory.matt.ptr and room.gloss.ptr == memory.gloss.ptr
+
+
 def test_gloss_is_as_bright_as_the_images_show_it(device):
     pixels = scattered_pixels(50, seed=2)
     visible = np.full((len(LIGHTS), 50), 255, np.uint8)

@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from kernels.relight.direction_grid import direction_grid
+from kernels.relight.responses import respond
 from stage.camera import Camera
 from tests.kernels.scenes import cap
 from tests.scenes.captures import write_exr
@@ -126,3 +128,33 @@ def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monke
     parts = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}")
     for number in (1, FRAMES):
         np.testing.assert_allclose(parts[number], whole[number], rtol=2 * HALF, atol=1e-5)
+
+
+def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tmp_path, monkeypatch):
+    """With them, the frames are the same to half and the order of float32 sums."""
+    asked = []
+
+    def counted(surface, sources, visible, responses):
+        asked.append(len(sources.place))
+        respond(surface, sources, visible, responses)
+
+    monkeypatch.setattr("service.light.model_range.RESPONSE_BYTES", 1)
+    monkeypatch.setattr("service.light.model_range.respond", counted)
+    frames = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
+    whole = len(direction_grid().direction)
+    assert max(asked) < 0.9 * whole
+    asked.clear()
+    monkeypatch.setattr("service.light.model_range.ROUNDING", 2.0)
+    every = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}")
+    assert max(asked) == whole
+    for number in (1, FRAMES):
+        np.testing.assert_allclose(frames[number], every[number], rtol=2 * HALF, atol=1e-5)
+
+
+def test_small_lights_of_few_frames_at_a_time_light_alike(relit, scene, tmp_path, monkeypatch):
+    """The horizons of a perspective camera and of lights far apart differ where they are interpolated, at the edges of few shadows."""
+    together = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--spin-degrees", "20")
+    monkeypatch.setattr("service.light.model_range.HORIZON_FRAMES", 2)
+    apart = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}", "--spin-degrees", "20")
+    for number in together:
+        assert off(apart[number], together[number]) < 0.002
