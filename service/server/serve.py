@@ -1,4 +1,4 @@
-"""The processes of the service: the API with its workers, or one worker.
+"""The service: the API and its workers.
 
 When the service is asked to end (SIGTERM or SIGINT), it still answers, and says that it is not ready, while its workers finish their steps
 and return their jobs. Then requests and streams of events end, and then the service. At a second signal it ends at once, and its jobs are
@@ -6,22 +6,18 @@ taken over, as after a crash.
 """
 
 import asyncio
-import os
-import signal
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from queue import SimpleQueue
 from typing import Any, cast
 
 import uvicorn
 from anyio import to_thread
 
 from service.errors import RequestError
-from service.server import devices, log, telemetry
+from service.server import devices, telemetry
 from service.server.api.app import create_app
 from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
@@ -31,8 +27,8 @@ from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
 from service.server.malloc import keep_freed_blocks, share_one_arena
-from service.server.permissions import keep_private
-from service.server.settings import Settings, unknown_variables
+from service.server.processes import configure, hear_signals
+from service.server.settings import Settings
 from service.server.storage.folder import Storage
 from service.server.storage.open import open_storage
 
@@ -41,9 +37,6 @@ CLOSE_S = 5
 THREADS = 20
 """Threads in which the API waits for the database and for files: two for each connection of the database. The 40 that anyio allows come and
 go as it happens, and take 60 KB each."""
-SIGNALS = (signal.SIGTERM, signal.SIGINT)
-SAME_S = 1.0
-"""Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
 
 
 def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None) -> None:
@@ -58,10 +51,10 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
         DeviceError: a device is not on this machine.
     """
     supervisors: list[Supervisor] = []
-    asked = _signals(supervisors)
+    asked = hear_signals(supervisors)
     share_one_arena()
     keep_freed_blocks()
-    _configure(settings)
+    configure(settings)
     limits = limits_of(settings, raise_descriptors())
     listening = _listen(settings)
     database = open_database(settings, prepare)
@@ -104,19 +97,6 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
         logger.info("service ended")
 
 
-def work(settings: Settings, device: str | None) -> None:
-    """Run one worker, which is started again when it dies, until SIGTERM or SIGINT."""
-    supervisors: list[Supervisor] = []
-    asked = _signals(supervisors)
-    _configure(settings)
-    open_database(settings, prepare).close()
-    telemetry.close(telemetry.provider(settings))  # so that a missing extra is reported here, and not by every worker
-    supervisors.append(Supervisor(settings, [devices.resolve(device)]))
-    supervisors[0].start()
-    asked.get()
-    supervisors[0].stop()
-
-
 class _Server(uvicorn.Server):
     """A server without signal handlers: those of uvicorn would end it at the first signal."""
 
@@ -138,36 +118,6 @@ def http_server(app: Any, settings: Settings, limits: ConnectionLimits) -> uvico
         app, http=cast(type[asyncio.Protocol], connection), ws="none", log_config=None, access_log=False, server_header=False,
         timeout_graceful_shutdown=CLOSE_S, backlog=AT_ONCE, proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies)))
-
-
-def _signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
-    """Put the first signal into a queue; at the second, kill the workers and end this process."""
-    asked: SimpleQueue[int] = SimpleQueue()  # its put may interrupt its get, in the signal handler
-    heard: list[float] = []
-
-    def hear(number: int, _frame: object) -> None:
-        now = time.monotonic()
-        if not heard:
-            heard.append(now)
-            asked.put(number)
-        elif now - heard[0] > SAME_S:
-            for supervisor in supervisors:
-                supervisor.kill()
-            os._exit(128 + number)
-
-    for number in SIGNALS:
-        signal.signal(number, hear)
-    return asked
-
-
-def _configure(settings: Settings) -> None:
-    keep_private()
-    log.configure(settings.log_level, settings.log_format)
-    for name, near in unknown_variables(os.environ).items():
-        logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))
-    for root in (*settings.roots, *(root.folder for root in settings.project_roots)):
-        if not root.is_dir():
-            logger.warning("a root is no folder", root=str(root))
 
 
 def _listen(settings: Settings) -> socket.socket:

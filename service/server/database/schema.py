@@ -3,21 +3,24 @@
 A new database gets the tables of `tables` as they are. Each change of them since the first release is a revision in `migrations/versions`,
 which `upgrade` applies to a database that lacks it, in one transaction. To write one: change `tables`, add a file with the next number
 there, and run tests/service/server/database, which compare an upgraded database with a new one.
+
+Alembic is imported only to make or upgrade tables: its import takes a tenth of the start of a worker, and a database is seldom old.
 """
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 
 from service.server.database import audit, tables
 from service.server.database.engine import Database, DatabaseError
 
+if TYPE_CHECKING:
+    from alembic.config import Config
+
 REVISIONS = "relit_schema"
 """Table in which Alembic keeps the revision of the database."""
+MIGRATIONS = Path(__file__).parent / "migrations"
 ABOUT = sa.Table("relit_about", sa.MetaData(), sa.Column("version", sa.Integer, primary_key=True))
 """How programs without migrations knew the schema: they made databases with the number 1, and refuse every other number."""
 BEFORE_MIGRATIONS, SINCE_MIGRATIONS = 1, 2
@@ -36,14 +39,19 @@ def upgrade(database: Database) -> None:
             connection.execute(sa.text("BEGIN IMMEDIATE"))
         else:
             connection.execute(sa.text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": UPGRADE_LOCK})
-        found, config = _revision(connection), _alembic(connection)
+        found = _revision(connection)
+        if found == _newest():
+            return
+        from alembic import command
+
+        config = _alembic(connection)
         if found is None and not sa.inspect(connection).has_table(ABOUT.name):
             tables.metadata.create_all(connection)
             ABOUT.create(connection)
             connection.execute(ABOUT.insert().values(version=SINCE_MIGRATIONS))
             command.stamp(config, "head")
             audit.protect(connection)
-        elif found != _newest():
+        else:
             _require_known(found)
             command.upgrade(config, "head")
             audit.protect(connection)
@@ -66,20 +74,30 @@ def require_current(database: Database) -> None:
 
 def _revision(connection: sa.Connection) -> str | None:
     """Return the revision of the tables; None: there are none, or they are older than the first revision."""
-    return MigrationContext.configure(connection, opts={"version_table": REVISIONS}).get_current_revision()
+    if not sa.inspect(connection).has_table(REVISIONS):
+        return None
+    version = sa.column("version_num", sa.String)  # as Alembic names it
+    return connection.execute(sa.select(version).select_from(sa.table(REVISIONS))).scalar_one_or_none()
 
 
-def _newest() -> str | None:
-    return ScriptDirectory.from_config(_alembic()).get_current_head()
+def _known() -> list[str]:
+    """Return the revisions that this program knows, by the names of their files, oldest first."""
+    return sorted(file.name[1:].partition("_")[0] for file in (MIGRATIONS / "versions").glob("r*.py"))
+
+
+def _newest() -> str:
+    return _known()[-1]
 
 
 def _require_known(found: str | None) -> None:
-    if found is not None and found not in {script.revision for script in ScriptDirectory.from_config(_alembic()).walk_revisions()}:
+    if found is not None and found not in _known():
         raise DatabaseError(f"the database has the tables of a newer relit (revision {found}): "
                             "use that program, or another data folder or database")
 
 
-def _alembic(connection: sa.Connection | None = None) -> Config:
+def _alembic(connection: sa.Connection) -> "Config":
+    from alembic.config import Config
+
     config = Config(attributes={"connection": connection})
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations").replace("%", "%%"))
+    config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     return config

@@ -1,13 +1,17 @@
 """Databases of older programs, upgraded when they are opened; and databases that are refused."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 
-from service.server.database import intakes, jobs, keys, tables, uploads
+from service.server.database import intakes, jobs, keys, schema, tables, uploads
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import REVISIONS, require_current, upgrade
 from service.server.jobs.queue import prepare
@@ -75,6 +79,19 @@ def test_a_new_database_equals_an_upgraded_one(settings, database):
     prepare(settings, database)  # a second process finds nothing to do
     require_current(database)
     assert differences(database) == []
+
+
+def test_the_revisions_are_those_of_alembic_and_an_open_database_needs_none_of_it(settings, database):
+    upgrade(database)
+    script = ScriptDirectory(str(Path(schema.__file__).parent / "migrations"))
+    with database.engine.connect() as connection:
+        assert MigrationContext.configure(connection, opts={"version_table": REVISIONS}).get_current_revision() == script.get_current_head()
+    assert len(list(script.walk_revisions())) == len(list(Path(script.versions).glob("*.py")))
+    url = {} if settings.database_url is None else {"RELIT_DATABASE_URL": settings.database_url}
+    code = ("import sys; from service.server.settings import Settings; from service.server.database.engine import connect; "
+            "from service.server.database.schema import upgrade; upgrade(connect(Settings().sqlalchemy_url)); "
+            "assert 'alembic' not in sys.modules")
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | url | {"RELIT_DATA": str(settings.data)})
 
 
 def test_an_upgrade_that_fails_changes_nothing(yesterday, monkeypatch):
