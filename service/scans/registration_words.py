@@ -26,6 +26,7 @@ def registration_facts(found: Registration, scans: Sequence[ScanFacts]) -> dict[
     """Return what the report says of a registration by pairs."""
     return {"method": "pairs and pose graph", "reference": scans[found.reference].name, "cell_m": _short(found.cell_m),
             "loop_factor": None if not np.isfinite(found.factor) else _short(found.factor),
+            "alike_turned": [scans[number].name for number in found.alike_turned],
             "contradicted_by_loops": [[scans[pair.a].name, scans[pair.b].name] for pair, weight in found.kept if weight <= REFUSED],
             **target_facts(found.targets, scans)}
 
@@ -40,6 +41,10 @@ def registration_warnings(found: Registration, scans: Sequence[ScanFacts]) -> li
         if weight <= REFUSED:
             out.append(f"{scans[pair.a].name} and {scans[pair.b].name}: the loops through other scans contradict their pose by "
                        f"{pair.by.value}, which counts as nothing")
+    if found.alike_turned:
+        out.append(f"{', '.join(scans[number].name for number in found.alike_turned)}: look much the same when they are turned about an "
+                   "axis: only what sticks out tells their poses from turned ones, which may fit as well and have a small σ: look at the "
+                   "result, or give targets, starts or a turntable")
     out += _target_warnings(found, scans)
     if np.isfinite(found.factor) and found.factor > LOOSE:
         out.append(f"loops leave {found.factor:.3g} times what the noise of the pairs explains: lenses or σ may be wrong; the "

@@ -155,12 +155,17 @@ def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -
         if found is None or any(is_near(found.pose, other, b.rough.middle, cell_m) for other in seen):
             continue
         seen.append(found.pose)
-        noise = float(np.median(np.hypot(a.rough.sigma.mean(), b.rough.sigma)))
-        if found.residual > max(ROUGH_BEND * cell_m, RATIO * noise):
+        if not fits_roughly(found, a, b, cell_m):
             continue
         sight = both_sights(a.image, b.image, a.rough.points, b.rough.points, found.pose, cell_m / 2)
         if sight.contradicted_part <= ROUGH_CONTRADICTED:
             yield found.pose
+
+
+def fits_roughly(found: Fit, a: Prepared, b: Prepared, cell_m: float) -> bool:
+    """Return whether a fit at the rough scale leaves no more than the noise and the bend of the surface between points explain."""
+    noise = float(np.median(np.hypot(a.rough.sigma.mean(), b.rough.sigma)))
+    return found.residual <= max(ROUGH_BEND * cell_m, RATIO * noise)
 
 
 def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
@@ -217,19 +222,25 @@ def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
 def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float) -> Pair:
     """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
     assert best.fit is not None
-    size = float(np.sqrt(((b.rough.points - b.rough.middle) ** 2).sum(axis=1).mean()))
-    units = np.array([1 / size] * 3 + [1.0] * 3)  # a step of length 1 moves points by about 1 m
+    units = step_units(b)
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
     for value, axis in zip(values, axes.T, strict=True):
         noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
                                   for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
         step = units * axis
         weak = value < WEAK * noise or value < WEAKLY_BENT * bend
-        if value < NOT_DETERMINED * noise or value < BENT * even_bend or (weak and _slides(a, b, best, size * step, cell_m, least_overlap)):
+        slid = step / units[0]
+        if value < NOT_DETERMINED * noise or value < BENT * even_bend or (weak and _slides(a, b, best, slid, cell_m, least_overlap)):
             kind = "turned about an axis" if np.linalg.norm(axis[:3]) > 0.5 else "shifted along itself"
             return best._replace(state=PairState.AMBIGUOUS,
                                  reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
     return best
+
+
+def step_units(scan: Prepared) -> np.ndarray:
+    """Return the units of a motion [6] in which a step of length 1 moves the points of a scan by about 1 m."""
+    size = float(np.sqrt(((scan.rough.points - scan.rough.middle) ** 2).sum(axis=1).mean()))
+    return np.array([1 / size] * 3 + [1.0] * 3)
 
 
 def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: float, least_overlap: float) -> bool:

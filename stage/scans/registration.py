@@ -25,6 +25,7 @@ from stage.scans.pose_graph import REFUSED, Edge, Solved, solve
 from stage.scans.records import Turntable
 from stage.scans.rigid import inverse
 from stage.scans.scan import Scan, Target
+from stage.scans.symmetry import looks_alike_turned
 from stage.scans.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from stage.scans.tree import joined_groups, tree_poses
 from stage.scans.turntable import angle_of, freedom, turned_pose
@@ -86,6 +87,8 @@ class Registration(NamedTuple):
     cell_m: float
     targets: tuple[TargetPlace, ...]
     """The targets that two or more joined scans show."""
+    alike_turned: tuple[int, ...]
+    """Joined scans of unknown start without targets that look much the same when they are turned about an axis."""
 
 
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
@@ -173,11 +176,13 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         raise ScanError(*(f"{names[number]}: {words}" for number, words in alone.items()))
     if options.reference is not None and options.reference not in joined:
         raise ScanError(f"{names[options.reference]}: is the reference, but {alone[options.reference]}")
+    free = [number for number in joined if starts[number] is None and number not in shown] if table is None else []
+    turned = tuple(number for number in free if looks_alike_turned(work.ready(number), cells[number]))
     spread = covariances(solved, kept, [edge_of(pair) for pair in kept],
                          lambda pair: rows_of(pair) if pair.by is Evidence.TARGETS else work.rows(pair))
     return Registration(joined, spread, _reference(joined, starts, options), (*pairs.values(), *targeted.values()), alone,
                         odd_scales(kept, list(joined)), tuple(zip(kept, map(float, solved.weights), strict=True)), solved.factor, common,
-                        tuple(target_places(shown, joined, spread)))
+                        tuple(target_places(shown, joined, spread)), turned)
 
 
 class _InMemory:

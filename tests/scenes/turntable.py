@@ -78,6 +78,12 @@ def vase(p: np.ndarray) -> np.ndarray:
     return np.maximum(side, np.abs(y) - 0.5)
 
 
+def urn(p: np.ndarray) -> np.ndarray:
+    """A vase on a square foot, with an arm."""
+    foot = box(p, (0, -0.53, 0), (0.2, 0.03, 0.2), 0.005)
+    return np.minimum(np.minimum(vase(p), foot), 0.8 * capsule(p, (0.2, 0.2, 0), (0.36, 0.05, 0.0), 0.03))
+
+
 def pillar(p: np.ndarray) -> np.ndarray:
     """A square pillar: a quarter turn leaves it as it is."""
     return box(p, (0.0, 0.0, 0.0), (0.17, 0.46, 0.17), 0.02)

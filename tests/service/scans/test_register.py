@@ -11,7 +11,7 @@ from stage.depth_maps import DepthMaps
 from stage.ply import PointCloud, write_ply
 from stage.scans.records import read_scan_set
 from stage.scans.rigid import inverse, step_between
-from tests.scenes.turntable import MM, Distance, View, figure, pose, turntable, vase
+from tests.scenes.turntable import MM, Distance, View, figure, pose, turntable, urn, vase
 
 ROWS = 120
 """Pixels of 10 mm on the figure: the search must do with some 2500 points a scan."""
@@ -136,6 +136,14 @@ def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
     outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
     assert outcome.code == 0, outcome.err
     assert "nothing checks the turntable" in outcome.out + outcome.err
+
+
+def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
+    seen = views(urn, 0, 90)
+    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert "s0, s1: look much the same when they are turned about an axis" in outcome.out + outcome.err
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["alike_turned"] == ["s0", "s1"]
 
 
 @pytest.mark.parametrize(("change", "sentence"), [
