@@ -4,6 +4,8 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 # tests of the service wait much of their time, so that four share two cores well
 WORKERS ?= 4
+# Python keeps what it compiled, also where an image says that it should not: else every start of a program compiles all of it again
+export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +35,11 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports_of(path: Path) -> list[Import]:
     found = []
 
@@ -47,12 +53,17 @@ def imports_of(path: Path) -> list[Import]:
         for child in ast.iter_child_nodes(node):
             visit(child, inside)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")), False)
+    visit(tree_of(path), False)
     return found
 
 
 FILES = {module_name(path): path for root in ROOTS for path in sorted((HOME / root).rglob("*.py"))}
-IMPORTS = [found for path in FILES.values() for found in imports_of(path)]
+
+
+@cache
+def imports() -> tuple[Import, ...]:
+    """All of them, read when a test asks: every process of a run loads this file, and one runs it."""
+    return tuple(found for path in FILES.values() for found in imports_of(path))
 
 
 def under(name: str, *packages: str) -> bool:
@@ -66,9 +77,9 @@ def top(name: str) -> str:
 def test_the_imports_are_read():
     """If this fails, the others prove nothing."""
     assert len(FILES) > 60
-    assert Import("service.solve.solve", "stage.capture.Capture", False) in IMPORTS
-    assert Import("service.cli.solve", "service.solve.solve.solve", True) in IMPORTS
-    assert any(i.importer == "kernels.device" and i.target == "warp" for i in IMPORTS)
+    assert Import("service.solve.solve", "stage.capture.Capture", False) in imports()
+    assert Import("service.cli.solve", "service.solve.solve.solve", True) in imports()
+    assert any(i.importer == "kernels.device" and i.target == "warp" for i in imports())
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
@@ -77,7 +88,7 @@ def test_the_imports_are_read():
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     """So stage and kernels import neither each other nor service, and stage does not import Warp."""
-    others = {i for i in IMPORTS if top(i.importer) == layer and top(i.target) not in allowed | sys.stdlib_module_names}
+    others = {i for i in imports() if top(i.importer) == layer and top(i.target) not in allowed | sys.stdlib_module_names}
     assert not others
 
 
@@ -89,13 +100,13 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     ("MaterialX", ["service.asset.openpbr"]),
 ])
 def test_a_library_lives_in_its_places(library, homes):
-    assert {i.importer for i in IMPORTS if top(i.target) == library and not under(i.importer, *homes)} == set()
+    assert {i.importer for i in imports() if top(i.target) == library and not under(i.importer, *homes)} == set()
 
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
     allowed = ("stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw", "stage.importers.video",
                "stage.scans.found_targets")
-    assert {i.importer for i in IMPORTS if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
+    assert {i.importer for i in imports() if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 
 @pytest.mark.parametrize(("package", "forbidden"), [
@@ -114,29 +125,29 @@ def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured
     ("service.views", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
-    assert {i for i in IMPORTS if under(i.importer, package) and under(i.target, *forbidden)} == set()
+    assert {i for i in imports() if under(i.importer, package) and under(i.target, *forbidden)} == set()
 
 
 def test_stage_and_kernels_meet_in_products_alone():
     """service.errors is the table of what either may raise, and takes no more from kernels than that."""
     meeting = {name for name in FILES
-               if {"stage", "kernels"} <= {top(i.target) for i in IMPORTS if i.importer == name}
+               if {"stage", "kernels"} <= {top(i.target) for i in imports() if i.importer == name}
                and not under(name, *PRODUCTS)}
     assert meeting <= {"service.errors"}
-    taken = {i.target for i in IMPORTS if i.importer == "service.errors" and top(i.target) == "kernels"}
+    taken = {i.target for i in imports() if i.importer == "service.errors" and top(i.target) == "kernels"}
     assert taken == {"kernels.errors.KernelError"}
 
 
 def test_the_command_line_knows_kernels_and_warp_lightly():
     """relit doctor runs a kernel, which is a check of the installation and no product, and --device asks which devices there are; they
     may, when they are called."""
-    knowing = {i for i in IMPORTS if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
+    knowing = {i for i in imports() if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
     assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.request_commands"}
 
 
 def test_the_roof_outside_the_products_knows_no_warp():
-    assert {i for i in IMPORTS if top(i.importer) == "service" and top(i.target) == "warp"
+    assert {i for i in imports() if top(i.importer) == "service" and top(i.target) == "warp"
             and not under(i.importer, *PRODUCTS)} == set()
 
 
@@ -145,13 +156,13 @@ def test_no_module_takes_a_private_name_of_another():
     def private(name: str) -> bool:
         return name.startswith("_") and not name.startswith("__")
 
-    assert {i for i in IMPORTS if top(i.target) in ROOTS and private(i.target.rpartition(".")[2])} == set()
+    assert {i for i in imports() if top(i.target) in ROOTS and private(i.target.rpartition(".")[2])} == set()
     reached = []
     for name, path in FILES.items():
-        modules = {alias.asname or alias.name for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        modules = {alias.asname or alias.name for node in ast.walk(tree_of(path))
                    if isinstance(node, ast.ImportFrom) and node.module and top(node.module) in ROOTS
                    for alias in node.names if f"{node.module}.{alias.name}" in FILES}
-        reached += [f"{name}: {node.value.id}.{node.attr}" for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        reached += [f"{name}: {node.value.id}.{node.attr}" for node in ast.walk(tree_of(path))
                     if isinstance(node, ast.Attribute) and private(node.attr)
                     and isinstance(node.value, ast.Name) and node.value.id in modules]
     assert reached == []
@@ -163,7 +174,7 @@ def test_nothing_lies_loose_in_the_root_of_the_service():
 
 def test_no_cycles():
     graph: dict[str, set[str]] = {name: set() for name in FILES}
-    for found in IMPORTS:
+    for found in imports():
         target = found.target if found.target in FILES else found.target.rpartition(".")[0]
         if not found.lazy and target in FILES and target != found.importer:
             graph[found.importer].add(target)
@@ -204,7 +215,7 @@ def test_a_text_and_a_type_of_fields_stand_in_one_module():
     """No two modules of stage and service give one name the same text, Annotated type or Spelling."""
     found: dict[tuple[str, str], set[str]] = {}
     for name, path in FILES.items():
-        for node in ast.parse(path.read_text(encoding="utf-8")).body if top(name) != "kernels" else ():
+        for node in tree_of(path).body if top(name) != "kernels" else ():
             if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and not node.targets[0].id.startswith("__"):
                 text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
                 annotated = isinstance(node.value, ast.Subscript) and ast.unparse(node.value.value) == "Annotated"
