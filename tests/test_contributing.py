@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.test_architecture import HOME, IMPORTS, module_name
+from tests.test_architecture import HOME, imports_of, module_name
 
 TEXT = (HOME / "CONTRIBUTING.md").read_text(encoding="utf-8")
 WAYS = {title: re.findall(r"^\d\. `([^`]+)`( \(another process\))?", body, re.MULTILINE)
@@ -26,7 +26,7 @@ def test_a_way_is_short_and_each_file_is_reached_from_one_before_it(way):
         assert (HOME / file).is_file(), file
         name = module_name(HOME / file)
         assert number == 0 or another_process or name in reached, f"{file} is imported by none of the files before it"
-        reached |= {part for found in IMPORTS if found.importer == name for part in (found.target, found.target.rpartition(".")[0])}
+        reached |= {part for found in imports_of(HOME / file) for part in (found.target, found.target.rpartition(".")[0])}
 
 
 @pytest.mark.parametrize("path", sorted(set(re.findall(r"`([a-z_]+/[a-z_/.]*)`", TEXT))))
