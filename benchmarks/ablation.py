@@ -16,7 +16,7 @@ from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly, gather
-from kernels.photometric.svbrdf import average_normals, solve_svbrdf
+from kernels.photometric.svbrdf import SHAPE_TEMPERATURE, average_normals, solve_svbrdf
 from kernels.status import Status
 from service.reporting.progress import Timings
 from service.solve.material import SPREAD_PIXELS, MaterialOptions, solve_material
@@ -93,7 +93,8 @@ def _gather(band: packs.Band, pixels: np.ndarray, lights: Lights, factors: np.nd
 
 def _channels_apart(case: Case) -> np.ndarray:
     found = [find_normals(samples, case.robust, shape=case.shape).best for samples in case.channels]
-    return average_normals(np.stack([search.normal for search in found]), np.stack([search.cost for search in found]))[0]
+    return average_normals(np.stack([search.normal for search in found]), np.stack([search.cost for search in found]),
+                           temperature=SHAPE_TEMPERATURE)[0]
 
 
 VARIANTS: dict[str, Callable[[Case], np.ndarray]] = {

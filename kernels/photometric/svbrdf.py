@@ -1,8 +1,8 @@
 """The general solver: normal, diffuse albedo, F0 and roughness of each pixel, without learning.
 
 Normals come from `normal_search` under the diffuse shape that the object shares, from descents under shapes close to it, and from the
-joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel. The material then follows for the normal
-found.
+joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel, first those of the mixture under all shapes
+and then their mean and that of the single lobe. The material then follows for the normal found.
 
 Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
@@ -25,10 +25,12 @@ from kernels.photometric.refine import refine
 from kernels.photometric.samples import Samples, choose
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
-"""Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object."""
-TEMPERATURE = 0.4
-"""Softmax temperature of the average over models, relative to the best cost: a model whose cost is this fraction above the best has 1/e of
-its weight. Costs a third apart may differ by misfit alone."""
+"""Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A
+roughness below 0 is left out: the lobe of roughness 0 in its place costs least on real objects and has worse normals."""
+SHAPE_TEMPERATURE, KIND_TEMPERATURE = 0.8, 0.2
+"""Softmax temperatures of the averages over shapes, and over the mixture and the single lobe, relative to the best cost: a model whose cost
+is this fraction above the best has 1/e of its weight. Costs of shapes differ by misfit alone, and what it bends cancels in their mean; a
+single lobe that costs clearly less than the mixture is the sharper model."""
 SINGLE_LOBE_CHARGE = 1.5
 """Factor on the cost of the single lobe: to replace the mixture, the single lobe must explain a pixel clearly better, as it does on
 metals."""
@@ -77,20 +79,18 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
     lobe = shape if lobe is None else lobe
     found = find_normals(samples, start, shape=shape, options=options, beside=beside, prior=prior)
     normals, costs = [found.best.normal], [found.best.cost]
-    for rough, slope in NEIGHBOURS:
-        if rough and shape.rough < 0:
-            continue
-        nearby = Diffuse(rough=max(shape.rough + rough, 0.0) if shape.rough >= 0 else shape.rough, slope=shape.slope + slope)
+    for nearby in nearby_shapes(shape):
         other = descend(samples, found.best.normal, shape=nearby, options=options, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
+    normal, spread = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
     if single_lobe and prior is None:
         if roughness is None:
             roughness = fit_tinted(samples, found.best.normal, shape=shape, options=options).roughness
         single = refine(samples, found.best.normal, roughness, shape=shape, options=options)
-        normals.append(single.normal)
-        costs.append(SINGLE_LOBE_CHARGE * single.cost)
-    normal, spread = average_normals(np.stack(normals), np.stack(costs))
+        kinds = np.stack([np.min(costs, axis=0), SINGLE_LOBE_CHARGE * single.cost])
+        normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE,
+                                         spreads=np.stack([spread, np.zeros_like(spread)]))
     if prior is None:
         material = fit_material(samples, normal, shape=lobe, options=options, shared=shared)
         if metals is not None:
@@ -112,22 +112,32 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
                      certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)
 
 
-def average_normals(normals: np.ndarray, costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearby_shapes(shape: Diffuse) -> list[Diffuse]:
+    """Return the shapes of the diffuse lobe that are tried besides one; Lambert's lobe has no roughness that could differ."""
+    return [Diffuse(rough=shape.rough + rough, slope=shape.slope + slope) for rough, slope in NEIGHBOURS
+            if not rough or shape.rough + rough >= 0]
+
+
+def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float,
+                    spreads: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of a pixel's normals under several models, each weighted by exp(-(cost - best) / (temperature · best)).
 
     Args:
         normals: [models, n, 3] unit.
         costs: [models, n].
+        temperature: relative to the best cost.
+        spreads: [models, n] RMS spread, in degrees, of the normals that each model's normal is the mean of; None: of none.
 
     Returns:
         [n, 3] unit normals, and [n] their weighted RMS spread in degrees.
     """
     best = costs.min(axis=0)
-    weights = np.exp(-(costs - best) / np.maximum(TEMPERATURE * best, 1e-6))
+    weights = np.exp(-(costs - best) / np.maximum(temperature * best, 1e-6))
     weights /= weights.sum(axis=0)
     mean = np.einsum("sn,snc->nc", weights, normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-    spread = np.sqrt(np.einsum("sn,sn->n", weights, _angles(normals, mean) ** 2))
+    apart = _angles(normals, mean) ** 2 + (0 if spreads is None else spreads**2)
+    spread = np.sqrt(np.einsum("sn,sn->n", weights, apart))
     return mean.astype(np.float32), spread.astype(np.float32)
 
 

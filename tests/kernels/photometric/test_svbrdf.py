@@ -15,7 +15,7 @@ from kernels.photometric.normal_search import find_normals
 from kernels.photometric.readings import grey_factors, pad_lights
 from kernels.photometric.samples import gather, to_host
 from kernels.photometric.survey import CLOSE
-from kernels.photometric.svbrdf import average_normals, solve_svbrdf
+from kernels.photometric.svbrdf import average_normals, nearby_shapes, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, cap, store
 from tests.reference import hypotheses
 from tests.reference import microfacet as twin
@@ -270,12 +270,31 @@ def test_confidence_falls_with_noise(device):
 def test_average_of_normals():
     """Equal costs give the mean direction; a shape that costs far more has no say."""
     a, b = np.array([[0.0, 0.0, 1.0]]), twin.unit(np.array([[0.1, 0.0, 1.0]]))
-    mean, spread = average_normals(np.stack([a, b]), np.array([[0.1], [0.1]]))
+    mean, spread = average_normals(np.stack([a, b]), np.array([[0.1], [0.1]]), temperature=0.4)
     np.testing.assert_allclose(mean, twin.unit(a + b), atol=1e-6)
     assert spread[0] == pytest.approx(np.degrees(np.arctan(0.1)) / 2, rel=1e-2)
-    alone, none = average_normals(np.stack([a, b]), np.array([[0.1], [10.0]]))
+    alone, none = average_normals(np.stack([a, b]), np.array([[0.1], [10.0]]), temperature=0.4)
     np.testing.assert_allclose(alone, a, atol=1e-6)
     assert none[0] < 0.05
+
+
+def test_an_average_of_averages_spreads_as_all_normals_do():
+    """The spread about a mean of means is that about the mean of all (law of total variance), to the second order of angles of 3°."""
+    normals = twin.unit(np.array([[0.05, 0.0, 1.0], [-0.05, 0.0, 1.0], [0.0, 0.04, 1.0], [0.0, -0.02, 1.0]]))[:, None]
+    costs = np.full((4, 1), 0.1)
+    whole, spread = average_normals(normals, costs, temperature=0.4)
+    parts = [average_normals(normals[pair], costs[pair], temperature=0.4) for pair in (slice(2), slice(2, 4))]
+    mean, again = average_normals(np.stack([part[0] for part in parts]), costs[:2], temperature=0.4,
+                                  spreads=np.stack([part[1] for part in parts]))
+    np.testing.assert_allclose(mean, whole, atol=1e-4)
+    assert again[0] == pytest.approx(spread[0], rel=0.01)
+
+
+def test_nearby_shapes_are_lobes():
+    """Lambert's lobe varies in slope alone, and no roughness is below 0."""
+    assert nearby_shapes(Diffuse(slope=-0.1)) == [Diffuse(slope=-0.2), Diffuse(slope=0.0)]
+    assert sorted(shape.rough for shape in nearby_shapes(Diffuse(rough=0.1))) == [0.1, 0.1, 0.25]
+    assert len(nearby_shapes(Diffuse(rough=0.5))) == 4
 
 
 def test_more_rounds_are_an_option(device):
