@@ -26,6 +26,11 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    """Libraries that look for leaks as the interpreter ends find none."""
+    gc.unfreeze()
+
+
 PROGRAMS = ("clients", "server")
 """Folders of tests that start servers, browsers and other programs."""
 
