@@ -1,11 +1,12 @@
 """A simulated site: hundreds of range images of a courtyard from afar and of its statues from near, registered and fused out of core.
 
-Usage: python -m benchmarks.site [--scans 200] [--megapixels 0.05] [--work DIR] [--write docs/scans.md]
+Usage: python -m benchmarks.site [--scans 200] [--megapixels 0.05] [--voxel-mm 10] [--work DIR] [--write docs/scans.md]
 
 The courtyard (24 m × 16 m) is walls, columns, blocks and statues of balls in closed form, so that every ray and every distance is exact.
-Three of five scans are seen from afar (85° across, σ of 0.5 mm and 0.1 ‰ of the depth), the others from 1.3 m before a statue (45°, σ of
-0.1 mm); one in ten is a PLY cloud in millimetres, which is registered and not fused. Poses start 20 mm and 0.2° off from afar, and 4 mm and
-0.2° from near. `relit register` and `relit fuse --tiles` run as processes of their own, of which the memory and the time are told.
+Three of five scans are seen from afar (85° across, σ of 0.5 mm and 0.1 ‰ of the depth), the others from 1.3 m before a statue (32° across,
+σ of 0.1 mm, nothing beyond 2.2 m); one in ten is a PLY cloud in millimetres, which is registered and not fused. Poses start 20 mm and 0.2°
+off from afar, and 4 mm and 0.2° from near. `relit register` and `relit fuse --tiles` run as processes of their own, of which the memory and
+the time are told. A run that was stopped goes on where it was when it is begun again with the same folder.
 """
 
 import argparse
@@ -21,192 +22,129 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmarks.site_scene import STATUES, Scene, distance, look, looking, make_scene
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
+from stage.files import write_text
 from stage.ply import PointCloud, write_ply
 from stage.scans.ply_points import read_ply_points
 from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
-from stage.scans.rigid import exponential, rigid_between
+from stage.scans.rigid import exponential, inverse, rigid_between
 
-LENGTH, WIDTH, HEIGHT = 24.0, 16.0, 7.0
-STATUES = 10
 FAR_SHARE, CLOUD_EVERY = 0.6, 10
+FAR_DEGREES, NEAR_DEGREES = 85.0, 32.0
+NEAR_M, NEAR_RANGE_M = 1.3, 2.2
 FAR_OFF, NEAR_OFF, TURN_OFF = 0.02, 0.004, np.radians(0.2)
 MOST_CHECKED = 100_000
 """Vertices whose distance from the true surface is computed, of all in equal steps."""
+LOOK_S = 5.0
+"""Seconds after which it is written down again what a process has taken so far."""
 MARK, END = "<!-- made by benchmarks.site -->", "<!-- end of the site -->"
 
 
-class Scene(NamedTuple):
-    """Bodies in a box that is open above; y is up, the floor is y = 0."""
-
-    balls: np.ndarray  # [n, 4] centre and radius
-    columns: np.ndarray  # [n, 3] x, z, radius; from the floor to the top
-    blocks: np.ndarray  # [n, 6] lowest and highest corner
-    statues: np.ndarray  # [STATUES, 3] middle
-
-
-def make_scene() -> Scene:
-    rng = np.random.default_rng(18)
-    balls, blocks, statues = [], [], []
-    for number in range(STATUES):
-        x = (number % 5 - 2) * 4.0 + rng.uniform(-0.5, 0.5)
-        z = (3.2 if number < 5 else -3.2) + rng.uniform(-0.5, 0.5)
-        half = rng.uniform(0.35, 0.5, 2)
-        top = rng.uniform(0.7, 1.0)
-        blocks.append([x - half[0], 0, z - half[1], x + half[0], top, z + half[1]])
-        statues.append([x, top + 0.45, z])
-        for _ in range(26):
-            radius = rng.uniform(0.04, 0.2)
-            spread = rng.normal(scale=[0.16, 0.28, 0.16])
-            balls.append([x + spread[0], top + 0.4 + spread[1], z + spread[2], radius])
-    for _ in range(220):  # bosses on the walls and on the floor
-        wall, radius = rng.integers(5), rng.uniform(0.1, 0.5)
-        place = rng.uniform([-LENGTH / 2, 0.3, -WIDTH / 2], [LENGTH / 2, HEIGHT - 1, WIDTH / 2])
-        axis, side = [(0, -LENGTH / 2), (0, LENGTH / 2), (2, -WIDTH / 2), (2, WIDTH / 2), (1, 0.0)][wall]
-        place[axis] = side - np.sign(side) * radius * rng.uniform(-0.4, 0.4) if axis != 1 else -radius * rng.uniform(0.2, 0.7)
-        balls.append([*place, radius])
-    for _ in range(18):
-        middle, half = rng.uniform([-11, 0, -7.5], [11, 0, 7.5]), rng.uniform([0.1, 0.1, 0.1], [0.6, 0.5, 0.6])
-        blocks.append([*(middle - half * [1, 0, 1]), *(middle + half * [1, 2, 1])])
-    columns = [[x, z, rng.uniform(0.2, 0.35)] for z in (-6.0, 6.0) for x in rng.uniform(-0.4, 0.4, 7) + np.linspace(-10, 10, 7)]
-    return Scene(np.array(balls), np.array(columns), np.array(blocks), np.array(statues))
-
-
-def distance(scene: Scene, points: np.ndarray) -> np.ndarray:
-    """Distance of points [n, 3] from the nearest surface, metres."""
-    x, y, z = points.T
-    best = np.minimum.reduce([np.abs(y), np.abs(LENGTH / 2 - np.abs(x)), np.abs(WIDTH / 2 - np.abs(z))])
-    for ball in scene.balls:
-        best = np.minimum(best, np.abs(np.linalg.norm(points - ball[:3], axis=1) - ball[3]))
-    for cx, cz, radius in scene.columns:
-        best = np.minimum(best, np.abs(np.hypot(x - cx, z - cz) - radius))
-    for block in scene.blocks:
-        q = np.abs(points - (block[:3] + block[3:]) / 2) - (block[3:] - block[:3]) / 2
-        best = np.minimum(best, np.abs(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)))
-    return best
-
-
-def look(scene: Scene, camera: Camera, pose: np.ndarray) -> np.ndarray:
-    """Z-depth of each pixel, [rows, cols] float64 metres; 0 where the ray leaves by the top."""
-    x, y = camera.plane_coordinates()
-    ray = np.stack([x, y, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ pose[:3, :3].T  # of unit depth
-    eye = pose[:3, 3]
-    depth = np.full(len(ray), np.inf)
-
-    def nearer(index: np.ndarray | slice, found: np.ndarray) -> None:
-        depth[index] = np.where((found > 1e-6) & (found < depth[index]), found, depth[index])
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        nearer(slice(None), (0 - eye[1]) / ray[:, 1])
-        for axis, half in ((0, LENGTH / 2), (2, WIDTH / 2)):
-            for side in (-half, half):
-                at = (side - eye[axis]) / ray[:, axis]
-                nearer(slice(None), np.where(eye[1] + at * ray[:, 1] < HEIGHT, at, np.inf))
-    square = (ray**2).sum(axis=1)
-    for ball in scene.balls:
-        away = ball[:3] - eye
-        along = ray @ away
-        index = np.flatnonzero((along > 0) & (along**2 >= square * (away @ away - ball[3] ** 2)))
-        root = np.sqrt(np.maximum(along[index] ** 2 - square[index] * (away @ away - ball[3] ** 2), 0))
-        nearer(index, (along[index] - root) / square[index])
-    flat = ray[:, 0] ** 2 + ray[:, 2] ** 2
-    for cx, cz, radius in scene.columns:
-        away = np.array([cx - eye[0], cz - eye[2]])
-        along = ray[:, 0] * away[0] + ray[:, 2] * away[1]
-        index = np.flatnonzero((along > 0) & (along**2 >= flat * (away @ away - radius**2)))
-        root = np.sqrt(np.maximum(along[index] ** 2 - flat[index] * (away @ away - radius**2), 0))
-        at = (along[index] - root) / flat[index]
-        nearer(index, np.where(eye[1] + at * ray[index, 1] < HEIGHT, at, np.inf))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for block in scene.blocks:
-            low, high = (block[:3] - eye) / ray, (block[3:] - eye) / ray
-            first, last = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
-            index = np.flatnonzero((first > 0) & (first <= last))
-            nearer(index, first[index])
-    return np.where(np.isfinite(depth), depth, 0).reshape(x.shape)
-
-
-def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """world_from_camera of a camera that looks at a point."""
-    back = (eye - target) / np.linalg.norm(eye - target)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
-    return pose
-
-
 class Truth(NamedTuple):
+    """What is known of a scan that was made."""
+
     pose: np.ndarray  # [4, 4]
     middle: np.ndarray  # [3] of its points, world
     size: float  # metres, RMS distance of its points from there
     far: bool
+    points: int
 
 
-def write_site(scene: Scene, folder: Path, count: int, pixels: float) -> tuple[dict[str, Truth], int]:
-    """Write scans one by one, and return the truth of each by its name, and the number of points."""
-    rng = np.random.default_rng(1)
+def write_site(scene: Scene, folder: Path, count: int, pixels: float) -> dict[str, Truth]:
+    """Write scans one by one, but those that are there already, and return the truth of each by its name."""
     cols = round(np.sqrt(pixels * 1.25))
-    rows = round(cols / 1.25)
-    entries, truth, points = [], {}, 0
-    far_count = round(FAR_SHARE * count)
+    entries, truth = [], {}
     for number in range(count):
-        far = number < far_count
-        if far:
-            turn = 2 * np.pi * 0.381966 * number
-            eye = np.array([rng.uniform(-8.5, 8.5), rng.uniform(1.5, 2.5), rng.uniform(-1.5, 1.5)])
-            pose = looking(eye, eye + np.array([np.cos(turn), rng.uniform(-0.2, 0.0), np.sin(turn)]))
+        name = f"{'far' if number < round(FAR_SHARE * count) else 'near'}{number:03d}"
+        known, entry = folder / "known" / f"{name}.json", None
+        if known.exists():
+            read = json.loads(known.read_text())
+            truth[name] = Truth(np.array(read["pose"]), np.array(read["middle"]), read["size"], read["far"], read["points"])
+            entry = ScanEntry.model_validate(read["entry"])
         else:
-            statue = scene.statues[number % STATUES]
-            turn = 2 * np.pi * (number // STATUES) / max((count - far_count) / STATUES, 1) + 0.3 * (number % STATUES)
-            pose = looking(statue + 1.3 * np.array([np.cos(turn), rng.uniform(-0.1, 0.4), np.sin(turn)]), statue)
-        focal = cols / 2 / np.tan(np.radians(85 if far else 45) / 2)
-        camera = Camera(projection="perspective", resolution=(cols, rows), focal_px=(focal, focal))
-        depth = look(scene, camera, pose)
-        mask = depth > 0
-        sigma = np.where(mask, 5e-4 + 1e-4 * depth if far else 1e-4, 0).astype(np.float32)
-        noisy = np.where(mask, depth + sigma * rng.standard_normal(depth.shape), 0).astype(np.float32)
-        name = f"{'far' if far else 'near'}{number:03d}"
-        own = camera.points(-noisy)[mask]
-        world = own.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        middle = world.mean(axis=0)
-        truth[name] = Truth(pose, middle, float(np.sqrt(((world - middle) ** 2).sum(axis=1).mean())), far)
-        points += len(own)
-        start = pose.copy()
-        start[:3, :3] = exponential(rng.normal(scale=TURN_OFF, size=3)) @ pose[:3, :3]
-        start[:3, 3] = pose[:3, 3] + rng.normal(scale=FAR_OFF if far else NEAR_OFF, size=3)
-        more = {}
-        if number % CLOUD_EVERY == CLOUD_EVERY - 1:
-            write_ply(PointCloud((1000 * own).astype(np.float32), np.zeros((len(own), 3), dtype=np.uint8)), folder / f"{name}.ply")
-            more = {"unit": "mm", "sigma_m": float(np.median(sigma[mask]))}
-        else:
-            DepthMaps(camera=camera, mask=mask, depth=noisy, sigma=sigma).write(folder / name / "depth.exr")
-        entries.append(ScanEntry(name=name, path=f"{name}.ply" if more else name, **more,
-                                 scan_to_world=tuple(tuple(map(float, row)) for row in start)))
+            truth[name], entry = write_scan(scene, folder, name, number, count, (cols, round(cols / 1.25)))
+            plain = truth[name]._asdict() | {"pose": truth[name].pose.tolist(), "middle": truth[name].middle.tolist()}
+            write_text(known, json.dumps(plain | {"entry": entry.model_dump(mode="json")}))
+        entries.append(entry)
     write_scan_set(ScanSet(schema="relit.scan-set/1", name="site", scans=tuple(entries)), folder / "scan-set.json")
-    return truth, points
+    return truth
+
+
+def write_scan(scene: Scene, folder: Path, name: str, number: int, count: int, shape: tuple[int, int]) -> tuple[Truth, ScanEntry]:
+    """Write one scan of so many columns and rows, the same whichever others are written."""
+    rng = np.random.default_rng([1, number])
+    far_count = round(FAR_SHARE * count)
+    far = number < far_count
+    if far:
+        turn = 2 * np.pi * 0.381966 * number
+        eye = np.array([rng.uniform(-8.5, 8.5), rng.uniform(1.5, 2.5), rng.uniform(-1.5, 1.5)])
+        pose = looking(eye, eye + np.array([np.cos(turn), rng.uniform(-0.2, 0.0), np.sin(turn)]))
+    else:
+        statue = scene.statues[number % STATUES]
+        turn = 2 * np.pi * (number // STATUES) / max((count - far_count) / STATUES, 1) + 0.3 * (number % STATUES)
+        pose = looking(statue + NEAR_M * np.array([np.cos(turn), rng.uniform(-0.1, 0.4), np.sin(turn)]), statue)
+    focal = shape[0] / 2 / np.tan(np.radians(FAR_DEGREES if far else NEAR_DEGREES) / 2)
+    camera = Camera(projection="perspective", resolution=shape, focal_px=(focal, focal))
+    depth = look(scene, camera, pose)
+    mask = depth > 0 if far else (depth > 0) & (depth < NEAR_RANGE_M)
+    sigma = np.where(mask, 5e-4 + 1e-4 * depth if far else 1e-4, 0).astype(np.float32)
+    noisy = np.where(mask, depth + sigma * rng.standard_normal(depth.shape, dtype=np.float32), 0).astype(np.float32)
+    own = camera.points(-noisy)[mask]
+    middle = own.mean(axis=0, dtype=np.float64)
+    size = float(np.sqrt(((own - middle.astype(np.float32)) ** 2).sum(axis=1).mean(dtype=np.float64)))
+    start = pose.copy()
+    start[:3, :3] = exponential(rng.normal(scale=TURN_OFF, size=3)) @ pose[:3, :3]
+    start[:3, 3] = pose[:3, 3] + rng.normal(scale=FAR_OFF if far else NEAR_OFF, size=3)
+    more = {}
+    if number % CLOUD_EVERY == CLOUD_EVERY - 1:
+        write_ply(PointCloud((1000 * own).astype(np.float32), np.zeros((len(own), 3), dtype=np.uint8)), folder / f"{name}.ply")
+        more = {"unit": "mm", "sigma_m": float(np.median(sigma[mask]))}
+    else:
+        DepthMaps(camera=camera, mask=mask, depth=noisy, sigma=sigma).write(folder / name / "depth.exr")
+    entry = ScanEntry(name=name, path=f"{name}.ply" if more else name, **more, scan_to_world=tuple(tuple(map(float, row)) for row in start))
+    return Truth(pose, pose[:3, :3] @ middle + pose[:3, 3], size, far, len(own)), entry
 
 
 class Cost(NamedTuple):
-    wall_s: float
+    """What the attempts of one command have taken together."""
+
     processor_s: float
     peak_bytes: int
+    attempts: int
+    ended: bool
 
 
-def run(*command: object) -> Cost:
-    """Run a relit command, and return what it took."""
-    began = time.perf_counter()
+def run(*command: object, note: Path) -> Cost:
+    """Run a relit command unless it has ended before, and return what it took with what earlier attempts did, which `note` tells."""
+    before = Cost(**json.loads(note.read_text())) if note.exists() else Cost(0.0, 0, 0, False)
+    if before.ended:
+        return before
     process = subprocess.Popen([sys.executable, "-m", "service.cli.main", *map(str, command)], stdout=sys.stderr)
-    _, status, usage = os.wait4(process.pid, 0)
+
+    def noted(processor_s: float, peak: int, ended: bool) -> Cost:
+        cost = Cost(before.processor_s + processor_s, max(before.peak_bytes, peak), before.attempts + 1, ended)
+        write_text(note, json.dumps(cost._asdict()))
+        return cost
+
+    while True:
+        found, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if found:
+            break
+        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+        peak = next((int(line.split()[1]) for line in Path(f"/proc/{process.pid}/status").read_text().splitlines()
+                     if line.startswith("VmHWM")), 0)
+        noted((int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), 1024 * peak, False)
+        time.sleep(LOOK_S)
     if (code := os.waitstatus_to_exitcode(status)) not in (0, 1):
         raise SystemExit(f"relit {command[0]} ended with {code}")
-    return Cost(time.perf_counter() - began, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024)
+    return noted(usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024, True)
 
 
 def pose_errors(registered: Path, truth: dict[str, Truth]) -> dict[str, tuple[float, float]]:
     """By how much each pose is wrong, after the best common motion of all: metres at the middle of its points, and degrees."""
-    found = {entry.name: np.array(entry.scan_to_world) for entry in read_scan_set(registered)[1].scans if entry.scan_to_world is not None}
+    found = poses_of(registered)
     true = np.concatenate([truth[name].middle + truth[name].size * np.concatenate([np.eye(3), -np.eye(3)]) for name in found])
     placed = np.concatenate([(truth[name].middle + truth[name].size * np.concatenate([np.eye(3), -np.eye(3)]) - truth[name].pose[:3, 3])
                              @ truth[name].pose[:3, :3] @ pose[:3, :3].T + pose[:3, 3] for name, pose in found.items()])
@@ -237,37 +175,77 @@ def common_motion(registered: Path, truth: dict[str, Truth]) -> np.ndarray:
     return np.asarray(rigid_between(placed[None], true[None], np.ones((1, len(true))))[0])
 
 
+def poses_of(registered: Path) -> dict[str, np.ndarray]:
+    """Return world_from_scan [4, 4] of each scan that has a pose."""
+    return {entry.name: np.array(entry.scan_to_world) for entry in read_scan_set(registered)[1].scans if entry.scan_to_world is not None}
+
+
+def errors_in_sigmas(registered: Path, truth: dict[str, Truth]) -> dict[str, tuple[float, float]]:
+    """Return the errors of place and turn of each scan against the reference in their stated standard deviations; 1 is expected (RMS)."""
+    report, found = json.loads((registered / "report.json").read_text()), poses_of(registered)
+    reference = report["reference"]
+    common = truth[reference].pose @ inverse(found[reference])
+    out = {}
+    for scan in report["scans"]:
+        if scan["name"] in found and scan["name"] != reference:
+            true = truth[scan["name"]]
+            motion = common @ found[scan["name"]] @ inverse(true.pose)
+            turn = np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)))
+            place = np.linalg.norm(motion[:3, :3] @ true.middle + motion[:3, 3] - true.middle)
+            out[scan["name"]] = float(place / scan["pose_sigma_m"]), float(turn / scan["pose_sigma_degrees"])
+    return out
+
+
+def claim(work: Path, **given: object) -> None:
+    """Take note of what the site in a folder is made of, and refuse a folder with another one."""
+    note = work / "site.json"
+    if note.exists() and json.loads(note.read_text()) != given:
+        raise SystemExit(f"--work {work}: holds another site, {note.read_text()}: delete it, or give another folder")
+    write_text(note, json.dumps(given))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=200)
-    parser.add_argument("--megapixels", type=float, default=0.05, help="of each scan; 5 makes 10⁹ points of 200 scans")
+    parser.add_argument("--megapixels", type=float, default=0.05, help="of each scan; 5.5 makes 10⁹ points of 200 scans")
     parser.add_argument("--voxel-mm", type=float, help="default: half the median pixel of the scans from afar")
-    parser.add_argument("--work", type=Path, default=Path("site-work"), help="folder for the scans and results, which is deleted")
+    parser.add_argument("--work", type=Path, default=Path("site-work"), help="folder for the scans and results, deleted at the end")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--keep", action="store_true", help="do not delete the folder at the end")
+    parser.add_argument("--only-scans", action="store_true", help="stop when the scans are written; a further run goes on")
     parser.add_argument("--write", type=Path, help="page whose table gets a row")
     given = parser.parse_args()
     scene, work = make_scene(), given.work
-    shutil.rmtree(work, ignore_errors=True)
-    began = time.perf_counter()
-    truth, points = write_site(scene, work / "scans", given.scans, 1e6 * given.megapixels)
-    print(f"{given.scans} scans, {points:.3g} points, written in {time.perf_counter() - began:.0f} s; load "
+    claim(work, scans=given.scans, megapixels=given.megapixels)
+    began = time.process_time()
+    truth = write_site(scene, work / "scans", given.scans, 1e6 * given.megapixels)
+    points = sum(each.points for each in truth.values())
+    print(f"{given.scans} scans, {points:.4g} points, written in {time.process_time() - began:.0f} s of processor time; load "
           f"{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores", flush=True)
-    registering = run("register", work / "scans", "--out", work / "registered", "--threads", given.threads)
+    if given.only_scans:
+        return
+    registering = run("register", work / "scans", "--out", work / "registered", "--threads", given.threads, "--cache", work / "register",
+                      note=work / "register.json")
     errors = pose_errors(work / "registered", truth)
     report = json.loads((work / "registered" / "report.json").read_text())
-    far = np.array([errors[name] for name in errors if truth[name].far])
-    near = np.array([errors[name] for name in errors if not truth[name].far])
+    far = np.array([errors[name] for name in errors if truth[name].far]).reshape(-1, 2)
+    near = np.array([errors[name] for name in errors if not truth[name].far]).reshape(-1, 2)
     for words, values in (("far", far), ("near", near)):
         print(f"{words}: {len(values)} joined; place median {1e3 * np.median(values[:, 0]):.3g} mm, largest "
               f"{1e3 * values[:, 0].max():.3g} mm; turn largest {values[:, 1].max():.3g}°", flush=True)
-    print(f"pairs {len(report['pairs'])}, not tried {report['pairs_not_tried']}; {registering}", flush=True)
+    in_sigmas = errors_in_sigmas(work / "registered", truth)
+    off = np.array(list(in_sigmas.values()))
+    print(f"error over σ, place and turn: RMS {np.sqrt((off**2).mean(axis=0)).round(2)}, largest {off.max(axis=0).round(2)} "
+          f"({max(in_sigmas, key=lambda name: in_sigmas[name][0])})", flush=True)
+    print(f"pairs {len(report['pairs'])}, joined {sum(pair['state'] == 'joined' for pair in report['pairs'])}, not tried "
+          f"{report['pairs_not_tried']}; {registering}", flush=True)
     file, listed = read_scan_set(work / "registered")
     images = [entry for entry in listed.scans if entry.scan_to_world is not None and not entry.path.endswith(".ply")]
-    (work / "images").mkdir()
     write_scan_set(listed.model_copy(update={"scans": tuple(entry.model_copy(update={"path": str((file.parent / entry.path).resolve())})
                                                             for entry in images)}), work / "images" / "scan-set.json")
-    voxel = given.voxel_mm or 1e3 * 0.5 * 6.0 * np.tan(np.radians(85) / 2) * 2 / np.sqrt(1.25e6 * given.megapixels)
-    fusing = run("fuse", work / "images", "--out", work / "fused", "--tiles", "--voxel-m", f"{1e-3 * voxel:.3g}", "--device", "cpu")
+    voxel = given.voxel_mm or 1e3 * 0.5 * 6.0 * np.tan(np.radians(FAR_DEGREES) / 2) * 2 / np.sqrt(1.25e6 * given.megapixels)
+    fusing = run("fuse", work / "images", "--out", work / "fused", "--tiles", "--voxel-m", f"{1e-3 * voxel:.3g}", "--device", "cpu",
+                 "--cache", work / "fuse", note=work / "fuse.json")
     fused = json.loads((work / "fused" / "report.json").read_text())
     off = surface_errors(scene, work / "fused" / "tiles", common_motion(work / "registered", truth))
     print(f"surface: {fused['vertices']} vertices in {fused['tiles']} tiles, voxel {voxel:.3g} mm; off by {1e3 * np.median(off):.3g} mm "
@@ -280,7 +258,8 @@ def main() -> None:
     if given.write is not None:
         text = given.write.read_text(encoding="utf-8")
         given.write.write_text(text.replace(END, f"{row}\n{END}"), encoding="utf-8")
-    shutil.rmtree(work)
+    if not given.keep:
+        shutil.rmtree(work)
 
 
 if __name__ == "__main__":

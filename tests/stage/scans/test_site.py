@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.site import distance, look, looking, make_scene
+from benchmarks.site_scene import distance, look, looking, make_scene
 from stage.camera import Camera
 from stage.scans.fine import fit
 from stage.scans.pairs import prepare
