@@ -7,6 +7,7 @@ import numpy as np
 
 from stage.scans.neighbours import Neighbours
 from stage.scans.scan import Scan
+from stage.scans.squares import squares_of
 
 NEIGHBOURS, FEW_NEIGHBOURS = 16, 8
 """The number of neighbours that a normal is fitted to, and with which poses are fitted again, to see what the
@@ -47,28 +48,68 @@ class Thinned(NamedTuple):
     points: np.ndarray  # [n, 3] float64 metres
     directions: np.ndarray  # [n, 3] float64, unit, from the camera
     sigma: np.ndarray  # [n] float64 metres
+    even: bool = True
+    """Whether points are as far apart on all of the surface."""
 
 
-def prepared(scan: Scan, *, cell_m: float, most: int, threads: int = 1) -> Cloud:
-    """Return the points of a scan at one scale.
+def thinned_scan(scan: Scan) -> Thinned:
+    """Return at most `MOST_POINTS` points of a scan.
+
+    A range image of many more pixels is taken in squares of pixels, which are larger where the surface is farther away. All else is taken
+    in cells, only as far as the noise and the number of points demand it.
+    """
+    side = int(np.ceil(np.sqrt(len(scan.points) / MOST_POINTS)))
+    if side > 2 and scan.camera is not None and scan.camera.projection == "perspective":
+        points, directions, variance = _of_squares(scan, side)
+    else:
+        side = 1
+        points, directions, variance = _of_scan(scan)
+    cell = NOISE_CELLS * float(np.sqrt(np.median(variance)))
+    while len(points) > MOST_POINTS and (count := 1 + np.count_nonzero(np.diff(np.sort(_cells(points, cell))))) > MOST_POINTS:
+        cell *= max(1.02, float(np.sqrt(count / MOST_POINTS)))
+    return thin(points, directions, variance, cell)._replace(even=side == 1)
+
+
+def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
+    """Return the means of the points of a scan in cells.
 
     Args:
         scan: the scan.
-        cell_m: the side of cells whose points are averaged, metres; 0: only as far as the noise demands it.
-        most: the most points that are matched with other scans; they are drawn evenly, and always the same.
-        threads: for the search of neighbours.
+        thinned: what `thinned_scan` made of it, which is taken in its place if it has far fewer points.
+        cell_m: the side of the cells, metres, if the noise does not demand larger ones.
     """
-    points, directions, variance = scan.points.astype(np.float64), scan.directions(), scan.sigma.astype(np.float64) ** 2
     cell = max(cell_m, NOISE_CELLS * float(np.median(scan.sigma)))
-    thinned = thin(points, directions, variance, cell)
-    while len(thinned.points) > MOST_POINTS:
-        cell *= max(1.02, float(np.sqrt(len(thinned.points) / MOST_POINTS)))
-        thinned = thin(points, directions, variance, cell)
-    return cloud_of(thinned, most=most, threads=threads)
+    if len(scan.points) > MOST_POINTS:
+        return thin(thinned.points, thinned.directions, thinned.sigma**2, cell)
+    return thin(*_of_scan(scan), cell)
+
+
+def _of_scan(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points of a scan, their directions [n, 3], and their variances along these [n]."""
+    return scan.points.astype(np.float64), scan.directions(), scan.sigma.astype(np.float64) ** 2
+
+
+def _of_squares(scan: Scan, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points of squares of pixels, their directions [n, 3], and their variances along these [n]."""
+    assert scan.camera is not None
+    z = -scan.points[:, 2]
+    length = np.sqrt((scan.points**2) @ np.ones(3, dtype=np.float32))
+    image = squares_of(scan.image(z), scan.image(scan.sigma * z / length), scan.camera, side)
+    x, y = image.camera.plane_coordinates()
+    there = image.depth > 0
+    ray = np.stack([x[there], y[there], -np.ones(np.count_nonzero(there))], axis=1)
+    stretch = np.sqrt((ray * ray) @ np.ones(3))
+    return ray * image.depth[there][:, None], ray / stretch[:, None], (image.sigma[there] * stretch) ** 2
 
 
 def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
-    """Return points with their normals, spacing and borders; arguments as of `prepared`."""
+    """Return points with their normals, spacing and borders.
+
+    Args:
+        thinned: the points.
+        most: the most points that are matched with other scans; they are drawn evenly over the surface, and always the same.
+        threads: for the search of neighbours.
+    """
     tree = Neighbours(thinned.points, threads=threads)
     index, distance = tree.nearest(thinned.points, NEIGHBOURS + 1)
     around = thinned.points[index] - thinned.points[:, None]
@@ -77,9 +118,12 @@ def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
     off = np.linalg.norm(mean - normals * np.einsum("ni,ni->n", mean, normals)[:, None], axis=1)
     spacing = distance[:, min(SPACING_NEIGHBOUR, distance.shape[1] - 1)]
     border = (off > OFF_CENTRE * distance[:, -1]) | (spread[:, 1] < 0.05 * spread[:, 2])
-    sample = np.random.default_rng(0).permutation(len(thinned.points))[:most]
+    if thinned.even:
+        order = np.random.default_rng(0).permutation(len(thinned.points))
+    else:  # by the area that a point stands for (Efraimidis and Spirakis, Information Processing Letters 97, 2006)
+        order = np.argsort(np.random.default_rng(0).exponential(size=len(spacing)) / np.maximum(spacing, 1e-12) ** 2, kind="stable")
     return Cloud(points=thinned.points, normals=normals, near_normals=near_normals, directions=thinned.directions, sigma=thinned.sigma,
-                 spacing=spacing, border=border, tree=tree, sample=np.sort(sample))
+                 spacing=spacing, border=border, tree=tree, sample=np.sort(order[:most]))
 
 
 def _planes(around: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,9 +144,7 @@ def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell:
         variance: [n] square metres, along the directions.
         cell: side of the cells, metres.
     """
-    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    size = index.max(axis=0) + 1
-    _, of_point, count = np.unique(index @ np.array([1, size[0], size[0] * size[1]]), return_inverse=True, return_counts=True)
+    _, of_point, count = np.unique(_cells(points, cell), return_inverse=True, return_counts=True)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.bincount(of_point, values, minlength=len(count)) / count
@@ -111,3 +153,10 @@ def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell:
     middle = np.stack([mean(column) for column in directions.T], axis=1)
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
     return Thinned(averaged, middle, np.sqrt(mean(variance) / count))
+
+
+def _cells(points: np.ndarray, cell: float) -> np.ndarray:
+    """Return the number of the cell of each point, [n] int64."""
+    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = index.max(axis=0) + 1
+    return index @ np.array([1, size[0], size[0] * size[1]])

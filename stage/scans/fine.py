@@ -12,6 +12,7 @@ import numpy as np
 
 from stage.scans.cloud import Cloud
 from stage.scans.coarse import ALIKE
+from stage.scans.neighbours import NearestWithin
 from stage.scans.rigid import applied, moved
 from stage.spread import MAD_TO_SIGMA
 
@@ -62,24 +63,26 @@ class Rows(NamedTuple):
     sigma_b: np.ndarray  # [k] float32
 
 
-def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float]) -> Fit | None:
+def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float], *, most: int | None = None) -> Fit | None:
     """Move scan b until its surface lies on that of scan a.
 
     Args:
         a, b: the scans.
         start: [4, 4] a_from_b.
         reaches: the largest distances, metres, at which points are matched, one after the other.
+        most: the most points of b that are matched; None: all that are drawn.
 
     Returns:
         The fit, or None if fewer than `LEAST_MATCHES` points can be matched or they do not determine a pose at all.
     """
     pose = start
     found: _Matches | None = None
-    few = b.sample[::max(1, -(-len(b.sample) // FEW))]
+    search, count = NearestWithin(a.tree, len(b.sample)), len(b.sample)
+    whole, few = (slice(None, None, max(1, -(-count // min(most or count, each)))) for each in (count, FEW))
     for reach in reaches:
         last = reach == reaches[-1]
         for _ in range(STEPS):
-            found = _match(a, b, pose, reach, b.sample if last else few)
+            found = _match(a, b, pose, reach, search, whole if last else few)
             if found is None:
                 return None
             system = _system(found)
@@ -92,7 +95,7 @@ def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float]) -> Fit | No
             enough = STILL * found.scale / np.sqrt(len(found.at)) if last else NEARLY_STILL * found.scale
             if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < enough:
                 break
-    if found is None or (found := _match(a, b, pose, reaches[-1], b.sample)) is None:
+    if found is None or (found := _match(a, b, pose, reaches[-1], search, whole)) is None:
         return None
     return _result(a, found, pose)
 
@@ -167,17 +170,19 @@ def _dots(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (one * other) @ np.ones(3)
 
 
-def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, sample: np.ndarray) -> _Matches | None:
+def _match(a: Cloud, b: Cloud, pose: np.ndarray, reach: float, search: NearestWithin, rows: slice) -> _Matches | None:
+    sample = b.sample[rows]
     placed = applied(pose, b.points[sample])
-    index, apart = a.tree.nearest(placed)
-    index, apart = index[:, 0], apart[:, 0]
+    index, apart = search.search(placed, rows, reach)
+    near = np.flatnonzero(apart < reach)
+    sample, placed, index, apart = sample[near], placed[near], index[near], apart[near]
     turned = b.normals[sample] @ pose[:3, :3].T
     alike = _dots(turned, a.normals[index])
     normal = turned + a.normals[index]
     normal /= np.maximum(np.sqrt(_dots(normal, normal)), 1e-12)[:, None]
     across = _dots(placed - a.points[index], normal)
     beside = np.sqrt(np.maximum(apart**2 - across**2, 0))
-    keep = (apart < reach) & (alike > ALIKE) & ~a.border[index] & ~b.border[sample] & (beside < 1.5 * a.spacing[index])
+    keep = (alike > ALIKE) & ~a.border[index] & ~b.border[sample] & (beside < 1.5 * a.spacing[index])
     if keep.sum() < LEAST_MATCHES:
         return None
     at, of, normal, across = index[keep], sample[keep], normal[keep], across[keep]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.scans.cloud import Cloud, prepared
+from stage.scans.cloud import Cloud, cloud_of, rough_scan, thinned_scan
 from stage.scans.coarse import is_near, rough_poses
 from stage.scans.features import fpfh
 from stage.scans.fine import TUKEY, Fit, fit
@@ -42,8 +42,14 @@ BENT, WEAKLY_BENT = 0.3, 1.5
 the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .1 to .2 about its axis at
 spacings of 6 to 17 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
 details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
+TRIED_POINTS = 800
+"""The most points of the fit that is first tried out."""
 SHIFTS = (0.1, -0.1, 0.3)
 """By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
+NEAR_SHIFT = 3.0
+"""The same from a start, in spacings: a place far from the start is none."""
+KEPT = 0.3
+"""The part of such a shift that is left after a fit, from which on the scan slides along the direction."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
 """Another pose fits as well if its residual is at most this many times that of the best, its overlap that part of it at the least, and not
 this much more of it is contradicted."""
@@ -121,8 +127,9 @@ def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
         cell_m: side of the cells of the rough scale, metres.
         threads: for the search of neighbours.
     """
-    rough = prepared(scan, cell_m=cell_m, most=ROUGH_POINTS, threads=threads)
-    fine = prepared(scan, cell_m=0.0, most=FINE_POINTS, threads=threads)
+    thinned = thinned_scan(scan)
+    rough = cloud_of(rough_scan(scan, thinned, cell_m), most=ROUGH_POINTS, threads=threads)
+    fine = cloud_of(thinned, most=FINE_POINTS, threads=threads)
     return Prepared(rough=rough, fine=fine, features=fpfh(rough, FEATURE_CELLS * cell_m), image=depth_range(scan),
                     area=len(rough.points) * cell_m**2)
 
@@ -141,8 +148,14 @@ def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float,
 
 
 def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
-    """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`."""
-    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap)
+    """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`.
+
+    The fine scale is tried at once. The rough scale has few points, and only leads there where the start does not.
+    """
+    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, from_start=True)
+    if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
+        return pair
+    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, from_start=True)
 
 
 def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -> Iterator[np.ndarray]:
@@ -168,10 +181,13 @@ def fits_roughly(found: Fit, a: Prepared, b: Prepared, cell_m: float) -> bool:
     return found.residual <= max(ROUGH_BEND * cell_m, RATIO * noise)
 
 
-def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float, *,
+          from_start: bool = False) -> Pair:
+    """Return the best pair of poses that are tried; `from_start`: of the one that is given, so that others far from it are none."""
     found: list[Pair] = []
     for pose in poses:
-        pair = _judged(a, b, pose, numbers, cell_m, least_overlap)
+        settled = _fitted(a, b, pose, cell_m)
+        pair = None if settled is None else _judged(a, b, settled, numbers, least_overlap)
         if pair is not None and not any(_same(pair, other, b, cell_m) for other in found):
             found.append(pair)
     if not found:
@@ -183,15 +199,21 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
     if rival is not None:
         return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
-    return _tried_out(a, b, best, cell_m, least_overlap)
+    tried = _tried_out(a, b, best, cell_m, least_overlap, from_start)
+    if tried.state is PairState.JOINED and tried.fit is not None:
+        tried = tried._replace(fit=_doubted(a.fine, b.fine, tried.fit, 1.5 * max(a.spacing, b.spacing)))
+    return tried
 
 
-def _judged(a: Prepared, b: Prepared, start: np.ndarray, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair | None:
-    """Return the pair at the pose that the fine scale finds from a start; None if there is none."""
+def _fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
+    """Return the fit of so many points at the fine scale from a start; None if there is none."""
     spacing = max(a.spacing, b.spacing)
-    found = fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing])
-    if found is None:
-        return None
+    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most)
+
+
+def _judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
+    """Return the pair at the pose of a fit at the fine scale."""
+    spacing = max(a.spacing, b.spacing)
     area = found.matches / len(b.fine.sample) * b.area
     overlap = min(area / min(a.area, b.area), 1.0)
     tolerance = max(TUKEY * found.residual, 0.5 * spacing)
@@ -206,8 +228,6 @@ def _judged(a: Prepared, b: Prepared, start: np.ndarray, numbers: tuple[int, int
         state, reason = PairState.CONTRADICTED, f"{against.points:.1%} of the points in sight lie where the other camera saw through"
     elif overlap < least_overlap:
         state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
-    if state is PairState.JOINED:
-        found = _doubted(a.fine, b.fine, found, 1.5 * spacing)
     return Pair(*numbers, state, found, overlap, against.points, reason)
 
 
@@ -219,22 +239,41 @@ def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
     return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
 
 
-def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float) -> Pair:
+def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, from_start: bool) -> Pair:
     """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
     assert best.fit is not None
     units = step_units(b)
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
+    weak, undetermined = [], []
     for value, axis in zip(values, axes.T, strict=True):
         noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
                                   for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
-        step = units * axis
-        weak = value < WEAK * noise or value < WEAKLY_BENT * bend
-        slid = step / units[0]
-        if value < NOT_DETERMINED * noise or value < BENT * even_bend or (weak and _slides(a, b, best, slid, cell_m, least_overlap)):
-            kind = "turned about an axis" if np.linalg.norm(axis[:3]) > 0.5 else "shifted along itself"
-            return best._replace(state=PairState.AMBIGUOUS,
-                                 reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
-    return best
+        if value < NOT_DETERMINED * noise or value < BENT * even_bend:
+            undetermined.append(units * axis / units[0])
+        elif value < WEAK * noise or value < WEAKLY_BENT * bend:
+            weak.append(units * axis / units[0])
+    if not undetermined and weak:
+        near = NEAR_SHIFT * max(a.spacing, b.spacing)
+        shifts, reach = ((near * units[0], -near * units[0]), near) if from_start else (SHIFTS, cell_m)
+        undetermined = [step for step in _left_behind(a, b, best, weak, shifts, reach) if _slides(a, b, best, step, cell_m, least_overlap)]
+    if not undetermined:
+        return best
+    kind = "turned about an axis" if np.linalg.norm(undetermined[0][:3]) > 0.5 else "shifted along itself"
+    return best._replace(state=PairState.AMBIGUOUS,
+                         reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
+
+
+def _left_behind(a: Prepared, b: Prepared, best: Pair, steps: list[np.ndarray], shifts: tuple[float, ...], reach: float
+                 ) -> list[np.ndarray]:
+    """Return the directions along which a fit of few points does not return from a shift along all of them."""
+    assert best.fit is not None
+    left: list[np.ndarray] = []
+    for shift in shifts:
+        start = moved(shift * np.sum(steps, axis=0), best.fit.pivot, best.fit.pose)
+        found = _fitted(a, b, start, reach, TRIED_POINTS)
+        if found is not None:
+            left += [step for step in steps if _kept(found, best.fit, step) / shift > KEPT and not any(step is other for other in left)]
+    return left
 
 
 def step_units(scan: Prepared) -> np.ndarray:
@@ -247,12 +286,20 @@ def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: floa
     """Return whether a fit from a place along a direction ends about there, and as good."""
     assert best.fit is not None
     for shift in SHIFTS:
-        other = _judged(a, b, moved(shift * step, best.fit.pivot, best.fit.pose), (best.a, best.b), cell_m, least_overlap)
-        if other is not None and other.fit is not None and _as_good(other, best):
-            kept = step_between(other.fit.pose @ inverse(best.fit.pose), best.fit.pivot)
-            if float(kept @ step / (step @ step)) / shift > 0.3:
+        start, found = moved(shift * step, best.fit.pivot, best.fit.pose), None
+        for most in (TRIED_POINTS, None):
+            found = _fitted(a, b, start, cell_m, most)
+            if found is None or _kept(found, best.fit, step) / shift <= KEPT:
+                break
+        else:
+            if found is not None and _as_good(_judged(a, b, found, (best.a, best.b), least_overlap), best):
                 return True
     return False
+
+
+def _kept(found: Fit, best: Fit, step: np.ndarray) -> float:
+    """Return how far a fit lies from another along a direction, in its length."""
+    return float(step_between(found.pose @ inverse(best.pose), best.pivot) @ step / (step @ step))
 
 
 def _as_good(pair: Pair, best: Pair) -> bool:

@@ -237,7 +237,7 @@ def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | Non
             if count <= ALL_PAIRS:
                 tasks.append(PairTask(a, b, None, 0.0, True))
         elif (a, b) in near:
-            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, True))
+            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS))
         elif count <= ALL_PAIRS:
             pairs[a, b] = Pair(a, b, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
     pairs |= registered(tasks, 0.15, 0.75)
@@ -283,7 +283,7 @@ def _predicted(outlines: dict[int, Outline], pairs: dict[tuple[int, int], Pair],
     near = overlapping(poses, Overlaps(outlines, poses, NEAR_CELLS), options.least_overlap, count=count, wanted=wanted)
     if count > ALL_PAIRS:
         joined = [number for pair in pairs.values() if pair.state is PairState.JOINED for number in (pair.a, pair.b)]
-        near = [(a, b) for a, b in near if min(joined.count(a), joined.count(b)) < PARTNERS]
+        near = [(a, b) for a, b in near if min(joined.count(a), joined.count(b)) < PARTNERS // 2]
     found = registered([PairTask(a, b, inverse(poses[a]) @ poses[b], NEAR_CELLS, False) for a, b in near], 0.75, 0.9)
     tried |= {numbers for numbers, pair in found.items() if pair.reason != NOT_THERE}
     return {numbers: pair for numbers, pair in found.items() if pair.state is PairState.JOINED}
