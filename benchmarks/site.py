@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("site-work"), help="folder for the scans and results, deleted at the end")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--keep", action="store_true", help="do not delete the folder at the end")
-    parser.add_argument("--only-scans", action="store_true", help="stop when the scans are written; a further run goes on")
+    parser.add_argument("--until", choices=("scans", "registration"), help="stop when this is done; a further run goes on")
     parser.add_argument("--write", type=Path, help="page whose table gets a row")
     given = parser.parse_args()
     scene, work = make_scene(), given.work
@@ -222,7 +222,7 @@ def main() -> None:
     points = sum(each.points for each in truth.values())
     print(f"{given.scans} scans, {points:.4g} points, written in {time.process_time() - began:.0f} s of processor time; load "
           f"{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores", flush=True)
-    if given.only_scans:
+    if given.until == "scans":
         return
     registering = run("register", work / "scans", "--out", work / "registered", "--threads", given.threads, "--cache", work / "register",
                       note=work / "register.json")
@@ -239,6 +239,8 @@ def main() -> None:
           f"({max(in_sigmas, key=lambda name: in_sigmas[name][0])})", flush=True)
     print(f"pairs {len(report['pairs'])}, joined {sum(pair['state'] == 'joined' for pair in report['pairs'])}, not tried "
           f"{report['pairs_not_tried']}; {registering}", flush=True)
+    if given.until == "registration":
+        return
     file, listed = read_scan_set(work / "registered")
     images = [entry for entry in listed.scans if entry.scan_to_world is not None and not entry.path.endswith(".ply")]
     write_scan_set(listed.model_copy(update={"scans": tuple(entry.model_copy(update={"path": str((file.parent / entry.path).resolve())})
