@@ -208,7 +208,7 @@ def main() -> None:
     parser.add_argument("--relighting", type=Path, help="folder with glossy and owl of samples/make_relight_checks.py, and "
                                                            "two_parts and figure of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
-    parser.add_argument("--large", type=Path, help="folder where about 60 GB may be written and are removed again")
+    parser.add_argument("--large", type=Path, help="folder where about 40 GB may be written and are removed again")
     parser.add_argument("--megapixels", type=float, default=MEGAPIXELS, help="of --large")
     parser.add_argument("--lights", type=int, default=LIGHTS, help="of --large")
     parser.add_argument("--frames", type=int, default=FRAMES, help="of --large")

@@ -1,11 +1,11 @@
 """A large capture end to end: seconds and peak memory of every stage of a solve, an export and relit frames.
 
-    python -m benchmarks.large FOLDER                    # 50 megapixels, 64 lights, 100 frames: about 26 GB in the folder, removed again
+    python -m benchmarks.large FOLDER                    # 50 megapixels, 64 lights, 100 frames: about 40 GB in the folder, removed again
     python -m benchmarks.large FOLDER --megapixels 4     # less of everything
 
 The capture is synthetic: a bumpy Lambertian surface that fills the frame, with the noise of a camera, as half EXR files. Each command has a
-process of its own, whose peak memory is set back at the beginning of every stage (Linux: /proc/self/clear_refs), so that each stage shows
-its own peak.
+process of its own, and its results are removed when no later one reads them. The peak memory of the process is set back at the
+beginning of every stage (Linux: /proc/self/clear_refs), so that each stage shows its own.
 """
 
 import argparse
@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -99,8 +100,10 @@ def make_capture(folder: Path, width: int, height: int, lights: int, compression
     u = np.arange(width, dtype=np.float32)[None] * np.float32(2 * np.pi * 8 / width)
     albedo = np.array([0.6, 0.5, 0.4], dtype=np.float32) / np.float32(np.pi)
     noise = rng.standard_normal(4 * ROWS * width, dtype=np.float32)  # taken from another place for each frame and channel
-    frames = []
-    for index, (x, y, z) in enumerate(directions.astype(np.float32)):
+
+    def write_frame(index: int) -> dict[str, object]:
+        x, y, z = directions[index].astype(np.float32)
+        places = np.random.default_rng(index)
         image = np.empty((3, height, width), dtype=np.float16)
         for first in range(0, height, ROWS):
             v = np.arange(first, min(first + ROWS, height), dtype=np.float32)[:, None] * np.float32(2 * np.pi * 8 / width)
@@ -108,13 +111,16 @@ def make_capture(folder: Path, width: int, height: int, lights: int, compression
             shading = np.maximum((x * slope_x + y * slope_y + z) / np.sqrt(slope_x**2 + slope_y**2 + 1), 0)
             for channel, reflected in enumerate(albedo):
                 clean = reflected * shading
-                begin = int(rng.integers(len(noise) - clean.size))
+                begin = int(places.integers(len(noise) - clean.size))
                 sigma = np.sqrt(clean / np.float32(ELECTRONS) + np.float32(READ_ELECTRONS / ELECTRONS) ** 2)
                 image[channel, first : first + ROWS] = np.maximum(clean + sigma * noise[begin : begin + clean.size].reshape(clean.shape), 0)
         name = f"{index:03d}.exr"
         exr.write(folder / name, dict(zip("RGB", image, strict=True)), color_space="lin_rec709_scene", metadata={},
                   compression=getattr(exr.Compression, compression))
-        frames.append({"image": name, "light": {"type": "distant", "direction": [float(x), float(y), float(z)], "irradiance": [1, 1, 1]}})
+        return {"image": name, "light": {"type": "distant", "direction": [float(x), float(y), float(z)], "irradiance": [1, 1, 1]}}
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        frames = list(pool.map(write_frame, range(lights)))
     write_manifest(Manifest.model_validate({
         "schema": SCHEMA, "name": "large", "camera": {"projection": "orthographic", "resolution": [width, height]},
         "frames": frames}), folder / "capture.json")
@@ -164,10 +170,15 @@ def head(width: int, height: int, lights: int, frames: int, method: str, compres
 
 def rows(stages: list[Stage]) -> list[str]:
     """Return the rows of a command's stages, and one of them all."""
-    command, peak = stages[0].command, max(stage.peak_gib for stage in stages)
+    command = f"`{stages[0].command}`"
+    return [*(f"| {command} | {stage.name} | {stage.seconds:.1f} | {stage.cpu_seconds:.1f} | {stage.peak_gib:.2f} |" for stage in stages),
+            sum_row(command, stages)]
+
+
+def sum_row(command: str, stages: list[Stage]) -> str:
+    """Return the row of all these stages: their seconds added up, and the largest peak."""
     seconds, cpu_seconds = sum(stage.seconds for stage in stages), sum(stage.cpu_seconds for stage in stages)
-    return [*(f"| `{command}` | {stage.name} | {stage.seconds:.1f} | {stage.cpu_seconds:.1f} | {stage.peak_gib:.2f} |" for stage in stages),
-            f"| `{command}` | **all** | **{seconds:.0f}** | **{cpu_seconds:.0f}** | **{peak:.2f}** |"]
+    return f"| {command} | **all** | **{seconds:.0f}** | **{cpu_seconds:.0f}** | **{max(stage.peak_gib for stage in stages):.2f}** |"
 
 
 def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGHTS, frames: int = FRAMES,
@@ -182,10 +193,18 @@ def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGH
         subprocess.run([sys.executable, "-c", "import sys; from pathlib import Path; from benchmarks.large import make_capture\n"
                         "make_capture(Path(sys.argv[1]), *map(int, sys.argv[2:5]), sys.argv[5])", str(work / "capture"), str(width),
                         str(height), str(lights), compression.upper()], check=True)
+        stages: list[Stage] = []
         for command in COMMANDS:
-            found = rows(measure(command, work, method, frames, compression))
+            measured = measure(command, work, method, frames, compression)
+            stages += measured
+            found = rows(measured)
+            if command == COMMANDS[-1]:
+                found.append(sum_row("all commands", stages))
             print("\n".join(found), flush=True)
             lines += found
+            if command == "export":  # relight reads the capture and the stack beside it
+                shutil.rmtree(work / "out")
+                shutil.rmtree(work / "asset")
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return lines
@@ -205,7 +224,7 @@ def main() -> None:
     if given.command is not None:
         print(json.dumps(run_command(given.command, given.folder, given.method, given.frames, given.compression)))
         return
-    large_table(given.folder, given.megapixels, given.lights, given.frames, given.method)
+    large_table(given.folder, given.megapixels, given.lights, given.frames, given.method, given.compression)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from stage import inputs
@@ -38,16 +40,18 @@ class Fingerprints:
         Raises:
             StorageError: a file cannot be read.
         """
-        result: dict[str, str] = {}
-        for name in names:
-            path = self._folder / name
-            with storage("read", path):
-                stat = path.stat()
-                known = self._known.get(name)
-                if known is None or known[:2] != [stat.st_size, stat.st_mtime_ns]:
-                    self._known[name] = [stat.st_size, stat.st_mtime_ns, digest(path)]
-            result[name] = str(self._known[name][2])
-        return result
+        wanted = list(dict.fromkeys(names))
+        with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-fingerprints") as pool:
+            return dict(zip(wanted, pool.map(self._of, wanted), strict=True))
+
+    def _of(self, name: str) -> str:
+        path = self._folder / name
+        with storage("read", path):
+            stat = path.stat()
+            known = self._known.get(name)
+            if known is None or known[:2] != [stat.st_size, stat.st_mtime_ns]:
+                known = self._known[name] = [stat.st_size, stat.st_mtime_ns, digest(path)]
+        return str(known[2])
 
     def remember(self) -> None:
         """Write the hashes to the JSON file."""

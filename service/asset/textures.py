@@ -17,7 +17,7 @@ import numpy as np
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
 from service.asset.metallic import MetallicLook
-from service.asset.tangent import TangentFrames
+from service.asset.tangent import TangentFrames, dot
 from service.requests.export import TextureFormat
 from stage import exr
 from stage.colour import convert
@@ -236,7 +236,7 @@ def _tangent_bands(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> 
         rows = slice(start, min(start + BAND_ROWS, len(known)))
         frame = frames.of_rows(rows.start, rows.stop)
         vectors = np.where(known[rows][..., None], normal[rows], 0)
-        length = np.linalg.norm(vectors, axis=-1)
+        length = np.sqrt(dot(vectors, vectors))
         covered = known[rows] & frame.covered & (length > 0)
         unit = np.where(covered[..., None], vectors, 0) / np.where(covered, length, 1)[..., None]
         yield rows, frame.express(unit) / 2 + 0.5, covered

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from kernels import device as devices
+from kernels.half import to_half
 from service.light.attributes import camera_attributes
 from service.light.layers import StillLayer, in_parts
 from service.requests.picture import FrameCompression, Layer, PictureOptions
@@ -229,8 +230,12 @@ class FrameWriter:
 def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int]:
     """Return what the file of a frame holds, of the whole frame or of rows, and the number of clipped pixels."""
     frame = _finished(frame, file, form)
-    clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum()) if _is_beyond_half(frame) else 0
-    picture = _half(frame, form, "")
+    clipped = 0
+    if _is_beyond_half(frame):
+        clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum())
+        picture = _half(np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX), form, "")
+    else:
+        picture = _half(frame, form, "")
     if form.alpha is not None:
         picture[ALPHA] = form.alpha
     parts = [exr.Part(BEAUTY_PART, picture, form.space, COMPRESSIONS[form.compression])]
@@ -239,7 +244,8 @@ def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray]
         layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
     for name, layer in layers.items():
         if name != Layer.SPECULAR or name in form.parts:
-            parts.append(exr.Part(name, _half(layer, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
+            bounded = np.clip(layer, -exr.HALF_MAX, exr.HALF_MAX) if _is_beyond_half(layer) else layer
+            parts.append(exr.Part(name, _half(bounded, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
     parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
     if not form.in_parts:
         parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
@@ -256,10 +262,8 @@ def _finished(frame: np.ndarray, file: FrameFile, form: FrameFormat) -> np.ndarr
 
 
 def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.ndarray]:
-    """Return the channels as half, clipped."""
-    if _is_beyond_half(frame):
-        frame = np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX)
-    planes = frame.astype(np.float16).reshape(3, form.resolution[1], form.resolution[0])
+    """Return the channels as half."""
+    planes = to_half(frame).reshape(3, form.resolution[1], form.resolution[0])
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}
 
 
