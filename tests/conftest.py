@@ -27,7 +27,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_unconfigure() -> None:
-    """Libraries that look for leaks as the interpreter ends find none."""
+    """What was spared can be freed as the interpreter ends: some libraries then look for leaks."""
     gc.unfreeze()
 
 

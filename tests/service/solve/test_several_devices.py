@@ -23,7 +23,7 @@ from tests.service.solve import test_reference as reference
 
 PAIR = "cuda:0,cuda:0" if "cuda:0" in devices.names() else "cpu,cpu"
 """One device that works on two pieces at a time: pieces end in any order, as on two devices."""
-BAND_BYTES, BATCH_BYTES, SEARCH_BYTES = 1 << 14, 1 << 15, 1 << 20
+BAND_BYTES, BATCH_BYTES, SEARCH_BYTES = 1 << 14, 1 << 15, 1 << 19
 """Memory of a band, of a batch, and of a batch for the searches in tables, which keep much for each pixel: small enough that every capture
 here has several."""
 
@@ -51,12 +51,12 @@ def distant(folder):
 
 
 def near(folder):
-    dome = near_lights.dome(20, perspective=True)
+    dome = near_lights.dome(16, perspective=True)
     return {"capture": near_lights.write(folder, dome, near_lights.lamps(dome, 16, 1.3))}
 
 
 def extended(folder):
-    return {"capture": horn.write(folder, horn.horn(16), 16), "method": "svbrdf"}
+    return {"capture": horn.write(folder, horn.horn(12), 12), "method": "svbrdf"}
 
 
 def polarised(folder):
@@ -94,7 +94,7 @@ def test_maps_and_findings_are_the_same_to_the_last_bit(tmp_path, small_pieces, 
 
 def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     """The shadows, the bounces and the shared materials of the owl follow from the whole object, between the passes over it."""
-    capture = write_small_owl(tmp_path / "owl", 10)
+    capture = write_small_owl(tmp_path / "owl", 16)
     one, two = (solve(SolveRequest(capture=capture, out=tmp_path / names, device=names)) for names in (PAIR.split(",")[0], PAIR))
     assert one.maps_path.read_bytes() == two.maps_path.read_bytes()
     found = json.loads(two.report_path.read_text())

@@ -148,7 +148,7 @@ def test_two_workers_find_the_same_to_the_last_bit_as_one(tmp_path, small_pieces
 
 def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     """What follows from the whole object is found by both workers, and has to be the same."""
-    request = {"capture": write_small_owl(tmp_path / "owl", 10)}
+    request = {"capture": write_small_owl(tmp_path / "owl", 16)}
     alone = solve(SolveRequest(**request, out=tmp_path / "alone", device="cpu"))
     store = Store(second="two")
     maps, _ = shared_solve(request, tmp_path / "shared", store)
