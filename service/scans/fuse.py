@@ -32,6 +32,8 @@ LISTED_HOLES = 50
 """Holes that the report lists, the longest first."""
 LOST_SHARE = 0.05
 """Share of the pixels of a scan that may lie at no fused surface before it is said."""
+MANY_CONTRADICTED = 0.25
+"""Part of the vertices with photometric normals at which these may contradict the depth before it is said."""
 FAR_SIGMAS = 1.5
 """Median distance of the pixels of a scan from the fused surface, in their standard deviations, above which it is said: .67 is expected."""
 
@@ -106,7 +108,7 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
             raise RequestError(f"--join-normals: no scan of {file} has photometric normals: name results of relit solve as maps of the "
                                "scans")
         timings.stage("normals", 1)
-        surface, joined = with_joined_normals(surface, fused)
+        surface, joined = with_joined_normals(surface, fused, str(file))
     baked = None
     if request.texture:
         timings.stage("texture", 1)
@@ -165,7 +167,10 @@ def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]
 
 
 def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what the residuals of the scans against the fused surface say."""
+    """Yield what the residuals of the scans against the fused surface say, and the normals that were joined with it."""
+    if (normals := facts.get("joined_normals")) is not None and normals["contradicted_share"] > MANY_CONTRADICTED:
+        yield (f"normals: at {normals['contradicted_share']:.0%} of the vertices the photometric normals contradict the depth, which stays "
+               "as it is there: the maps may be of other scans, or the σ of the depth too small")
     for scan in facts["scans"]:
         if not scan["fused"]:
             continue

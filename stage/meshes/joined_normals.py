@@ -3,26 +3,27 @@
 (1) Where the normals of the surface and the photometric ones differ in the same way over a wide part, the latter have drifted: a light that
 stands elsewhere bends them all. The difference is averaged at lengths that double, and each band between two of them corrects the normals
 by the share S / (S + N) of it, S being the variance of the drift, N that of the noise of the depth in this band (Wiener 1949).
+Vertices at which the two contradict each other (`stage.meshes.contradictions`) count little or nothing in both variances.
 (2) Vertices move along the corrected normals until the edges of the mesh are perpendicular to the normals at their ends, held by the depth:
-least squares weighted by the variances of both. No band of the motions is larger than the noise of the depth in it.
+least squares weighted by the variances of both. Edges at vertices that contradict, before or after, are left out, and these vertices stay.
+No band of the motions is larger than the noise of the depth in it.
 
 Source: Nehab, Rusinkiewicz, Davis and Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry", SIGGRAPH 2005
     (sections 3 and 4), whose one scale of correction is replaced by bands; weights of edges by Pinkall and Polthier, "Computing discrete
     minimal surfaces and their conjugates", Experimental Mathematics 2(1), 1993.
 """
 
-from itertools import pairwise
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-FINEST_PIXELS = 4.0
-"""Shortest length of a correction in pixels: below it a depth between pixels is a chord, and a normal of it says nothing."""
-BANDS = 6
-"""Lengths of corrections, each twice the one before."""
+from stage.meshes.bands import Bands
+from stage.meshes.contradictions import compared, unlike_noise
+
 BOUND_SIGMAS = 4.0
 """A vertex moves no farther than this many standard deviations of its depth: where normals ask for more, the depth decides."""
-ROUNDS = 3
+ROUNDS = 4
 """Solutions, each without the edges at vertices that would move too far."""
 LEAST_COTANGENT, MOST_COTANGENT = 0.05, 10.0
 """Bounds of the weights of edges, which thin triangles would make negative or very large."""
@@ -30,6 +31,10 @@ BENT = 0.25
 """Standard deviation of the slope of an edge whose normals differ, in squares of their angle: a chord of a curve that is no circle."""
 TOLERANCE, MOST_ITERATIONS = 1e-4, 1000
 """Residual of the linear systems as a part of their right side, and the most iterations of conjugate gradients."""
+
+
+_OfMotions = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Takes the motions [V] of the vertices, metres, and which of these move."""
 
 
 class Joined(NamedTuple):
@@ -40,7 +45,7 @@ class Joined(NamedTuple):
     moved: np.ndarray  # [V] float32 metres along the normal
     used: np.ndarray  # [V] bool, vertices that the normals moved
     contradicted: int
-    """Vertices with photometric normals that ask for more than BOUND_SIGMAS, which stay."""
+    """Vertices whose photometric normals contradict the surface, or ask for more than its noise explains, which stay."""
     drift_degrees: float
     """RMS of the correction of the normals."""
 
@@ -75,19 +80,21 @@ def join_normals(points: np.ndarray, faces: np.ndarray, sigma: np.ndarray, norma
     spread, given, tilt = sigma[used].astype(np.float64), normals[used].astype(np.float64), normal_sigma[used].astype(np.float64)
     mesh = _mesh(own, tri)
     measured = _face_normals(own, tri)
-    bands = _Bands(own, measured, mesh.area, pixel_m)
+    bands = Bands(own, measured, mesh.area, pixel_m)
     alike = bands.averaged(np.random.default_rng(0).standard_normal(len(own))[:, None], pixel_m)[:, 0]
     alike *= spread / np.sqrt(np.average(alike**2, weights=mesh.area))
-    turned = _corrected(bands, measured, _face_normals(own + alike[:, None] * given, tri) - measured, given)
-    move, wild = _moves(own, mesh, spread, turned, tilt)
-    move = _limited(bands, move, alike)
+    noise = _face_normals(own + alike[:, None] * given, tri) - measured
+    trust = compared(bands, measured - given, noise, pixel_m)
+    turned = _corrected(bands, measured, noise, given, trust.counts)
+    move, agree = _moves(own, mesh, spread, turned, tilt, trust.agree, lambda move, agree: _limited(bands, move, alike, agree),
+                         lambda move, agree: unlike_noise(bands, move, spread, agree, pixel_m))
     moved = np.zeros(len(points), dtype=np.float32)
     moved[used] = move
     out, corrected = points.astype(np.float64).copy(), normals.copy()
     out[used] = own + move[:, None] * turned
     corrected[used] = turned
     angle = np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(turned - given, axis=1) / 2, 1)))
-    return Joined(out, corrected, moved, used, int(wild.sum()), float(np.sqrt(np.average(angle**2, weights=mesh.area))))
+    return Joined(out, corrected, moved, used, int((~agree).sum()), float(np.sqrt(np.average(angle**2, weights=mesh.area * trust.counts))))
 
 
 def _mesh(points: np.ndarray, faces: np.ndarray) -> _Mesh:
@@ -114,58 +121,7 @@ def _face_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float64).tiny))
 
 
-class _Bands:
-    """Means over cells whose sides double, between whose middles they are linear, weighted by areas.
-
-    A cell holds six means, for surfaces that face along the axes and against them, so that the two sides of a sheet do not mix.
-    """
-
-    def __init__(self, points: np.ndarray, normals: np.ndarray, area: np.ndarray, pixel_m: float) -> None:
-        self._points, self._area = points, area
-        self._facing = normals**2
-        self._side = np.where(normals < 0, 1, 0) + np.array([0, 2, 4])
-        self._lengths = [FINEST_PIXELS * pixel_m * 2**k for k in range(BANDS)]
-
-    def averaged(self, values: np.ndarray, length: float) -> np.ndarray:
-        """Return values [V, k] averaged over about a length."""
-        local = self._points / length - 0.5
-        low = np.floor(local).astype(np.int64)
-        part = local - low
-        low -= low.min(axis=0)
-        size = low.max(axis=0) + 2
-        weights, places = [], []
-        for corner in np.ndindex(2, 2, 2):
-            share = np.prod(np.where(corner, part, 1 - part), axis=1)
-            cell = ((low + corner) @ np.array([1, size[0], size[0] * size[1]])) * 6
-            for axis in range(3):
-                weights.append(share * self._facing[:, axis])
-                places.append(cell + self._side[:, axis])
-        _, number = np.unique(np.concatenate(places), return_inverse=True)
-        of_corner = number.reshape(len(places), -1)
-        count = int(number.max()) + 1
-
-        def summed(given: np.ndarray) -> np.ndarray:
-            return np.sum([np.bincount(cells, weight * given, count) for cells, weight in zip(of_corner, weights, strict=True)], axis=0)
-
-        total = np.maximum(summed(self._area), np.finfo(np.float64).tiny)
-        out = np.zeros_like(values)
-        for column in range(values.shape[1]):
-            mean = summed(self._area * values[:, column]) / total
-            for cells, weight in zip(of_corner, weights, strict=True):
-                out[:, column] += weight * mean[cells]
-        return out
-
-    def of(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return values [V, k] as a sum of bands, the finest first."""
-        smooth = [values, *(self.averaged(values, length) for length in self._lengths)]
-        return [one - other for one, other in pairwise(smooth)] + [smooth[-1]]
-
-    def variance(self, values: np.ndarray) -> float:
-        """Return the mean square of vectors [V, k]."""
-        return float(np.average((values**2).sum(axis=1), weights=self._area))
-
-
-def _corrected(bands: _Bands, measured: np.ndarray, noise: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _corrected(bands: Bands, measured: np.ndarray, noise: np.ndarray, normals: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the photometric normals without the drift that the depth shows.
 
     Args:
@@ -173,17 +129,18 @@ def _corrected(bands: _Bands, measured: np.ndarray, noise: np.ndarray, normals: 
         measured: [V, 3] normals of the surface.
         noise: [V, 3] an example of their noise.
         normals: [V, 3] photometric.
+        counts: [V] 0…1, by how much each vertex counts.
     """
     correction = np.zeros_like(normals)
-    for band in bands.of(np.concatenate([measured - normals, noise], axis=1))[1:]:
-        found, expected = bands.variance(band[:, :3]), bands.variance(band[:, 3:])
+    for band in bands.of(np.concatenate([measured - normals, noise], axis=1), counts)[1:]:
+        found, expected = bands.variance(band[:, :3], counts), bands.variance(band[:, 3:], counts)
         correction += max(1 - expected / max(found, np.finfo(np.float64).tiny), 0.0) * band[:, :3]
     correction -= normals * (correction * normals).sum(axis=1, keepdims=True)
     turned = normals + correction
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
-def _limited(bands: _Bands, move: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _limited(bands: Bands, move: np.ndarray, noise: np.ndarray, agree: np.ndarray) -> np.ndarray:
     """Return the motions of the vertices, of which no band is larger than the noise of the depth in it.
 
     What the depth is wrong by has the variance N of its noise. If the motions have more, V, the rest is drift that was left in the normals,
@@ -193,17 +150,29 @@ def _limited(bands: _Bands, move: np.ndarray, noise: np.ndarray) -> np.ndarray:
         bands: of the mesh.
         move: [V] metres.
         noise: [V] an example of the noise of the depth, metres.
+        agree: [V] bool, the vertices that move.
     """
     out = np.zeros_like(move)
-    for band in bands.of(np.stack([move, noise], axis=1)):
-        found, expected = bands.variance(band[:, :1]), bands.variance(band[:, 1:])
+    for band in bands.of(np.stack([move, noise], axis=1), agree):
+        found, expected = bands.variance(band[:, :1], agree), bands.variance(band[:, 1:], agree)
         out += min(expected / max(found, np.finfo(np.float64).tiny), 1.0) * band[:, 0]
-    return out
+    return np.where(agree, out, 0.0)
 
 
-def _moves(points: np.ndarray, mesh: _Mesh, sigma: np.ndarray, normals: np.ndarray, tilt: np.ndarray
-           ) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much each vertex moves along its normal, [V] metres, and which stay because the normals contradict the depth."""
+def _moves(points: np.ndarray, mesh: _Mesh, sigma: np.ndarray, normals: np.ndarray, tilt: np.ndarray, agree: np.ndarray,
+           limited: _OfMotions, unlike: _OfMotions) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much each vertex moves along its normal, [V] metres, and which do, [V] bool.
+
+    Args:
+        points: [V, 3] metres.
+        mesh: of them.
+        sigma: [V] metres, of the depth.
+        normals: [V, 3] corrected.
+        tilt: [V] radians, standard deviation of the normals.
+        agree: [V] bool, the vertices that may move.
+        limited: returns the motions without what drift has left in them.
+        unlike: returns which motions noise does not explain.
+    """
     one, other, count = mesh.one, mesh.other, len(points)
     middle = normals[one] + normals[other]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), np.finfo(np.float64).tiny)
@@ -212,18 +181,18 @@ def _moves(points: np.ndarray, mesh: _Mesh, sigma: np.ndarray, normals: np.ndarr
     angle = np.linalg.norm(normals[one] - normals[other], axis=1)
     trust = mesh.weight / ((tilt[one] ** 2 + tilt[other] ** 2) / 2 + (BENT * angle**2) ** 2)
     hold = mesh.area / sigma**2
-    wild = np.zeros(count, dtype=bool)
-    move = np.zeros(count)
+    move, found = np.zeros(count), np.zeros(count)
     for _ in range(ROUNDS):
-        weight = np.where(wild[one] | wild[other], 0.0, trust)
+        weight = np.where(agree[one] & agree[other], trust, 0.0)
         diagonal = hold + np.bincount(one, weight * at_one**2, count) + np.bincount(other, weight * at_other**2, count)
         right = np.bincount(one, weight * at_one * rise, count) - np.bincount(other, weight * at_other * rise, count)
         move = _solved(mesh, diagonal, -weight * at_one * at_other, right, move)
-        far = np.abs(move) > BOUND_SIGMAS * sigma
-        if not far.any():
+        found = limited(move, agree)
+        kept = agree & ~unlike(found, agree) & (np.abs(found) <= BOUND_SIGMAS * sigma)
+        if (kept == agree).all():
             break
-        wild |= far
-    return np.where(far, 0.0, move), wild
+        agree = kept
+    return np.where(agree, found, 0.0), agree
 
 
 def _solved(mesh: _Mesh, diagonal: np.ndarray, between: np.ndarray, right: np.ndarray, first: np.ndarray) -> np.ndarray:
