@@ -47,7 +47,7 @@ def compared(bands: Bands, difference: np.ndarray, noise: np.ndarray, pixel_m: f
     means = [bands.averaged(np.concatenate([difference, noise], axis=1), length * pixel_m) for length in LENGTHS_PX]
     found, example = (np.stack([(mean[:, part] ** 2).sum(axis=1) for mean in means], axis=1) for part in (slice(3), slice(3, 6)))
     ratio = found / (SIGMAS**2 * bands.averaged(example, NOISE_PX * pixel_m) + DRIFT**2)
-    return Trust((ratio <= 1).all(axis=1), np.prod(1 / (1 + ratio) ** 2, axis=1))
+    return Trust(np.asarray((ratio <= 1).all(axis=1)), np.prod(1 / (1 + ratio) ** 2, axis=1))
 
 
 def unlike_noise(bands: Bands, move: np.ndarray, sigma: np.ndarray, agree: np.ndarray, pixel_m: float) -> np.ndarray:
