@@ -57,9 +57,12 @@ def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -
         ArrayError: a light gives nothing in a channel.
     """
     found = np.zeros((len(samples), 3, len(lights.direction)), dtype=np.float32)
-    for index, (towards, each) in enumerate(zip(samples, energy, strict=True)):
-        shared = share_samples(towards, each[:, None], lights.direction, weighting=Weighting.KERNEL)
-        found[index] = light_weights(shared.repeat(3, axis=1)[None], lights.irradiance, np.ones(len(lights.direction)))[0]
+    for begin in range(0, len(samples), COLS):
+        part = slice(begin, begin + COLS)
+        channels = np.stack([np.diag(each) for each in energy[part].T], axis=1)  # [kinds, n, kinds]: a channel of its own for each
+        shared = share_samples(samples[part].reshape(-1, 3), channels.reshape(-1, channels.shape[2]), lights.direction,
+                               weighting=Weighting.KERNEL)
+        found[part] = light_weights(shared.T[..., None].repeat(3, axis=2), lights.irradiance, np.ones(len(lights.direction)))
     return found
 
 
