@@ -10,12 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import cv2
 import numpy as np
 
 from stage.errors import ImageError, storage
-
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # OpenCV writes on the terminal what it raises too
 
 MOST_META_BYTES = 1 << 20
 """The largest box of metadata that is read; that of an image of one tile has some hundred bytes."""
@@ -74,6 +71,9 @@ def decode(path: str | Path, stream: BinaryIO, header: AvifHeader) -> np.ndarray
     Raises:
         ImageError: the image cannot be decoded, or has another size than its header says.
     """
+    import cv2  # a tenth of a second that captures of other images need not wait
+
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # OpenCV writes on the terminal what it raises too
     with storage("read", path):
         stream.seek(0)
         data = np.frombuffer(stream.read(), np.uint8)

@@ -13,7 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from stage import inputs
@@ -104,6 +103,8 @@ def demosaic(mosaic: np.ndarray, colour: np.ndarray) -> np.ndarray:
         [rows, cols, 3] float32: the own colour of a pixel as it is, the others as means of those around it, and at least 1 where
         one of these is saturated.
     """
+    import cv2  # a tenth of a second that captures of other images need not wait
+
     repeats_every_two = np.array_equal(colour[2:], colour[:-2]) and np.array_equal(colour[:, 2:], colour[:, :-2])
     weights = np.array(WEIGHTS[0 if repeats_every_two else 1], dtype=np.float32)
     near = np.ones((len(weights), len(weights)), np.uint8)

@@ -1,5 +1,7 @@
 """Reading and writing of OpenEXR files of one part or several: named channels, metadata, colour space and compression."""
 
+import os
+import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -28,6 +30,11 @@ class Compression:
 
 DWA_LEVEL = 45.0
 """The compression level of DWAA, for which 0 loses least: the default of the library, stated in the file."""
+
+
+LARGE_VALUES = 1 << 22
+"""The number of values from which an image is compressed and decoded by threads of the library, which start once in a process."""
+_starting = threading.Lock()
 
 
 DATA = "data"
@@ -112,6 +119,9 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         StorageError: the file cannot be opened.
     """
     with inputs.opened(path) as source:
+        header = header_of(source)
+        if header.width * header.height * len(header.channels) >= LARGE_VALUES:
+            _start_threads()
         return read_open(source)
 
 
@@ -184,6 +194,8 @@ def encode(temporary: Path, parts: Sequence[Part], *, metadata: Mapping[str, Any
             header["chromaticities"] = declared
         header |= {name: value for name, value in metadata.items() if not written or name in SHARED}
         written.append((header, {name: np.ascontiguousarray(plane) for name, plane in part.channels.items()}, part.name))
+    if sum(plane.size for _, channels, _ in written for plane in channels.values()) >= LARGE_VALUES:
+        _start_threads()
     try:
         if len(written) == 1:
             OpenEXR.File(*written[0][:2]).write(str(temporary))
@@ -191,6 +203,13 @@ def encode(temporary: Path, parts: Sequence[Part], *, metadata: Mapping[str, Any
             OpenEXR.File([OpenEXR.Part(*part) for part in written]).write(str(temporary))
     except RuntimeError as error:
         raise StorageError(f"cannot write {path}: {_one_line(error)}") from error
+
+
+def _start_threads() -> None:
+    """Let the library compress and decode on all cores; the bytes that it writes are the same."""
+    with _starting:
+        if OpenEXR.global_thread_count() == 0:
+            OpenEXR.set_global_thread_count(os.cpu_count() or 1)
 
 
 def finish(temporary: Path, *, path: str | Path, checksum: bool) -> None:

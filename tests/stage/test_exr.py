@@ -207,3 +207,32 @@ def test_chromaticities_name_a_space_where_nothing_else_does(tmp_path, space):
 def test_chromaticities_of_no_space_are_refused():
     with pytest.raises(ValueError, match="no known colour space"):
         exr.color_space_of({"chromaticities": (0.7, 0.3, 0.2, 0.7, 0.15, 0.05, 0.3, 0.3)})
+
+
+@pytest.fixture
+def no_threads():
+    """The library without threads of its own, as a process starts."""
+    OpenEXR.set_global_thread_count(0)
+    yield
+    OpenEXR.set_global_thread_count(0)
+
+
+@pytest.mark.parametrize("compression", ["ZIP", "PIZ", "DWAA"])
+def test_threads_of_the_library_write_and_read_the_same_bytes(tmp_path, monkeypatch, no_threads, compression):
+    """A large image starts them, a small one does not."""
+    rng = np.random.default_rng(5)
+    channels = {name: rng.normal(1, 0.1, (300, 70)).astype(np.float16) for name in "RGB"}
+    for name in ("alone.exr", "threads.exr"):
+        exr.write(tmp_path / name, channels, color_space="data", metadata={}, compression=getattr(exr.Compression, compression))
+        alone, _ = exr.read(tmp_path / "alone.exr")
+        assert (OpenEXR.global_thread_count() > 0) == (name == "threads.exr")
+        monkeypatch.setattr(exr, "LARGE_VALUES", 300 * 70 * 3)
+    assert (tmp_path / "threads.exr").read_bytes() == (tmp_path / "alone.exr").read_bytes()
+    found, _ = exr.read(tmp_path / "threads.exr")
+    assert all(np.array_equal(found[name], alone[name]) for name in channels)
+
+
+def test_damaged_pixels_are_one_error_with_threads_too(tmp_path, monkeypatch, no_threads):
+    monkeypatch.setattr(exr, "LARGE_VALUES", 1)
+    test_damaged_pixels_are_one_error(tmp_path)
+    assert OpenEXR.global_thread_count() > 0
