@@ -71,13 +71,14 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
         places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
         pieces.identify(scan_set.model_dump_json(), stamps(places, timed=sharing is None), kind_of_worker(device))
         (work / "scans").mkdir()
-        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans"), pieces, timings, device)
+        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m), pieces, timings, device)
 
 
 def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:
     numbers = [f"{number:05d}" for number in range(len(scans))]
     timings.stage("read", len(scans))
-    content = pieces.do("read", numbers, lambda piece: scans.summary(int(piece)).packed(), advance=timings.advance)
+    content = pieces.do("read", numbers, lambda piece: scans.summary(int(piece)).packed(), follows_from=request.voxel_m,
+                        advance=timings.advance)
     summaries = [ScanSummary.unpacked(content(piece)) for piece in numbers]
     names = tuple(name for name in WIDTHS if any(name in summary.names for summary in summaries))
     voxel = request.voxel_m or _voxel(summaries)

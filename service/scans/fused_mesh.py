@@ -29,7 +29,7 @@ def triangle_mesh(surface: Surface | BrickSurface, names: tuple[str, ...]) -> Tr
 def scan_facts(fused: FusedBricks, tallies: list[Tally]) -> list[dict[str, Any]]:
     """Return what the report says of each scan."""
     of_scan = dict(zip(fused.used, tallies, strict=True))
-    return [{"name": scan.name, "fused": number in of_scan, "photometric_normals": scan.photometric,
+    return [{"name": scan.name, "fused": number in of_scan, "photometric_normals": scan.photometric, "square_px": scan.square_px,
              "compared_pixels": fused.placings[number].compared, "displacement_m": short(fused.placings[number].displacement_m),
              **(_tally(of_scan[number]) if number in of_scan else {})} for number, scan in enumerate(fused.summaries)]
 

@@ -33,11 +33,13 @@ class ScanSummary(NamedTuple):
     normal_sigma: float  # radians, as of `PreparedScan`
     camera: Camera
     camera_from_world: np.ndarray  # [4, 4]
+    square_px: int  # as of `PreparedScan`
     sample: Sample
 
     def packed(self) -> bytes:
         """Return the summary as bytes."""
-        known = {"name": self.name, "names": self.names, "photometric": self.photometric, "camera": self.camera.model_dump(mode="json")}
+        known = {"name": self.name, "names": self.names, "photometric": self.photometric, "camera": self.camera.model_dump(mode="json"),
+                 "square_px": self.square_px}
         return packed({"known": np.frombuffer(json.dumps(known).encode(), dtype=np.uint8), "pitch": self.pitch, "noise": self.noise,
                        "normal_sigma": self.normal_sigma, "centre": self.centre, "camera_from_world": self.camera_from_world,
                        **self.sample._asdict()})
@@ -49,7 +51,7 @@ class ScanSummary(NamedTuple):
         known = json.loads(found["known"].tobytes())
         return ScanSummary(known["name"], tuple(known["names"]), float(found["pitch"]), float(found["noise"]), found["centre"],
                            known["photometric"], float(found["normal_sigma"]), Camera.model_validate(known["camera"]),
-                           found["camera_from_world"], Sample(found["points"], found["normals"], found["variance"]))
+                           found["camera_from_world"], known["square_px"], Sample(found["points"], found["normals"], found["variance"]))
 
     def outline(self) -> PreparedScan:
         """Return the scan without what it measured, to ask whether it can see a place."""
@@ -63,15 +65,16 @@ class ScanSummary(NamedTuple):
 class PreparedScans:
     """The scans of a set."""
 
-    def __init__(self, file: Path, scan_set: ScanSet, folder: Path) -> None:
+    def __init__(self, file: Path, scan_set: ScanSet, folder: Path, voxel_m: float | None) -> None:
         """Create the scans, of which none is read yet.
 
         Args:
             file: the scan-set.json.
             scan_set: its content.
             folder: for the arrays of the scans; exists.
+            voxel_m: metres, to which pixels that are far smaller are joined; None: they stay.
         """
-        self._file, self._scan_set, self._folder = file, scan_set, folder
+        self._file, self._scan_set, self._folder, self._voxel_m = file, scan_set, folder, voxel_m
         self._prepared: dict[int, PreparedScan] = {}
         self._complete: dict[int, PreparedScan] = {}
         self._lock = threading.Lock()
@@ -105,16 +108,17 @@ class PreparedScans:
         cell = np.asarray(scan.image.cell)
         pitch = float(np.median(np.asarray(scan.image.depth)[cell])) / min(scan.image.focal)
         return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
-                           scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, sample_of(scan, number))
+                           scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, scan.square_px,
+                           sample_of(scan, number))
 
     def _read(self, number: int) -> PreparedScan:
         folder = self._folder / str(number)
         folder.mkdir()
-        scan = read_scan(self._file, self._scan_set, number)
+        scan = read_scan(self._file, self._scan_set, number, estimate_normals=False)
         where = f"{self._file}: scans[{number}] ({scan.name})"
         if scan.pose is None:
             raise RequestError(f"{where}: scan_to_world is missing: run relit register first, and fuse the scan-set.json that it writes")
-        prepared = prepare_scan(scan, folder, where)
+        prepared = prepare_scan(scan, folder, where, self._voxel_m)
         if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
             raise RequestError(f"{where}: has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours show the same surface: its "
                                "pixels are too far apart or too noisy to be fused")

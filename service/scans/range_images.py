@@ -15,6 +15,7 @@ from stage.depth_normals import depth_normals
 from stage.maps import SurfaceMaps
 from stage.mask_border import distance
 from stage.scans.scan import Scan
+from stage.scans.squares import coarser
 
 STEEPEST = float(np.tan(np.radians(70.0)))
 """Largest slope of a cell of four pixels against the line of sight: what is steeper may be an edge beside what lies behind it."""
@@ -24,6 +25,9 @@ CLEAR_PIXELS = 2
 """Pixels around a pixel that must all lie behind a point before the point counts as seen to be empty: edges are blurred that far."""
 FEATHER_PIXELS = 12.0
 """Distance from the edge of the valid pixels over which the weight of a view in blended colours rises to its full value."""
+SQUARE_VOXELS, LEAST_SIDE, LEAST_SQUARES = 0.5, 3, 32
+"""Largest side of the squares that pixels are joined in, in voxels; least in pixels, of which the bend of the surface can be told; and
+fewest squares across an image."""
 ESTIMATED_SHARE = 0.01
 """Weight of a normal that was fitted to depths beside one of solved maps: where any view has maps, these decide."""
 NORMAL_RADIUS_PX = 2
@@ -45,6 +49,8 @@ class PreparedScan(NamedTuple):
     photometric: bool
     normal_sigma: float = float("nan")
     """Median standard error of the normals of solved maps, radians; NaN: there are none, or their maps do not say it."""
+    square_px: int = 1
+    """Side, in pixels of the scan, of the squares that are the pixels here."""
 
 
 def channels(names: tuple[str, ...]) -> dict[str, slice]:
@@ -56,24 +62,35 @@ def channels(names: tuple[str, ...]) -> dict[str, slice]:
     return places
 
 
-def prepare_scan(scan: Scan, folder: Path, where: str) -> PreparedScan:
+def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = None) -> PreparedScan:
     """Return a scan as a range image with the layers that it has, its arrays in files of a folder.
 
     Args:
         scan: with a pose and the camera of a range image.
         folder: exists.
         where: what messages begin with.
+        voxel_m: metres, to which pixels that are far smaller are joined in squares, unless the scan has maps; None: they stay.
 
     Raises:
         RequestError: the scan is no range image of a perspective camera.
     """
-    assert scan.pose is not None
+    pose = scan.pose
+    assert pose is not None
     if scan.camera is None or scan.pixels is None:
         raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what "
                            "is empty")
     camera = scan.camera
     if camera.projection != "perspective" or camera.focal_px is None:
         raise RequestError(f"{where}: its camera is orthographic: fusion takes perspective cameras")
+    pitch = float(np.median(-scan.points[:, 2])) / min(camera.focal_px)
+    side = 1 if voxel_m is None or scan.maps is not None else int(SQUARE_VOXELS * voxel_m / pitch)
+    side = min(side, min(camera.resolution) // LEAST_SQUARES)
+    if side < LEAST_SIDE:
+        side = 1
+    else:
+        scan = coarser(scan, side)
+        assert scan.camera is not None and scan.camera.focal_px is not None
+        camera = scan.camera
     depth = scan.image(-scan.points[:, 2]).astype(np.float32)
     mask = depth > 0
     along = scan.points.astype(np.float64)
@@ -92,11 +109,11 @@ def prepare_scan(scan: Scan, folder: Path, where: str) -> PreparedScan:
     layers = _layers(scan, maps, normal)
     stored = partial(_stored, folder)
     image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell),
-                       stored("clear", clear), np.linalg.inv(scan.pose), camera.focal_px, camera.principal_point,
+                       stored("clear", clear), np.linalg.inv(pose), camera.focal_px, camera.principal_point,
                        (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
     return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
                         stored("feather", feather), scan.normals_source == "photometric",
-                        _normal_sigma(maps))
+                        _normal_sigma(maps), side)
 
 
 def _normal_sigma(maps: SurfaceMaps | None) -> float:

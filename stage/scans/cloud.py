@@ -7,7 +7,7 @@ import numpy as np
 
 from stage.scans.neighbours import Neighbours
 from stage.scans.scan import Scan
-from stage.scans.squares import squares_of
+from stage.scans.squares import coarser
 
 NEIGHBOURS, FEW_NEIGHBOURS = 16, 8
 """The number of neighbours that a normal is fitted to, and with which poses are fitted again, to see what the
@@ -59,15 +59,12 @@ def thinned_scan(scan: Scan) -> Thinned:
     in cells, only as far as the noise and the number of points demand it.
     """
     side = int(np.ceil(np.sqrt(len(scan.points) / MOST_POINTS)))
-    if side > 2 and scan.camera is not None and scan.camera.projection == "perspective":
-        points, directions, variance = _of_squares(scan, side)
-    else:
-        side = 1
-        points, directions, variance = _of_scan(scan)
+    squares = side > 2 and scan.camera is not None and scan.camera.projection == "perspective"
+    points, directions, variance = _of_scan(coarser(scan, side) if squares else scan)
     cell = NOISE_CELLS * float(np.sqrt(np.median(variance)))
     while len(points) > MOST_POINTS and (count := 1 + np.count_nonzero(np.diff(np.sort(_cells(points, cell))))) > MOST_POINTS:
         cell *= max(1.02, float(np.sqrt(count / MOST_POINTS)))
-    return thin(points, directions, variance, cell)._replace(even=side == 1)
+    return thin(points, directions, variance, cell)._replace(even=not squares)
 
 
 def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
@@ -87,19 +84,6 @@ def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
 def _of_scan(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points of a scan, their directions [n, 3], and their variances along these [n]."""
     return scan.points.astype(np.float64), scan.directions(), scan.sigma.astype(np.float64) ** 2
-
-
-def _of_squares(scan: Scan, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the points of squares of pixels, their directions [n, 3], and their variances along these [n]."""
-    assert scan.camera is not None
-    z = -scan.points[:, 2]
-    length = np.sqrt((scan.points**2) @ np.ones(3, dtype=np.float32))
-    image = squares_of(scan.image(z), scan.image(scan.sigma * z / length), scan.camera, side)
-    x, y = image.camera.plane_coordinates()
-    there = image.depth > 0
-    ray = np.stack([x[there], y[there], -np.ones(np.count_nonzero(there))], axis=1)
-    stretch = np.sqrt((ray * ray) @ np.ones(3))
-    return ray * image.depth[there][:, None], ray / stretch[:, None], (image.sigma[there] * stretch) ** 2
 
 
 def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:

@@ -5,11 +5,14 @@ quadratic. The depth of a square is that at its centre of the quadratic function
 convex surface, by .2 mm on balls of 10 cm and squares of 15 mm. What the function leaves tells a square that shows two surfaces.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from stage.camera import Camera
+from stage.colour import convert
+from stage.scans.scan import Scan
 
 SIGMAS = 3.0
 """The largest RMS departure from a plane that noise explains, in its standard deviations."""
@@ -53,15 +56,43 @@ def squares_of(depth: np.ndarray, sigma: np.ndarray, camera: Camera, side: int) 
     return CoarseImage(coarse, found, spread)
 
 
+def coarser(scan: Scan, side: int) -> Scan:
+    """Return a range image of a perspective camera whose pixels are squares of those of another, without normals.
+
+    Args:
+        scan: the range image; its maps stay those of its own pixels.
+        side: of a square, pixels.
+    """
+    assert scan.camera is not None
+    z = -scan.points[:, 2]
+    length = np.sqrt((scan.points * scan.points) @ np.ones(3, dtype=np.float32))
+    found = squares_of(scan.image(z), scan.image(scan.sigma * z / length), scan.camera, side)
+    there = found.depth > 0
+    points = found.camera.points(-found.depth)[there]
+    stretch = np.sqrt((points * points) @ np.ones(3, dtype=np.float32)) / found.depth[there]
+    colours = confidence = None
+    if scan.colours is not None:
+        linear = convert(scan.image(scan.colours).astype(np.float32) / 255, "srgb_rec709_scene", "lin_rec709_scene")
+        display = convert(np.ascontiguousarray(_cut(linear, side).mean(axis=(1, 3))), "lin_rec709_scene", "srgb_rec709_scene")[there]
+        colours = np.rint(np.clip(display, 0, 1) * 255).astype(np.uint8)
+    if scan.confidence is not None:
+        confidence = _cut(scan.image(scan.confidence), side).mean(axis=(1, 3))[there]
+    return replace(scan, points=points, sigma=(found.sigma[there] * stretch).astype(np.float32), normals=None, normals_source="unknown",
+                   colours=colours, confidence=confidence, camera=found.camera, pixels=np.flatnonzero(there))
+
+
+def _cut(values: np.ndarray, side: int) -> np.ndarray:
+    """Return an image [rows, cols, …] in whole squares: [rows, side, cols, side, …]."""
+    rows, cols = values.shape[0] // side, values.shape[1] // side
+    return values[:rows * side, :cols * side].reshape(rows, side, cols, side, *values.shape[2:])
+
+
 def _means(depth: np.ndarray, sigma: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the depth and its standard deviation of the squares of some rows."""
-    def cut(values: np.ndarray) -> np.ndarray:
-        return values.reshape(values.shape[0] // side, side, values.shape[1] // side, side)
-
     def mean(values: np.ndarray) -> np.ndarray:
         return np.asarray(values.mean(axis=(1, 3)))
 
-    pixels = cut(depth)
+    pixels = _cut(depth, side)
     whole = (pixels > 0).all(axis=(1, 3))
     inverse = 1 / np.where(pixels > 0, pixels, np.float32(1))
     corner = inverse[:, :1, :, :1]
@@ -77,7 +108,7 @@ def _means(depth: np.ndarray, sigma: np.ndarray, side: int) -> tuple[np.ndarray,
     fitted = sum(slope**2 * apart for slope in slopes) + sum(each**2 * bends for each in bent) + twist**2 * apart**2
     left = np.sqrt(np.maximum(mean((off - middle[:, None, :, None]) ** 2) - fitted, 0))
     level = middle - sum(each * apart for each in bent) + corner[:, 0, :, 0]
-    noise = np.sqrt(mean(cut(sigma) ** 2))
+    noise = np.sqrt(mean(_cut(sigma, side) ** 2))
     good = whole & (left <= SIGMAS * noise * level**2 + BEND * np.hypot(*slopes)) & (level > 0)
     wider = np.sqrt(1 + 2 * apart**2 / bends) if side > 2 else 1.0
     level = np.where(good, level, 1)
