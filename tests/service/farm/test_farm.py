@@ -94,15 +94,15 @@ def test_a_turn_of_pictures(relit, tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     words = ("maps", "--environment", "sky.exr", "--light", "-0.001,0.002,0.03,1e-05,2e-5,3e-5", "--sphere", "0,0,0.1,0.01,1,2,3",
              "--rectangle", "0,0,.1,.01,0,0,0,.02,0,5,5,5", "--light", "0,0,0.1,1,1,1,0,0,-1,2", "--device", "cpu")
-    outcome = relit("farm", "template", "shade", *words, "--turns", "3", "--turn-degrees", "10", "--out", "farm/lit.##.exr", "--job", "b")
+    outcome = relit("farm", "template", "shade", *words, "--turns", "2", "--turn-degrees", "10", "--out", "farm/lit.##.exr", "--job", "b")
     assert (outcome.code, outcome.err) == (0, "")
     assert outcome.out == "template b/template.yaml\nvalues   b/parameter_values.yaml\nsubmit   deadline bundle submit b\n"
     values = {each["name"]: each["value"] for each in read(folder / "b" / "parameter_values.yaml")["parameterValues"]}
     ran = openjd("run", "b/template.yaml", "-p", json.dumps(values), cwd=folder)
     assert ran.returncode == 0, ran.stdout + ran.stderr
-    for number, turn in enumerate((10.0, 130.0, 250.0), start=1):
+    for number, turn in enumerate((10.0, 190.0), start=1):
         assert relit("shade", *words, "--turn-degrees", str(turn), "--out", f"here/lit.0{number}.exr").code == 0
-    assert len(digests(folder / "here")) == 3 and digests(folder / "farm") == digests(folder / "here")
+    assert len(digests(folder / "here")) == 2 and digests(folder / "farm") == digests(folder / "here")
 
 
 @needs_openjd

@@ -52,12 +52,11 @@ def off(views: list[View], found: Registration) -> np.ndarray:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("count", [9, 6])
-def test_a_turntable_of_unknown_poses_is_right_to_a_tenth_of_a_millimetre(count):
-    """At 8 mm between pixels; the noise alone would leave some 0.02 mm."""
-    views = seen(figure, *(360 / count * k for k in range(count)), rows=160)
+def test_a_turntable_of_unknown_poses_is_right_to_a_tenth_of_a_millimetre():
+    """At 8 mm between pixels; the noise alone would leave some 0.02 mm. Each of six views has little in common with the next."""
+    views = seen(figure, *range(0, 360, 60), rows=160)
     found = registered(views)
-    assert len(found.poses) == count and not found.alone and not found.scales
+    assert len(found.poses) == 6 and not found.alone and not found.scales
     assert found.factor < 2
     wrong = off(views, found)
     assert np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.1 * MM
