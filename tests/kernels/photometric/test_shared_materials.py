@@ -63,6 +63,43 @@ def test_both_materials_are_told_apart(device):
     assert (np.abs(material.roughness - rough)[~away] < 0.125).mean() > 0.95
 
 
+def lobes(f0, rough):
+    """[3, light, pixel] radiance with 3 % noise, seed fixed, and normals of 60 pixels for each pair of an F0 and a roughness."""
+    normal = tilted(60, 20.0)
+    radiance = np.concatenate([render(normal, alpha=r**2, f0=f) for f, r in zip(f0, rough, strict=True)], axis=2)
+    return radiance * (1 + 0.03 * np.random.default_rng(7).normal(size=radiance.shape)), np.tile(normal, (len(f0), 1))
+
+
+def test_dielectrics_have_one_f0(device):
+    """Materials that differ in roughness alone share F0 to the last bit; tolerance: the step of three per cent and the noise."""
+    radiance, normal = lobes((0.04, 0.04, 0.04), (0.35, 0.5, 0.65))
+    shared = choose_materials(sample(radiance, device)[0], normal, shape=LAMBERT)
+    assert len(shared) > 1
+    assert np.ptp(shared[:, :3]) == 0
+    np.testing.assert_allclose(shared[0, 0], 0.04, rtol=0.05)
+    assert np.ptp(shared[:, 3]) > 0.2
+
+
+def test_dielectrics_keep_f0_of_their_own_where_they_pay(device):
+    """Of two F0 four fold apart each is found, within the ten per cent that one pixel's noise moves it."""
+    radiance, normal = lobes((0.03, 0.12), (0.4, 0.4))
+    shared = choose_materials(sample(radiance, device)[0], normal, shape=LAMBERT)
+    for f0 in (0.03, 0.12):
+        assert np.abs(shared[:, 0] / f0 - 1).min() < 0.1
+
+
+def test_metals_keep_their_f0_beside_dielectrics(device):
+    """Dielectrics that share F0 leave the metal beside them alone."""
+    paint, normal = lobes((0.04, 0.04), (0.35, 0.6))
+    tilt = tilted(60, 20.0)
+    metal = np.concatenate([render(tilt, albedo=[0.0], alpha=0.16, f0=f) for f in (0.9, 0.7, 0.3)])
+    shared = choose_materials(sample(np.concatenate([paint, metal], axis=2), device)[0], np.concatenate([normal, tilt]), shape=LAMBERT)
+    bright = shared[:, 0] > 0.5
+    np.testing.assert_allclose(shared[bright][0, :3], [0.9, 0.7, 0.3], rtol=0.05)
+    assert bright.sum() < len(shared)
+    assert np.ptp(shared[~bright][:, :3]) == 0
+
+
 def test_a_material_of_its_own_is_kept(device):
     """A coloured metal among paint is not painted over: no shared dielectric explains it."""
     normal = tilted(41, 40.0)
