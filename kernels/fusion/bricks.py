@@ -11,19 +11,8 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.views import (
-    ALONG,
-    TILE,
-    TRUNCATION_VOXELS,
-    WIDER,
-    Cell,
-    View,
-    ViewArrays,
-    image_point,
-    line_of_sight,
-    to_camera,
-    truncation,
-)
+from kernels.fusion.projection import View, depth_of, image_point, line_of_sight, pixel_metres, sight_start, to_camera
+from kernels.fusion.views import ALONG, TILE, TRUNCATION_VOXELS, WIDER, Cell, ViewArrays, truncation
 
 BLOCK = 8
 """Voxels along each side of a block."""
@@ -70,11 +59,13 @@ def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtyp
     view = views[cell.view]
     row = (cell.place - view.first) // view.cols
     col = cell.place - view.first - row * view.cols
-    four = cell.inverse
-    nearest = 1.0 / wp.max(wp.max(four[0], four[1]), wp.max(four[2], four[3]))
-    farthest = 1.0 / wp.min(wp.min(four[0], four[1]), wp.min(four[2], four[3]))
+    four = cell.linear
+    largest = depth_of(view, wp.max(wp.max(four[0], four[1]), wp.max(four[2], four[3])))
+    smallest = depth_of(view, wp.min(wp.min(four[0], four[1]), wp.min(four[2], four[3])))
+    nearest = wp.min(largest, smallest)
+    farthest = wp.max(largest, smallest)
     step = STEP_BLOCKS * float(BLOCK) * voxel
-    across = farthest / wp.min(view.focal[0], view.focal[1])
+    across = pixel_metres(view, farthest)
     most = wp.max(across, farthest - nearest)
     parts = int(most / step) + 1
     reach = truncation(cell.largest, voxel)
@@ -86,12 +77,15 @@ def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtyp
         fv = (float(a) + 0.5) / float(parts)
         for b in range(parts):
             fu = (float(b) + 0.5) / float(parts)
-            depth = 1.0 / ((1.0 - fv) * ((1.0 - fu) * four[0] + fu * four[1]) + fv * ((1.0 - fu) * four[2] + fu * four[3]))
-            ray = line_of_sight(view, float(col + view.first_col) + 0.5 + fu, float(row + view.first_row) + 0.5 + fv)
+            depth = depth_of(view, (1.0 - fv) * ((1.0 - fu) * four[0] + fu * four[1]) + fv * ((1.0 - fu) * four[2] + fu * four[3]))
+            u = float(col + view.first_col) + 0.5 + fu
+            v = float(row + view.first_row) + 0.5 + fv
+            ray = line_of_sight(view, u, v)
             length = wp.length(ray)
+            start = sight_start(view, u, v) - view.translation
             for s in range(-half, half + 1):
                 along = depth + wp.clamp(float(s) * step, -reach, reach) / length
-                point = back * (ray * along - view.translation) - corner
+                point = back * (ray * along + start) - corner
                 x0 = int(wp.floor((point[0] - margin) / size))
                 x1 = int(wp.floor((point[0] + margin) / size))
                 y0 = int(wp.floor((point[1] - margin) / size))
@@ -145,10 +139,12 @@ def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place:
         point = to_camera(view, centre)
         near = -point[2] - radius
         seen = bool(near <= radius)  # so close that its outline is not bounded
-        if near > radius:
+        if near > radius or view.orthographic:
             uv = image_point(view, point)
             slope = wp.sqrt(point[0] * point[0] + point[1] * point[1]) / near
             reach = wp.max(view.focal[0], view.focal[1]) * radius / near * (1.0 + slope) * wp.where(view.distorted, WIDER, 1.0) + 2.0
+            if view.orthographic:
+                reach = wp.max(view.focal[0], view.focal[1]) * radius + 2.0
             across = uv[0] - float(view.first_col)
             down = uv[1] - float(view.first_row)
             c0 = wp.max(int(wp.floor((across - reach) / float(TILE))), 0)

@@ -4,7 +4,8 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.views import Cell, View, ViewArrays, image_point, read_view, to_camera, turned_back
+from kernels.fusion.projection import View, image_point, in_front, to_camera, turned_back
+from kernels.fusion.views import Cell, ViewArrays, read_view
 
 SAME_SIDE = 0.5
 """Least cosine between two normals at which two views may show the same surface: 60°."""
@@ -21,7 +22,7 @@ def _compare_kernel(first: int, skipped: int, count: int, reach: float, views: w
         if number != skipped:
             view = views[number]
             there = to_camera(view, points[i])
-            if there[2] < 0.0:
+            if in_front(view, there):
                 reading = read_view(view, there, image_point(view, there), cell, cells)
                 if (reading.known and wp.dot(turned_back(view, reading.normal), normals[i]) > SAME_SIDE
                         and wp.abs(reading.distance) < reach):

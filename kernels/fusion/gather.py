@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.views import Cell, View, ViewArrays, image_point, read_view, to_camera, turned_back
+from kernels.fusion.projection import View, image_point, in_front, to_camera, toward_camera, turned_back
+from kernels.fusion.views import Cell, ViewArrays, read_view
 
 SHARPNESS = 4.0
 """Power of the weights: the best views win where they differ, and blend where they are about alike."""
@@ -54,11 +55,11 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
     for number in range(count):
         view = views[number]
         there = to_camera(view, point)
-        if there[2] < 0.0:
+        if in_front(view, there):
             uv = image_point(view, there)
             reading = read_view(view, there, uv, cell, cells)
             # the angle to the surface of all views, whose normals are surer than those of one
-            toward = wp.transpose(view.rotation) * (-there)
+            toward = wp.transpose(view.rotation) * toward_camera(view, there)
             cosine = wp.dot(normals[i], toward) / wp.length(toward)
             limit = OFF_SURFACE * wp.sqrt(reading.sigma * reading.sigma + uncertainty[i] * uncertainty[i]) + slack
             if (reading.known and cosine > 0.0 and wp.abs(reading.distance) <= limit
@@ -69,7 +70,7 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
                 fv = v - wp.floor(v)
                 place = view.first + (int(wp.floor(v)) - view.first_row) * view.cols + int(wp.floor(u)) - view.first_col
                 near = _bilinear(feather, place, view.cols, fu, fv, 0)
-                scale = wp.min(view.focal[0], view.focal[1]) / (-there[2])  # pixels for each metre
+                scale = wp.min(view.focal[0], view.focal[1]) / wp.where(view.orthographic, 1.0, -there[2])  # pixels for each metre
                 w = near * wp.pow(cosine * scale * 1.0e-3, SHARPNESS)
                 if w > 0.0:
                     number_seen += 1

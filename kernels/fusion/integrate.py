@@ -19,7 +19,8 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, SIDE, VOXELS, Blocks, block_place, find_watching
-from kernels.fusion.views import ALONG, Cell, View, ViewArrays, image_point, read_view, to_camera, truncation, turned_back
+from kernels.fusion.projection import View, image_point, in_front, to_camera, turned_back
+from kernels.fusion.views import ALONG, Cell, ViewArrays, read_view, truncation
 
 AGREEING = 0.85
 """Length of the weighted mean of the normals from which on all of them count: they then lie within some 45° of each other."""
@@ -109,7 +110,7 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
             break
         view = views[number]
         there = to_camera(view, point)
-        if there[2] < 0.0:
+        if in_front(view, there):
             uv = image_point(view, there)
             reading = read_view(view, there, uv, cell, cells)
             reach = truncation(reading.sigma, voxel)
@@ -141,7 +142,7 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
                 break
             view = views[number]
             there = to_camera(view, point)
-            if there[2] < 0.0:
+            if in_front(view, there):
                 reading = read_view(view, there, image_point(view, there), cell, cells)
                 reach = truncation(reading.sigma, voxel)
                 if (reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach

@@ -8,7 +8,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.fusion.bricks import BRICK_VOXELS, Blocks
 from kernels.fusion.integrate import EMPTY, SURFACE, Volume, voxel_number
-from kernels.fusion.views import Cell, View, ViewArrays, line_of_sight
+from kernels.fusion.projection import View, line_of_sight, sight_start
+from kernels.fusion.views import Cell, ViewArrays
 
 ELSEWHERE, FUSED, LOST, REFUSED = 0, 1, 2, 3
 """What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
@@ -26,8 +27,11 @@ def _residual_kernel(first: int, voxel: float, corner: wp.vec3i, index: wp.array
     row = (cell.place - view.first) // view.cols
     col = cell.place - view.first - row * view.cols
     found = wp.int32(ELSEWHERE)
-    ray = line_of_sight(view, float(col + view.first_col) + 0.5, float(row + view.first_row) + 0.5)
-    point = wp.transpose(view.rotation) * (ray / cell.inverse[0] - view.translation) / voxel
+    u = float(col + view.first_col) + 0.5
+    v = float(row + view.first_row) + 0.5
+    ray = line_of_sight(view, u, v)
+    away = wp.where(view.orthographic, ray * cell.linear[0], ray / cell.linear[0])
+    point = wp.transpose(view.rotation) * (away + (sight_start(view, u, v) - view.translation)) / voxel
     fx = point[0] - wp.floor(point[0])
     fy = point[1] - wp.floor(point[1])
     fz = point[2] - wp.floor(point[2])

@@ -1,7 +1,7 @@
-"""Range images on the device: how a point in space falls on them, and what they measured there.
+"""Range images on the device, and what they measured on the line of sight through a point in space.
 
-The depth between four pixels is bilinear in inverse depth, exact on planes. Nothing is read between pixels that show two surfaces, one
-behind the other: only cells of four pixels that are marked as one surface count.
+The depth between four pixels is bilinear in inverse depth, or in depth under an orthographic camera: exact on planes. Nothing is read
+between pixels that show two surfaces, one behind the other: only cells of four pixels that are marked as one surface count.
 """
 
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.fusion.projection import View, depth_of, line_of_sight, linear_of
 
 TILE = 4
 """Side in pixels of the squares whose farthest depth tells whether a block of voxels is hidden from a view."""
@@ -21,8 +22,6 @@ angle it is what limits a measurement, whatever the standard deviation of the de
 SPACING = 0.29
 """What the weights of readings assume in its place: a uniform distribution over a pixel, 1/√12. Between pixels a bent surface is cut short
 by a chord, by the more the more grazing it is seen; that error does not average out."""
-UNDISTORT_ITERATIONS = 10
-"""Rounds of the iteration that undoes the distortion: ordinary lenses converge to single precision in about six."""
 WIDER = 1.3
 """How much longer than without distortion lines of sight are taken to be, where only their greatest length matters."""
 LEAST_NORMAL = 2.0
@@ -41,19 +40,25 @@ TRUNCATION_SIGMAS = 4.0
 
 
 class RangeImage(NamedTuple):
-    """One range image of a perspective camera that looks along −z, with +x to the right and +y up, and where it stands."""
+    """One range image of a camera that looks along −z, with +x to the right and +y up, and where it stands."""
 
-    depth: np.ndarray  # [rows, cols] metres, −z of the camera frame; read inside cells alone
+    depth: np.ndarray  # [rows, cols] metres, −z of the camera frame, above 0; read inside cells alone
     sigma: np.ndarray  # [rows, cols] metres, standard deviation of the depth, above 0 inside cells
     normal: np.ndarray  # [rows, cols, 3] unit, camera frame, towards the camera; 0 where unknown
     cell: np.ndarray  # [rows, cols] bool, whether the pixel, its right and its lower neighbours and the one across show one surface
     clear: np.ndarray  # [rows, cols] metres: what is nearer than this was seen to be empty; 0 where nothing is known
     camera_from_world: np.ndarray  # [4, 4] rotation and translation, metres
-    focal: tuple[float, float]  # pixels
+    focal: tuple[float, float]  # pixels; of an orthographic camera pixels for each metre
     principal: tuple[float, float]  # u and v, pixels from the top-left corner
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, k3, p1, p2 of OpenCV
     first_row: int = 0  # of the arrays in the image that `principal` is of
     first_col: int = 0
+    orthographic: bool = False
+    """Whether the lines of sight are parallel; the frame then lies before everything that was measured, so that depths are above 0."""
+
+    def pixel_m(self, depth: float) -> float:
+        """Return the distance of neighbouring pixels at a depth, both in metres."""
+        return (1.0 if self.orthographic else depth) / min(self.focal)
 
     def cropped(self, first_row: int, last_row: int, first_col: int, last_col: int) -> "RangeImage":
         """Return the part of the image from the first row and column to those before the last."""
@@ -63,31 +68,12 @@ class RangeImage(NamedTuple):
 
 
 @wp.struct
-class View:
-    """The place and the camera of one range image."""
-
-    first: int  # index of its first pixel in the arrays of all pixels
-    first_tile: int
-    rows: int
-    cols: int
-    first_row: int  # of its first pixel in the image: image coordinates do not depend on what part of it is here
-    first_col: int
-    rotation: wp.mat33  # camera from world
-    translation: wp.vec3
-    focal: wp.vec2
-    principal: wp.vec2
-    radial: wp.vec3
-    tangential: wp.vec2
-    distorted: bool
-
-
-@wp.struct
 class Cell:
     """Four neighbouring pixels of one range image that show one surface, and how sure a reading between them is."""
 
     view: int
     place: int  # of the upper left pixel in the arrays of all pixels
-    inverse: wp.vec4  # 1 / depth, 1 / metres, of the upper left, upper right, lower left and lower right pixel
+    linear: wp.vec4  # `linear_of` the depth of the upper left, upper right, lower left and lower right pixel
     normal: wp.vec3  # unit, camera frame, mean of the four
     weight: float  # 1 / square metres, inverse square of `sigma`; 0 where nothing can be read
     sigma: float  # metres, standard deviation along the normal of the reading of one pixel, as readings are weighted
@@ -141,6 +127,7 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
         view.first_row, view.first_col = image.first_row, image.first_col
         rotation = np.asarray(image.camera_from_world, dtype=np.float64)[:3, :3]
         shift = rotation @ np.asarray(origin, dtype=np.float64) + np.asarray(image.camera_from_world, dtype=np.float64)[:3, 3]
+        view.orthographic = image.orthographic
         view.rotation = wp.mat33(*(float(v) for v in rotation.ravel()))
         view.translation = wp.vec3(*(float(v) for v in shift))
         view.focal, view.principal = wp.vec2(*map(float, image.focal)), wp.vec2(*map(float, image.principal))
@@ -175,6 +162,8 @@ def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: st
 def _behind(image: RangeImage) -> np.ndarray:
     """Return [rows, cols] metres, at least how far behind its depth a pixel says anything, but for the truncation in voxels."""
     rows, cols = image.depth.shape
+    if image.orthographic:
+        return ALONG * TRUNCATION_SIGMAS * (image.sigma + SPACING * image.pixel_m(0.0))
     x, y = ((np.array([first, first + count]) - middle) / focal for first, count, middle, focal in (
         (image.first_col, cols, image.principal[0], image.focal[0]), (image.first_row, rows, image.principal[1], image.focal[1])))
     stretch = WIDER * float(np.sqrt(1 + np.abs(x).max() ** 2 + np.abs(y).max() ** 2))
@@ -205,54 +194,6 @@ def truncation(sigma: float, voxel: float) -> float:
     return wp.max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma)
 
 
-@wp.func
-def to_camera(view: View, point: wp.vec3) -> wp.vec3:
-    """Return a point in the camera frame of a view."""
-    return view.rotation * point + view.translation
-
-
-@wp.func
-def turned_back(view: View, vector: wp.vec3) -> wp.vec3:
-    """Return a vector of the camera frame of a view in the world frame."""
-    return wp.transpose(view.rotation) * vector
-
-
-@wp.func
-def image_point(view: View, point: wp.vec3) -> wp.vec2:
-    """Return the image coordinates u and v of a camera-frame point in front of the camera, with the distortion of the lens."""
-    near = 1.0 / point[2]
-    x = -point[0] * near
-    y = point[1] * near
-    u = float(x)
-    v = float(y)
-    if view.distorted:
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
-        p = view.tangential
-        u = x * radial + 2.0 * p[0] * x * y + p[1] * (r2 + 2.0 * x * x)
-        v = y * radial + p[0] * (r2 + 2.0 * y * y) + 2.0 * p[1] * x * y
-    return wp.vec2(view.principal[0] + view.focal[0] * u, view.principal[1] + view.focal[1] * v)
-
-
-@wp.func
-def line_of_sight(view: View, u: float, v: float) -> wp.vec3:
-    """Return the direction (x, y, −1) of image coordinates in the camera frame; the distortion is undone by fixed-point iteration."""
-    x = (u - view.principal[0]) / view.focal[0]
-    y = (v - view.principal[1]) / view.focal[1]
-    ideal_x = float(x)
-    ideal_y = float(y)
-    p = view.tangential
-    rounds = wp.where(view.distorted, UNDISTORT_ITERATIONS, 0)
-    for _ in range(rounds):
-        r2 = ideal_x * ideal_x + ideal_y * ideal_y
-        radial = 1.0 + r2 * (view.radial[0] + r2 * (view.radial[1] + r2 * view.radial[2]))
-        dx = ideal_x * radial + 2.0 * p[0] * ideal_x * ideal_y + p[1] * (r2 + 2.0 * ideal_x * ideal_x)
-        dy = ideal_y * radial + p[0] * (r2 + 2.0 * ideal_y * ideal_y) + 2.0 * p[1] * ideal_x * ideal_y
-        ideal_x = ideal_x + x - dx
-        ideal_y = ideal_y + y - dy
-    return wp.vec3(ideal_x, -ideal_y, -1.0)
-
-
 @wp.kernel(enable_backward=False)
 def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=int), owner: wp.array(dtype=int),
                  depth: wp.array(dtype=float), sigma: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3),
@@ -267,7 +208,8 @@ def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=
     found = Cell()
     found.view = owner[i]
     found.place = upper
-    found.inverse = wp.vec4(1.0 / depth[upper], 1.0 / depth[upper + 1], 1.0 / depth[lower], 1.0 / depth[lower + 1])
+    found.linear = wp.vec4(linear_of(view, depth[upper]), linear_of(view, depth[upper + 1]), linear_of(view, depth[lower]),
+                           linear_of(view, depth[lower + 1]))
     ray = line_of_sight(view, float(col + view.first_col) + 1.0, float(row + view.first_row) + 1.0)
     length = wp.length(ray)
     found.largest = length * wp.max(wp.max(sigma[upper], sigma[upper + 1]), wp.max(sigma[lower], sigma[lower + 1]))
@@ -280,8 +222,8 @@ def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=
         cosine = toward / length
         if cosine >= LEAST_COSINE:
             one = 0.25 * (sigma[upper] + sigma[upper + 1] + sigma[lower] + sigma[lower + 1])
-            middle = 0.25 * (found.inverse[0] + found.inverse[1] + found.inverse[2] + found.inverse[3])
-            pixel = 1.0 / (middle * wp.min(view.focal[0], view.focal[1]))
+            middle = 0.25 * (found.linear[0] + found.linear[1] + found.linear[2] + found.linear[3])
+            pixel = 1.0 / (wp.where(view.orthographic, 1.0, middle) * wp.min(view.focal[0], view.focal[1]))
             across = pixel * pixel * (1.0 - cosine * cosine)
             found.normal = n
             found.along = one * one * toward * toward
@@ -328,12 +270,15 @@ def read_view(view: View, point: wp.vec3, at: wp.vec2, cell: wp.array(dtype=int)
         return found
     fu = at[0] - 0.5 - wp.floor(at[0] - 0.5)
     fv = at[1] - 0.5 - wp.floor(at[1] - 0.5)
-    four = cells[i].inverse
+    four = cells[i].linear
     upper = four[0] + fu * (four[1] - four[0])
     lower = four[2] + fu * (four[3] - four[2])
-    found.along = 1.0 / (upper + fv * (lower - upper)) + point[2]
+    found.along = depth_of(view, upper + fv * (lower - upper)) + point[2]
     found.normal = cells[i].normal
-    found.distance = found.along * wp.dot(found.normal, point) / point[2]
+    if view.orthographic:
+        found.distance = found.along * found.normal[2]
+    else:
+        found.distance = found.along * wp.dot(found.normal, point) / point[2]
     found.sigma = cells[i].sigma
     share = (1.0 - 2.0 * fu * (1.0 - fu)) * (1.0 - 2.0 * fv * (1.0 - fv))  # sum of the squares of the weights of the four pixels
     found.variance = share * cells[i].along + cells[i].lateral

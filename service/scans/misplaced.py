@@ -58,9 +58,13 @@ def sample_of(scan: PreparedScan, number: int) -> Sample:
     picked = np.sort(np.random.default_rng(number).choice(usable, min(SAMPLES, len(usable)), replace=False))
     world = np.linalg.inv(image.camera_from_world)
     turned = normal[picked] @ world[:3, :3].T
-    sight = there[picked] - world[:3, 3]
-    depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
-    along = np.asarray(image.sigma).ravel()[used[picked]] / depth * np.einsum("ni,ni->n", turned, sight)
+    sigma = np.asarray(image.sigma).ravel()[used[picked]]
+    if image.orthographic:
+        along = sigma * (turned @ world[:3, 2])
+    else:
+        sight = there[picked] - world[:3, 3]
+        depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
+        along = sigma / depth * np.einsum("ni,ni->n", turned, sight)
     return Sample(there[picked], turned, along**2)
 
 

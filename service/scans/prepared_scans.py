@@ -10,7 +10,7 @@ import numpy as np
 from kernels.fusion.views import RangeImage
 from service.errors import RequestError
 from service.scans.misplaced import Sample, sample_of
-from service.scans.range_images import PreparedScan, prepare_scan, with_layers
+from service.scans.range_images import PreparedScan, focal_of, prepare_scan, with_layers
 from service.scans.read import read_scan
 from service.scans.surface import centre_of
 from stage.camera import Camera
@@ -56,9 +56,8 @@ class ScanSummary(NamedTuple):
     def outline(self) -> PreparedScan:
         """Return the scan without what it measured, to ask whether it can see a place."""
         nothing: Any = np.broadcast_to(np.float32(0), (self.camera.height, self.camera.width))
-        assert self.camera.focal_px is not None
-        image = RangeImage(nothing, nothing, nothing, nothing, nothing, self.camera_from_world, self.camera.focal_px,
-                           self.camera.principal_point)
+        image = RangeImage(nothing, nothing, nothing, nothing, nothing, self.camera_from_world, focal_of(self.camera),
+                           self.camera.principal_point, orthographic=self.camera.projection == "orthographic")
         return PreparedScan(self.name, image, self.camera, self.names, nothing, nothing, self.photometric)
 
 
@@ -106,7 +105,7 @@ class PreparedScans:
         """Return the summary of a scan."""
         scan = self.prepared(number)
         cell = np.asarray(scan.image.cell)
-        pitch = float(np.median(np.asarray(scan.image.depth)[cell])) / min(scan.image.focal)
+        pitch = scan.image.pixel_m(float(np.median(np.asarray(scan.image.depth)[cell])))
         return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
                            scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, scan.square_px,
                            sample_of(scan, number))

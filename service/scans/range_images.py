@@ -30,6 +30,8 @@ SQUARE_VOXELS, LEAST_SIDE, LEAST_SQUARES = 0.5, 3, 32
 fewest squares across an image."""
 ESTIMATED_SHARE = 0.01
 """Weight of a normal that was fitted to depths beside one of solved maps: where any view has maps, these decide."""
+PARALLEL_START_M = 1e-3
+"""Depth of the nearest point that an orthographic camera measured, metres: its frame has no place along the lines of sight."""
 NORMAL_RADIUS_PX = 2
 """Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""
 NORMAL, COLOUR, ALBEDO, SPECULAR, ROUGHNESS = "normal", "colour", "diffuse_albedo", "specular", "roughness"
@@ -69,10 +71,11 @@ def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = N
         scan: with a pose and the camera of a range image.
         folder: exists.
         where: what messages begin with.
-        voxel_m: metres, to which pixels that are far smaller are joined in squares, unless the scan has maps; None: they stay.
+        voxel_m: metres, to which pixels that are far smaller are joined in squares, unless the scan has maps or an orthographic camera;
+            None: they stay.
 
     Raises:
-        RequestError: the scan is no range image of a perspective camera.
+        RequestError: the scan is no range image.
     """
     pose = scan.pose
     assert pose is not None
@@ -80,40 +83,60 @@ def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = N
         raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what "
                            "is empty")
     camera = scan.camera
-    if camera.projection != "perspective" or camera.focal_px is None:
-        raise RequestError(f"{where}: its camera is orthographic: fusion takes perspective cameras")
-    pitch = float(np.median(-scan.points[:, 2])) / min(camera.focal_px)
-    side = 1 if voxel_m is None or scan.maps is not None else int(SQUARE_VOXELS * voxel_m / pitch)
-    side = min(side, min(camera.resolution) // LEAST_SQUARES)
-    if side < LEAST_SIDE:
-        side = 1
-    else:
+    parallel = camera.projection == "orthographic"
+    side = 1 if voxel_m is None or scan.maps is not None or parallel else _square_side(scan, camera, voxel_m)
+    if side > 1:
         scan = coarser(scan, side)
-        assert scan.camera is not None and scan.camera.focal_px is not None
+        assert scan.camera is not None
         camera = scan.camera
     depth = scan.image(-scan.points[:, 2]).astype(np.float32)
-    mask = depth > 0
-    along = scan.points.astype(np.float64)
-    sigma = scan.image((scan.sigma * -along[:, 2] / np.linalg.norm(along, axis=1)).astype(np.float32))  # of the depth, not along the line
+    mask = scan.image(np.ones(len(scan.points), dtype=bool))
+    sigma = scan.image((scan.sigma * -scan.directions()[:, 2]).astype(np.float32)) if parallel else _depth_sigma(scan)
     maps = None if scan.maps is None else SurfaceMaps.read(scan.maps)
     if maps is not None and maps.height is not None and maps.height_sigma is not None:  # depth and normals have been joined
-        joined = mask & maps.mask & (maps.height_sigma > 0) & (maps.height < 0)
+        joined = mask & maps.mask & (maps.height_sigma > 0) & (parallel | (maps.height < 0))
         depth, sigma = np.where(joined, -maps.height, depth), np.where(joined, maps.height_sigma, sigma)
     estimated = scan.normals is None or scan.normals_source == "photometric"
     normal = depth_normals(depth, mask, camera, sigma=sigma, radius=NORMAL_RADIUS_PX) if estimated else scan.image(_given(scan))
     usable = mask & (np.abs(normal).sum(axis=-1) > 0)
     cell = surface_cells(depth, usable, camera, sigma)
+    camera_from_world = np.linalg.inv(pose)
+    if parallel:  # its frame is put before everything that it sees
+        shift = PARALLEL_START_M - float((depth - STEP_SIGMAS * sigma)[mask].min())
+        depth, camera_from_world = np.where(mask, depth + np.float32(shift), 0).astype(np.float32), camera_from_world.copy()
+        camera_from_world[2, 3] -= float(np.float32(shift))
     clear = _least_around(np.where(mask, depth - STEP_SIGMAS * sigma, 0))
     feather = np.clip(distance(np.pad(~cell, 1, constant_values=True))[1:-1, 1:-1] / FEATHER_PIXELS, 0, 1).astype(np.float32)
     distortion = camera.distortion
     layers = _layers(scan, maps, normal)
     stored = partial(_stored, folder)
     image = RangeImage(stored("depth", depth), stored("sigma", sigma), stored("normal", normal), stored("cell", cell),
-                       stored("clear", clear), np.linalg.inv(pose), camera.focal_px, camera.principal_point,
-                       (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p))
+                       stored("clear", clear), camera_from_world, focal_of(camera), camera.principal_point,
+                       (0.0,) * 5 if distortion is None else (*distortion.k, *distortion.p), orthographic=parallel)
     return PreparedScan(scan.name, image, camera, tuple(layers), stored("layers", np.concatenate(list(layers.values()), axis=-1)),
                         stored("feather", feather), scan.normals_source == "photometric",
                         _normal_sigma(maps), side)
+
+
+def _square_side(scan: Scan, camera: Camera, voxel_m: float) -> int:
+    """Return the side, in pixels, of the squares in which the pixels of a perspective camera are joined; 1: they stay."""
+    pitch = float(np.median(-scan.points[:, 2])) / min(focal_of(camera))
+    side = min(int(SQUARE_VOXELS * voxel_m / pitch), min(camera.resolution) // LEAST_SQUARES)
+    return side if side >= LEAST_SIDE else 1
+
+
+def _depth_sigma(scan: Scan) -> np.ndarray:
+    """Return σ of the depth, not along the line of sight, of a perspective camera, [rows, cols] float32 metres."""
+    along = scan.points.astype(np.float64)
+    return scan.image((scan.sigma * -along[:, 2] / np.linalg.norm(along, axis=1)).astype(np.float32))
+
+
+def focal_of(camera: Camera) -> tuple[float, float]:
+    """Return the focal lengths in pixels, or the pixels for each metre of an orthographic camera."""
+    if camera.focal_px is not None:
+        return camera.focal_px
+    assert camera.pixel_size_m is not None  # read_scan saw to it
+    return 1 / camera.pixel_size_m, 1 / camera.pixel_size_m
 
 
 def _normal_sigma(maps: SurfaceMaps | None) -> float:
@@ -156,13 +179,13 @@ def surface_cells(depth: np.ndarray, mask: np.ndarray, camera: Camera, sigma: np
     Args:
         depth: [rows, cols] metres. mask: [rows, cols] bool. sigma: [rows, cols] metres, of the depth.
     """
-    assert camera.focal_px is not None
     right, down, across, back = (connected(np.where(mask, depth, 1), mask, camera, offset, sigma=sigma)
                                  for offset in ((0, 1), (1, 0), (1, 1), (1, -1)))
     cell = np.zeros(depth.shape, dtype=bool)
     corners = np.stack([depth[:-1, :-1], depth[:-1, 1:], depth[1:, :-1], depth[1:, 1:]])
     noise = np.maximum.reduce([sigma[:-1, :-1], sigma[:-1, 1:], sigma[1:, :-1], sigma[1:, 1:]])
-    gentle = np.ptp(corners, axis=0) <= STEEPEST * corners.min(axis=0) / min(camera.focal_px) + STEP_SIGMAS * noise
+    nearest = corners.min(axis=0) if camera.projection == "perspective" else 1.0
+    gentle = np.ptp(corners, axis=0) <= STEEPEST * nearest / min(focal_of(camera)) + STEP_SIGMAS * noise
     cell[:-1, :-1] = right[:-1, :-1] & right[1:, :-1] & down[:-1, :-1] & down[:-1, 1:] & across[:-1, :-1] & back[:-1, 1:] & gentle
     return cell
 

@@ -199,7 +199,9 @@ def world_points(scan: PreparedScan) -> tuple[np.ndarray, np.ndarray]:
     row, col = np.divmod(used, scan.camera.width)
     x, y = scan.camera.plane_at(np.broadcast_to(u, (scan.camera.height, scan.camera.width))[row, col],
                                 np.broadcast_to(v, (scan.camera.height, scan.camera.width))[row, col])
-    points = np.stack([x * depth, y * depth, -depth], axis=-1)
+    if not scan.image.orthographic:
+        x, y = x * depth, y * depth
+    points = np.stack([x, y, -depth], axis=-1)
     world = np.linalg.inv(scan.image.camera_from_world)
     return points @ world[:3, :3].T + world[:3, 3], used
 
@@ -212,7 +214,7 @@ def bricks_of(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarra
         return np.zeros((0, 3), dtype=np.int64)
     sigma = float(np.asarray(scan.image.sigma).ravel()[used].max())
     depth = float(np.asarray(scan.image.depth).ravel()[used].max())
-    reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + depth / min(scan.image.focal)
+    reach = max(TRUNCATION_VOXELS * voxel, TRUNCATION_SIGMAS * sigma / LEAST_COSINE) + 2 * voxel + scan.image.pixel_m(depth)
     low, high = (np.floor((points - origin + side * reach) / size).astype(np.int64) for side in (-1, 1))
     beyond = int((high - low).max()) + 1
     base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
@@ -227,10 +229,11 @@ def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int,
     corners = np.array([[(low, high)[side][axis] for axis, side in enumerate(sides)] for sides in np.ndindex(2, 2, 2)])
     there = corners @ scan.image.camera_from_world[:3, :3].T + scan.image.camera_from_world[:3, 3]
     rows, cols = scan.image.depth.shape
-    if (there[:, 2] >= 0).all():
-        return None
-    if (there[:, 2] > -1e-3 * np.abs(there).max()).any():
-        return 0, rows, 0, cols
+    if not scan.image.orthographic:
+        if (there[:, 2] >= 0).all():
+            return None
+        if (there[:, 2] > -1e-3 * np.abs(there).max()).any():
+            return 0, rows, 0, cols
     u, v = scan.camera.image_coordinates(there)
     first_row, last_row = int(np.floor(v.min())) - WINDOW_PIXELS, int(np.ceil(v.max())) + WINDOW_PIXELS
     first_col, last_col = int(np.floor(u.min())) - WINDOW_PIXELS, int(np.ceil(u.max())) + WINDOW_PIXELS

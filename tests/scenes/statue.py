@@ -141,3 +141,23 @@ def write_scans(folder: Path, shots: list[Shot], *, sigma: float = SIGMA, poses:
 def colour_of(points: np.ndarray) -> np.ndarray:
     """Display-encoded colours that vary slowly over space."""
     return np.rint(127.5 + 100 * np.sin(9 * points + [0, 1, 2])).astype(np.uint8)
+
+
+def shoot_parallel(pose: np.ndarray, side: tuple[int, int], pixel_m: float, *, sigma: float = SIGMA, seed: int = 0, scene=distance,
+                   start_m: float = 1.0) -> Shot:
+    """A range image by parallel lines of sight, which start `start_m` before the frame of the camera: depths may be below 0."""
+    rows, cols = side
+    u, v = np.meshgrid(np.arange(cols) + 0.5 - cols / 2, np.arange(rows) + 0.5 - rows / 2)
+    points = np.stack([u * pixel_m, -v * pixel_m, np.full(side, start_m)], axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
+    along, hit, alive = np.zeros(len(points)), np.zeros(len(points), dtype=bool), np.arange(len(points))
+    for _ in range(200):
+        d = scene(points[alive] - along[alive, None] * pose[:3, 2])
+        along[alive] += d
+        hit[alive[np.abs(d) < 1e-7]] = True
+        alive = alive[(np.abs(d) >= 1e-7) & (along[alive] < start_m + 5)]
+        if len(alive) == 0:
+            break
+    mask = hit.reshape(side)
+    true = np.where(mask, along.reshape(side) - start_m, 0)
+    noise = sigma * np.random.default_rng(seed).standard_normal(side)
+    return Shot(np.where(mask, true + noise, 0), true, mask, pose, 0.0, side)

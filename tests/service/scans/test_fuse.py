@@ -15,7 +15,7 @@ from stage.depth_maps import DepthMaps
 from stage.depth_normals import depth_normals
 from stage.maps import SurfaceMaps
 from stage.scans.ply_points import read_ply_points
-from tests.scenes.statue import SIGMA, colour_of, distance, shoot, turntable, write_scans
+from tests.scenes.statue import SIGMA, colour_of, distance, shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
 VOXEL = 4e-3
@@ -109,12 +109,32 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     data["scans"][0]["sigma_m"] = SIGMA
     (points / "scan-set.json").write_text(json.dumps(data))
     refused(r"scans\[0\] \(view 0\): is a set of points: fusion needs range images", scan_set=points)
-    flat = Camera(projection="orthographic", resolution=shots[0].side[::-1], pixel_size_m=0.0075)
-    file = write_scans(tmp_path / "flat", shots[:1])
-    DepthMaps(camera=flat, mask=shots[0].mask, depth=shots[0].depth.astype(np.float32),
-              sigma=np.full(shots[0].side, SIGMA, dtype=np.float32)).write(file.parent / "scan0" / "depth.exr")
-    refused(r"scans\[0\] \(view 0\): its camera is orthographic: fusion takes perspective cameras", scan_set=file)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_range_images_of_orthographic_cameras_are_fused(tmp_path, shots, mixed):
+    """Cameras whose frame lies in the middle of the statue, so that half of the depths are below 0; every third is perspective if mixed."""
+    pixel = 7.5e-3
+    poses = [shot.world_from_camera.copy() for shot in shots[::2]]
+    parallel = []
+    for number, pose in enumerate(poses):
+        pose[:3, 3] = [0, 0, 0]
+        parallel.append(shoot_parallel(pose, (160, 120), pixel, seed=number))
+    file = write_scans(tmp_path, shots[::2], poses=[shot.world_from_camera if mixed and number % 3 == 0 else poses[number]
+                                                    for number, shot in enumerate(shots[::2])])
+    camera = Camera(projection="orthographic", resolution=(120, 160), pixel_size_m=pixel)
+    for number, shot in enumerate(parallel):
+        if not mixed or number % 3:
+            DepthMaps(camera=camera, mask=shot.mask, depth=shot.depth.astype(np.float32),
+                      sigma=np.full(shot.side, SIGMA, dtype=np.float32)).write(tmp_path / f"scan{number}" / "depth.exr")
+    result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
+    error = distance(read_ply_points(result.mesh_path).points)
+    assert np.median(np.abs(error)) <= 0.2e-3 and abs(np.median(error)) < 0.1e-3  # half as many views as above
+    assert np.percentile(np.abs(error), 90) < 2 * SIGMA + 1e-3
+    assert all(scan["fused"] for scan in result.facts["scans"]) and not [w for w in result.warnings if "pose" in w]
+    assert all(0.3 < scan["residual_median_sigmas"] < 1.2 for scan in result.facts["scans"])
+    assert result.facts["area_share_seen_by"]["2"] > 0.5
 
 
 def _moved(by: float) -> np.ndarray:
