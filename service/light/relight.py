@@ -34,6 +34,8 @@ from stage.brackets import merge_brackets
 from stage.files import write_text
 from stage.stack import Stack
 
+ROW_CHUNK_FRAMES = 64
+"""Most frames of a chunk that is made some rows at a time: large images are read from the disk once for each chunk."""
 MODEL_CHUNK_FRAMES = 128
 """Most frames of a chunk that a model guides: its responses to light are computed once for all of them."""
 RANGE_FRAMES = 4
@@ -157,7 +159,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     in_rows = guide is None and not alone and chunk_frames(stack) < CHUNK_FRAMES  # a model looks at whole frames
     whole = chunk_frames(stack, CHUNK_FRAMES if guide is None else MODEL_CHUNK_FRAMES)
-    size = max(1, (CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
+    size = max(1, (ROW_CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
                                device=device, model=use)
