@@ -68,6 +68,17 @@ def test_pixels_without_depth_beside_a_step_are_not_taken_for_sure(device):
     assert joined.guessed.mean() < 0.05
 
 
+@pytest.mark.parametrize("perspective", [False, True])
+def test_where_there_is_a_depth_none_beside_a_step_is_worse(device, perspective):
+    """A tenth of the depths is missing; pixels with one are right on both sides of the step, and only guessed ones are far off."""
+    view = see("disc", perspective=perspective)
+    seen = np.random.default_rng(3).random(view.z.shape) > 0.1
+    joined, _ = join(view, noise=2, drift=3, sigma=0.1 * MM, device=device, seen=seen)
+    error = np.abs(joined.height - view.z)
+    assert np.sqrt((error[seen] ** 2).mean()) <= LEAST_RATIO * 0.1 * MM and error[seen].max() < 0.5 * MM
+    assert joined.guessed[error > 0.5 * MM].all() and not (joined.guessed & seen).any()
+
+
 def test_mixtures_at_an_outline_are_left_out(device):
     view = see("disc")
     depth = -view.z + 0.2 * MM * np.random.default_rng(9).standard_normal(view.z.shape)
