@@ -90,7 +90,7 @@ KINDS = {"solve": jobs.SolveJob, "depth": jobs.DepthJob, "relight": jobs.Relight
          "view": jobs.ViewJob}
 
 
-PROGRAM = program()
+PROGRAM: Any = get_command(program())
 
 
 class Shown(NamedTuple):
@@ -102,7 +102,7 @@ class Shown(NamedTuple):
 
 
 def parameters(name: str) -> dict[str, Any]:
-    command: Any = get_command(PROGRAM)
+    command = PROGRAM
     for word in name.split():
         command = command.commands[word]
     return {parameter.name: parameter for parameter in command.params}
@@ -216,12 +216,12 @@ NO_JOBS = {
 
 
 def test_every_command_is_a_job_or_says_why_not():
-    names = {words for words, _ in commands(get_command(PROGRAM))}
+    names = {words for words, _ in commands(PROGRAM)}
     assert {words[0] for words in names if "-".join(words) not in jobs.JOBS} == NO_JOBS.keys()
     assert jobs.JOBS.keys() - {"-".join(words) for words in names} == {"pipeline"}
 
 
-@pytest.mark.parametrize("words", [words for words, _ in commands(get_command(PROGRAM))], ids=" ".join)
+@pytest.mark.parametrize("words", [words for words, _ in commands(PROGRAM)], ids=" ".join)
 def test_a_help_shows_every_word(relit, monkeypatch, words):
     """The names of options too, at the usual width of a terminal."""
     monkeypatch.setenv("COLUMNS", "80")
