@@ -44,6 +44,8 @@ class Harness:
         prepare(self.settings, self.database)
         self.queue = JobQueue(self.database)
         self.log = folder / "log.txt"
+        self._events: list[dict[str, Any]] = []
+        self._log_read = 0
         self._environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
         self._environment |= {f"RELIT_{name.upper()}": str(value) for name, value in settings.items()}
         if database_url is not None:
@@ -91,7 +93,7 @@ class Harness:
         assert row is not None
         return row
 
-    def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float = 0.02) -> Any:
+    def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float = 0.05) -> Any:
         """Wait for something, and return it."""
         deadline = time.monotonic() + within_s
         while not (found := true()):
@@ -111,6 +113,10 @@ class Harness:
     def pid_of(self, worker: str) -> int:
         """Of the process of a worker, which is part of its name."""
         return int(worker.split("-")[-2])
+
+    def is_alive(self, worker: str) -> bool:
+        """Whether the process of a worker runs."""
+        return Path(f"/proc/{self.pid_of(worker)}").exists()
 
     def holder(self, job: str, *, other_than: str | None = None) -> str:
         """The worker that does a job."""
@@ -160,8 +166,13 @@ class Harness:
                 at = None
 
     def events(self) -> list[dict[str, Any]]:
-        """The lines of the workers' logs, in their order."""
-        return [json.loads(line) for line in self.log.read_text().splitlines() if line.startswith("{")]
+        """The lines of the workers' logs, in their order; each is parsed once."""
+        with open(self.log, "rb") as log:
+            log.seek(self._log_read)
+            whole, end, _ = log.read().rpartition(b"\n")
+        self._log_read += len(whole + end)
+        self._events += [json.loads(line) for line in whole.splitlines() if line.startswith(b"{")]
+        return self._events
 
     def tail(self) -> str:
         return self.log.read_text()[-6000:] if self.log.exists() else ""

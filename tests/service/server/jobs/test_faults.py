@@ -55,8 +55,9 @@ def test_a_worker_that_hangs_is_killed_and_its_job_taken_over(tmp_path, undistur
         victim = made.holder(job)
         if how == "stopped":
             frames_there(made, job, 1)
-            os.kill(made.pid_of(victim), signal.SIGSTOP)
-        made.start()
+            os.kill(made.pid_of(victim), signal.SIGSTOP)  # the worker in its place will be a good one
+        else:
+            made.start()
         row = made.ended(job)
         assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
         assert row["worker"] != victim

@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -65,61 +67,71 @@ def put_registered(made: Harness, names: list[str], views: list[View]) -> Path:
     return folder
 
 
-def start(made: Harness) -> None:
-    for _ in range(WORKERS):
-        made.start(PYTHONPATH=SABOTAGE, PIECES="0", TOGETHER=str(made.folder / "together"))
-    made.ready(WORKERS)
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
+    """A service with two workers, which serve one test after the other; in the last one of them is killed."""
+    with harness(tmp_path_factory.mktemp("service"), log_level="debug", takeover_s=0.5) as made:
+        for _ in range(WORKERS):
+            made.start(PYTHONPATH=SABOTAGE, PIECES="0", TOGETHER=str(made.folder / "together"))
+        made.ready(WORKERS)
+        yield made
+
+
+@pytest.fixture
+def both(pair: Harness) -> Harness:
+    """The two workers at the beginning of a test; the first piece will wait for both."""
+    shutil.rmtree(pair.folder / "together", ignore_errors=True)
+    return pair
+
+
+@pytest.fixture(scope="module")
+def depths(pair: Harness, views: list[View]) -> list[str]:
+    return put_depths(pair, views)
+
+
+@pytest.fixture(scope="module")
+def alone(pair: Harness, depths: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return registered_alone(pair, depths, tmp_path_factory.mktemp("alone"))
 
 
 def poses_of(path: Path) -> list[object]:
     return [(scan.name, scan.scan_to_world, scan.pose_covariance) for scan in read_scan_set(path)[1].scans]
 
 
-def test_two_workers_find_the_same_poses_as_one_process(tmp_path, views):
-    with harness(tmp_path / "service", log_level="debug") as made:
-        names = put_depths(made, views)
-        alone = registered_alone(made, names, tmp_path / "alone")
-        start(made)
-        job = made.submit(RegisterJob(kind="register", depths=tuple(names)), chunk_frames=8)
-        row = made.ended(job)
-        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-        shares = begun(made, job)
-        assert len(shares) == WORKERS
-        pieces = [piece for share in shares.values() for piece in share]
-        assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
-        assert poses_of(made.results(job) / "scan-set.json") == poses_of(alone)
-        assert json.loads((made.results(job) / "report.json").read_text())["pairs"] == json.loads(
-            (alone.parent / "report.json").read_text())["pairs"]
-        assert not pieces_folder(made, job).exists()
+def test_two_workers_find_the_same_poses_as_one_process(both, depths, alone):
+    job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
+    row = both.ended(job)
+    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+    shares = begun(both, job)
+    assert len(shares) == WORKERS
+    pieces = [piece for share in shares.values() for piece in share]
+    assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
+    assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
+    assert json.loads((both.results(job) / "report.json").read_text())["pairs"] == json.loads(
+        (alone.parent / "report.json").read_text())["pairs"]
+    assert not pieces_folder(both, job).exists()
 
 
-def test_two_workers_write_the_same_tiles_as_one_process(tmp_path, views):
-    with harness(tmp_path / "service", log_level="debug") as made:
-        names = put_depths(made, views[:4])
-        registered = put_registered(made, names, views)
-        options = {"tiles": True, "voxel_m": 6e-3}
-        alone = fuse(FuseRequest(scan_set=registered, out=tmp_path / "alone", device="cpu", **options)).report_path.parent
-        start(made)
-        job = made.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
-        row = made.ended(job)
-        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-        assert len(begun(made, job)) == WORKERS
-        tiles = {path.name: path.read_bytes() for path in (alone / "tiles").glob("*.ply")}
-        assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (made.results(job) / "tiles").glob("*.ply")} == tiles
-        assert (made.results(job) / "site.usda").exists()
-        assert not pieces_folder(made, job).exists()
+def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tmp_path):
+    registered = put_registered(both, depths[:4], views)
+    options = {"tiles": True, "voxel_m": 6e-3}
+    expected = fuse(FuseRequest(scan_set=registered, out=tmp_path / "alone", device="cpu", **options)).report_path.parent
+    job = both.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
+    row = both.ended(job)
+    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+    assert len(begun(both, job)) == WORKERS
+    tiles = {path.name: path.read_bytes() for path in (expected / "tiles").glob("*.ply")}
+    assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (both.results(job) / "tiles").glob("*.ply")} == tiles
+    assert (both.results(job) / "site.usda").exists()
+    assert not pieces_folder(both, job).exists()
 
 
 @pytest.mark.long
-def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(tmp_path, views):
-    with harness(tmp_path / "service", log_level="debug", takeover_s=0.5) as made:
-        names = put_depths(made, views)
-        alone = registered_alone(made, names, tmp_path / "alone")
-        start(made)
-        job = made.submit(RegisterJob(kind="register", depths=tuple(names)), chunk_frames=8)
-        holder, _ = both_at_work(made, job)
-        os.kill(made.pid_of(holder), signal.SIGKILL)
-        row = made.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
-        assert poses_of(made.results(job) / "scan-set.json") == poses_of(alone)
-        assert not pieces_folder(made, job).exists()
+def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths, alone):
+    job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
+    holder, _ = both_at_work(both, job)
+    os.kill(both.pid_of(holder), signal.SIGKILL)
+    row = both.ended(job)
+    assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
+    assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
+    assert not pieces_folder(both, job).exists()

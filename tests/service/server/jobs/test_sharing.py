@@ -3,43 +3,70 @@
 import os
 import shutil
 import signal
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.requests.jobs import SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
-from service.server.database import jobs
+from service.server.database import jobs, workers
 from service.server.storage import layout
 from service.solve import batches
 from service.solve.solve import solve
 from stage import stack
-from tests.scenes.captures import make_scene, write_capture
-from tests.service.server.jobs.harness import PROJECT, digests, harness
+from tests.scenes.captures import make_scene, write_capture, write_exr
+from tests.service.server.jobs.harness import PROJECT, digests, harness, relit_relight
 from tests.service.server.jobs.test_faults import SABOTAGE
 
 WORKERS = 2
-PIECE_S = {"lambert": 0.1, "svbrdf": 0.05}
+FRAMES = 12
+PIECE_S = 0.1
 """Seconds that each piece takes more, so that neither worker does all that is left when both have begun."""
 
 
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    return write_capture(tmp_path_factory.mktemp("registered") / "capture", make_scene(size=32, lights=9))
+
+
+@pytest.fixture(scope="module")
+def alone(capture, tmp_path_factory) -> Callable[[str], bytes]:
+    """What `relit solve` makes of the same pieces, by the method."""
+
+    @cache
+    def maps(method: str) -> bytes:
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(stack, "BAND_BYTES", 1 << 14)
+            patched.setattr(batches, "BATCH_BYTES", 1 << 15)
+            out = tmp_path_factory.mktemp("alone")
+            return solve(SolveRequest(capture=capture, method=method, out=out, device="cpu")).maps_path.read_bytes()
+
+    return maps
+
+
+@pytest.fixture(scope="module")
+def pair(capture, tmp_path_factory):
+    """A service with two workers, which serve one test after the other."""
+    with harness(tmp_path_factory.mktemp("service"), log_level="debug", takeover_s=0.5, roots=str(capture.parent)) as made:
+        start(made)
+        yield made
+
+
 @pytest.fixture
-def capture(tmp_path) -> Path:
-    """A capture beside the folder of the service, as no root of captures may hold that."""
-    return write_capture(tmp_path / "capture", make_scene(size=32, lights=9))
+def both(pair):
+    """The two workers at the beginning of a test; the first piece will wait for both."""
+    pair.until(lambda: sum(pair.is_alive(row["id"]) for row in workers.seen_lately(pair.database)) == WORKERS, "two workers there")
+    shutil.rmtree(pair.folder / "together", ignore_errors=True)
+    return pair
 
 
-def maps_alone(capture: Path, method: str, out: Path, monkeypatch) -> bytes:
-    """What `relit solve` makes of the same pieces."""
-    monkeypatch.setattr(stack, "BAND_BYTES", 1 << 14)
-    monkeypatch.setattr(batches, "BATCH_BYTES", 1 << 15)
-    return solve(SolveRequest(capture=capture, method=method, out=out, device="cpu")).maps_path.read_bytes()
-
-
-def start(made, method: str) -> None:
+def start(made) -> None:
     for _ in range(WORKERS):
-        made.start(PYTHONPATH=SABOTAGE, PIECES=str(PIECE_S[method]), TOGETHER=str(made.folder / "together"))
+        made.start(PYTHONPATH=SABOTAGE, PIECES=str(PIECE_S), TOGETHER=str(made.folder / "together"))
     made.ready(WORKERS)
 
 
@@ -67,85 +94,85 @@ def both_at_work(made, job: str) -> tuple[str, str]:
     return holder, next(worker for worker in begun(made, job) if worker != holder)
 
 
-@pytest.mark.parametrize(("method", "database_url"), [("lambert", "sqlite"), pytest.param("svbrdf", "postgresql", marks=pytest.mark.long)],
-                         indirect=["database_url"])
-def test_two_workers_make_the_same_maps_as_one(tmp_path, database_url, capture, monkeypatch, method):
-    alone = maps_alone(capture, method, tmp_path / "alone", monkeypatch)
-    with harness(tmp_path / "service", database_url, log_level="debug") as made:
-        start(made, method)
-        job = begin(made, capture, method)
-        row = made.ended(job)
-        assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-        assert row["done"] == row["total"]
-        shares = begun(made, job)
-        assert len(shares) == WORKERS
-        pieces = [piece for share in shares.values() for piece in share]
-        assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
-        assert (made.results(job) / layout.MAPS).read_bytes() == alone
-        assert not pieces_folder(made, job).exists()
-        made.until(lambda: any(event["event"] in ("help done", "help stopped") for event in made.events()), "helped")
+def events_of(made, job: str, *names: str) -> list[str]:
+    """Those of some events of a job that have been, in their order."""
+    return [event["event"] for event in made.events() if event.get("job") == job and event["event"] in names]
+
+
+def made_by_both(made, job: str, expected: bytes) -> None:
+    """Wait for a solve that two workers share."""
+    row = made.ended(job)
+    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+    assert row["done"] == row["total"]
+    shares = begun(made, job)
+    assert len(shares) == WORKERS
+    pieces = [piece for share in shares.values() for piece in share]
+    assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
+    assert (made.results(job) / layout.MAPS).read_bytes() == expected
+    assert not pieces_folder(made, job).exists()
+    made.until(lambda: events_of(made, job, "help done", "help stopped"), "helped")
+
+
+def test_two_workers_make_the_same_maps_as_one(both, capture, alone):
+    made_by_both(both, begin(both, capture, "lambert"), alone("lambert"))
+
+
+@pytest.mark.long
+def test_two_workers_make_the_same_maps_as_one_on_postgresql(tmp_path, on_postgres, capture, alone):
+    with harness(tmp_path, on_postgres, log_level="debug", roots=str(capture.parent)) as made:
+        start(made)
+        made_by_both(made, begin(made, capture, "lambert"), alone("lambert"))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("whom", ["who helps", "who has the job"])
-def test_the_pieces_of_a_killed_worker_are_done_by_another(tmp_path, capture, monkeypatch, whom):
-    alone = maps_alone(capture, "svbrdf", tmp_path / "alone", monkeypatch)
-    with harness(tmp_path / "service", log_level="debug", takeover_s=0.5) as made:
-        start(made, "svbrdf")
-        job = begin(made, capture, "svbrdf")
-        holder, helper = both_at_work(made, job)
-        victim = holder if whom == "who has the job" else helper
-        done = {path.name for path in pieces_folder(made, job).rglob("*") if path.is_file()}
-        os.kill(made.pid_of(victim), signal.SIGKILL)
-        row = made.ended(job)
-        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
-        assert (row["worker"] == holder) == (whom == "who helps")
-        assert done and (made.results(job) / layout.MAPS).read_bytes() == alone
-        assert not pieces_folder(made, job).exists()
-        later = [event["worker"] for event in made.events() if event["event"] == "piece begins" and event["job"] == job]
-        assert later[-1] != victim
+def test_the_pieces_of_a_killed_worker_are_done_by_another(both, capture, alone, whom):
+    job = begin(both, capture, "svbrdf")
+    holder, helper = both_at_work(both, job)
+    victim = holder if whom == "who has the job" else helper
+    done = {path.name for path in pieces_folder(both, job).rglob("*") if path.is_file()}
+    os.kill(both.pid_of(victim), signal.SIGKILL)
+    row = both.ended(job)
+    assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+    assert (row["worker"] == holder) == (whom == "who helps")
+    assert done and (both.results(job) / layout.MAPS).read_bytes() == alone("svbrdf")
+    assert not pieces_folder(both, job).exists()
+    later = [event["worker"] for event in both.events() if event["event"] == "piece begins" and event["job"] == job]
+    assert later[-1] != victim
 
 
 @pytest.mark.long
-def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(tmp_path, capture):
-    with harness(tmp_path / "service", log_level="debug") as made:
-        start(made, "svbrdf")
-        job = begin(made, capture, "svbrdf")
-        both_at_work(made, job)
-        assert made.database.transact(lambda connection: jobs.cancel(connection, job))
-        made.queue.cancel(job, 1)
-        made.until(lambda: {"step stopped", "help stopped"} <= {event["event"] for event in made.events()}, "stopped")
-        made.until(lambda: not pieces_folder(made, job).exists(), "removed")
-        assert made.row(job)["state"] == jobs.CANCELLED
-        shutil.rmtree(made.folder / "together")  # the first piece waits for both once more
-        other = begin(made, capture, "lambert")  # both are free again
-        assert made.ended(other)["state"] == jobs.SUCCEEDED
-        made.until(lambda: len(begun(made, other)) == WORKERS, "shared")
+def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture):
+    job = begin(both, capture, "svbrdf")
+    both_at_work(both, job)
+    assert both.database.transact(lambda connection: jobs.cancel(connection, job))
+    both.queue.cancel(job, 1)
+    both.until(lambda: {"step stopped", "help stopped"} <= set(events_of(both, job, "step stopped", "help stopped")), "stopped")
+    both.until(lambda: not pieces_folder(both, job).exists(), "removed")
+    assert both.row(job)["state"] == jobs.CANCELLED
+    shutil.rmtree(both.folder / "together")  # the first piece waits for both once more
+    other = begin(both, capture, "lambert")  # both are free again
+    assert both.ended(other)["state"] == jobs.SUCCEEDED
+    both.until(lambda: len(begun(both, other)) == WORKERS, "shared")
 
 
-def test_a_small_solve_is_not_shared(tmp_path, capture):
+def test_a_small_solve_is_not_shared(both, capture):
     """It has one piece a pass."""
-    with harness(tmp_path / "service", log_level="debug") as made:
-        for _ in range(WORKERS):
-            made.start()
-        made.ready(WORKERS)
-        job = begin(made, capture, "svbrdf")
-        assert made.ended(job)["state"] == jobs.SUCCEEDED
-        assert begun(made, job) == {} and "help begins" not in {event["event"] for event in made.events()}
+    small = write_capture(capture.parent / "small", make_scene(size=4, lights=9))
+    job = begin(both, small, "svbrdf")
+    assert both.ended(job)["state"] == jobs.SUCCEEDED
+    assert begun(both, job) == {} and events_of(both, job, "help begins") == []
 
 
-def test_frames_are_made_by_both_workers(tmp_path, undisturbed):
-    with harness(tmp_path, log_level="debug") as made:
-        for _ in range(WORKERS):
-            made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
-        made.ready(WORKERS)
-        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
-                           undisturbed.frames, chunk_frames=6)
-        row = made.ended(job)
-        assert (row["state"], row["error"], row["done"], row["total"]) == (jobs.SUCCEEDED, None, undisturbed.frames, undisturbed.frames)
-        assert sorted(row["finished_steps"]) == sorted(f"frames {first}-{first + 5}" for first in range(1, undisturbed.frames, 6))
-        shares = begun(made, job)
-        assert len(shares) == WORKERS
-        assert sorted(piece for share in shares.values() for piece in share) == sorted(f"steps/{step}" for step in row["finished_steps"])
-        assert digests(made.results(job)) == undisturbed.digests
-        assert not pieces_folder(made, job).exists()
+def test_frames_are_made_by_both_workers(both, capture, tmp_path):
+    sky = write_exr(capture.parent / "sky.exr", np.random.default_rng(7).random((16, 32, 3)))
+    expected = relit_relight(capture, sky, FRAMES, tmp_path / "expected")
+    job = both.relight(both.register(capture, CAPTURE), both.register(sky, ENVIRONMENT), FRAMES, chunk_frames=2)
+    row = both.ended(job)
+    assert (row["state"], row["error"], row["done"], row["total"]) == (jobs.SUCCEEDED, None, FRAMES, FRAMES)
+    assert sorted(row["finished_steps"]) == sorted(f"frames {first}-{first + 1}" for first in range(1, FRAMES, 2))
+    shares = begun(both, job)
+    assert len(shares) == WORKERS
+    assert sorted(piece for share in shares.values() for piece in share) == sorted(f"steps/{step}" for step in row["finished_steps"])
+    assert digests(both.results(job)) == expected
+    assert not pieces_folder(both, job).exists()

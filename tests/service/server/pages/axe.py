@@ -11,12 +11,25 @@ REQUIRED = os.environ.get("RELIT_TEST_CLIENTS") == "required"
 SERIOUS = ("serious", "critical")
 
 
-def violations(page) -> list[str]:
+COLOURS = {"runOnly": ["cat.color"]}
+"""Rules that look at colours, which are all that the dark scheme of base.css changes."""
+
+
+def violations(page, options: dict | None = None) -> list[str]:
     """What axe-core finds wrong with a page, of the impacts that count here: the rule, what it asks for, and where."""
     try:
         script = installed.node_modules() / "axe-core" / "axe.min.js"
     except installed.MissingClientError as error:
         (pytest.fail if REQUIRED else pytest.skip)(str(error))
-    page.add_script_tag(path=script)
-    found = page.evaluate("() => axe.run()")["violations"]
+    if page.evaluate("() => globalThis.axe === undefined"):
+        page.add_script_tag(path=script)
+    found = page.evaluate("(options) => axe.run(options)", options or {})["violations"]
     return [f"{each['id']}: {each['help']}: {node['html']}" for each in found if each["impact"] in SERIOUS for node in each["nodes"]]
+
+
+def violations_in_both_schemes(page) -> list[str]:
+    """The same in the light scheme, and what is wrong with the colours of the dark one."""
+    page.emulate_media(color_scheme="light")
+    found = violations(page)
+    page.emulate_media(color_scheme="dark")
+    return found + violations(page, COLOURS)

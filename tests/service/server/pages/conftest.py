@@ -28,6 +28,8 @@ MAX_SIGMA = 0.3
 """Largest standard error in degrees of a normal that counts as solved here, so that the capture has unsure pixels too."""
 
 
+PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
+"""The folder for the pictures of the documentation; without it they are made and dropped."""
 SETTINGS = {"roots": str(SAMPLES), "requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
 OPTIONS = ("--anonymous", "--device", "cpu")
 
@@ -102,11 +104,13 @@ def count_bytes(page) -> list[int]:
 
 
 class Solved:
-    """A capture that is registered, solved and prepared, and its pages."""
+    """A capture that is registered, perhaps solved, and prepared, and its pages."""
 
-    def __init__(self, server: Server, capture: str, solve: str) -> None:
+    def __init__(self, server: Server, capture: str, solve: str | None) -> None:
         self.server, self.capture, self.solve = server, capture, solve
-        self.pages = {"capture": f"/captures/{capture}", "job": f"/jobs/{solve}", "light": f"/light/{capture}", "maps": f"/maps/{solve}"}
+        self.pages = {"capture": f"/captures/{capture}", "light": f"/light/{capture}"}
+        if solve is not None:
+            self.pages |= {"job": f"/jobs/{solve}", "maps": f"/maps/{solve}"}
 
     def wait_for_content(self, page, name: str) -> None:
         """Wait until a page shows what it is for."""
@@ -130,15 +134,20 @@ def done(server: Server, client, request: dict) -> str:
     return job
 
 
-def prepared(server: Server, name: str, options: dict) -> Solved:
-    """A sample, registered, solved, and prepared for the pages."""
+def prepared(server: Server, name: str, options: dict | None) -> Solved:
+    """A sample, registered, solved unless `options` is None, and prepared for the pages."""
     with server.client() as client:
         capture = client.post("/v1/captures", json={"name": name, "folder": str(SAMPLES / name)}).raise_for_status().json()["id"]
         server.wait(client, f"/v1/captures/{capture}", ("ready",))
-        solve = done(server, client, {"kind": "solve", "capture": capture, "options": options})
         done(server, client, {"kind": "view", "capture": capture})
-        done(server, client, {"kind": "view", "capture": capture, "maps": solve})
-        return Solved(server, capture, solve)
+        return Solved(server, capture, None if options is None else solved_maps(server, client, capture, options))
+
+
+def solved_maps(server: Server, client, capture: str, options: dict) -> str:
+    """The job that solved a capture, its maps prepared for the pages."""
+    solve = done(server, client, {"kind": "solve", "capture": capture, "options": options})
+    done(server, client, {"kind": "view", "capture": capture, "maps": solve})
+    return solve
 
 
 @pytest.fixture(scope="session")
@@ -148,8 +157,17 @@ def solved(server: Server, solved_data: Path) -> Solved:
 
 @pytest.fixture(scope="session")
 def owl(server: Server) -> Solved:
-    """The sample that `make serve` opens on."""
-    return prepared(server, "owl", {})
+    """The sample that `make serve` opens on; its material is solved for pictures of the documentation alone."""
+    return prepared(server, "owl", {} if PICTURES else None)
+
+
+@pytest.fixture(scope="session")
+def material(server: Server, solved: Solved, owl: Solved) -> Solved:
+    """A capture whose material is solved: the sample where that is, else the small one."""
+    if owl.solve is not None:
+        return owl
+    with server.client() as client:
+        return Solved(server, solved.capture, solved_maps(server, client, solved.capture, {}))
 
 
 @pytest.fixture(scope="session")

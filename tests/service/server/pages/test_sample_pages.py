@@ -1,23 +1,21 @@
 """The pages on the shipped sample: live relighting is what the batch makes, and pictures of docs/pages.md and of the README, which
 `make screenshots` writes into docs/."""
 
-import os
 from pathlib import Path
 
 import pytest
 
+from tests.service.server.pages.conftest import PICTURES
 from tests.service.server.pages.frames import assert_same, picture, rendered
-
-FOLDER = os.environ.get("RELIT_TEST_SCREENSHOTS")
-"""Where the pictures go; without it they are made and dropped."""
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["light", "maps", "capture"])
-def test_a_page_shows_the_sample(browser, owl, sky, tmp_path, name):
-    page = browser.new_page(base_url=owl.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark")
-    page.goto(owl.pages[name])
-    owl.wait_for_content(page, name)
+def test_a_page_shows_the_sample(browser, owl, material, sky, tmp_path, name):
+    sample = material if name == "maps" else owl
+    page = browser.new_page(base_url=sample.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark")
+    page.goto(sample.pages[name])
+    sample.wait_for_content(page, name)
     if name == "light":
         page.get_by_label("Environment map").select_option(sky)
         page.locator("canvas.preview").wait_for(timeout=60_000)
@@ -27,7 +25,7 @@ def test_a_page_shows_the_sample(browser, owl, sky, tmp_path, name):
         page.get_by_label("Compare with", exact=True).first.select_option("roughness")
     page.evaluate("() => scrollTo(0, 0)")
     page.wait_for_timeout(1500)  # the last tiles, and a frame
-    path = (Path(FOLDER) if FOLDER else tmp_path) / f"page_{name}.png"
+    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_{name}.png"
     page.screenshot(path=path)
     assert path.stat().st_size > 50_000
     page.close()

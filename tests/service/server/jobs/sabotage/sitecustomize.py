@@ -2,11 +2,12 @@
 
 kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
 
-With PIECES the bands and batches of solves are small, and each takes that many seconds more. The first waits until a second worker has
-begun one: TOGETHER is the folder in which each leaves a file.
+With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
+has begun one: TOGETHER is the folder in which each leaves a file.
 """
 
 import os
+import random
 import signal
 import threading
 import time
@@ -68,7 +69,7 @@ if "PIECES" in os.environ:
     upload = batches.packs.upload
 
     def slow_upload(*arguments, **options):
-        time.sleep(float(os.environ["PIECES"]))
+        time.sleep(float(os.environ["PIECES"]) * random.uniform(0.5, 1.5))  # so that workers do not claim in step
         return upload(*arguments, **options)
 
     batches.packs.upload = slow_upload
