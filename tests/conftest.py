@@ -36,11 +36,15 @@ PROGRAMS = ("clients", "server")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Spread the files that start other programs evenly over the run: side by side they would wait for each other's processor time."""
+    """Spread the files that start other programs evenly over the run: side by side they would wait for each other's processor time.
+
+    Files with more long tests come first, so that at the end no worker of the run is left with one of them.
+    """
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    starts = [path for path in files if set(PROGRAMS) & set(path.parts)]
-    others = [path for path in files if path not in set(starts)]
+    in_order = sorted(files, key=lambda path: -sum(item.get_closest_marker("long") is not None for item in files[path]))
+    starts = [path for path in in_order if set(PROGRAMS) & set(path.parts)]
+    others = [path for path in in_order if path not in set(starts)]
     place = {path: (number + 0.5) / len(some) for some in (starts, others) for number, path in enumerate(some)}
     items[:] = [item for path in sorted(files, key=lambda path: place[path]) for item in files[path]]
