@@ -56,15 +56,20 @@ def thinned_scan(scan: Scan) -> Thinned:
     """Return at most `MOST_POINTS` points of a scan.
 
     A range image of many more pixels is taken in squares of pixels, which are larger where the surface is farther away. All else is taken
-    in cells, only as far as the noise and the number of points demand it.
+    in cells: means as far as the noise demands it, and one point of each where the number of points demands larger ones. The means of
+    those would lie behind each convex surface, by more than their σ.
     """
     side = int(np.ceil(np.sqrt(len(scan.points) / MOST_POINTS)))
     squares = side > 2 and scan.camera is not None and scan.camera.projection == "perspective"
     points, directions, variance = _of_scan(coarser(scan, side) if squares else scan)
     cell = NOISE_CELLS * float(np.sqrt(np.median(variance)))
-    while len(points) > MOST_POINTS and (count := 1 + np.count_nonzero(np.diff(np.sort(_cells(points, cell))))) > MOST_POINTS:
-        cell *= max(1.02, float(np.sqrt(count / MOST_POINTS)))
-    return thin(points, directions, variance, cell)._replace(even=not squares)
+    thinned = thin(points, directions, variance, cell)
+    kept = drawn = np.random.default_rng(0).permutation(len(thinned.points))  # in their order the first would be the lowest of the noise
+    while len(kept) > MOST_POINTS:
+        cell *= max(1.02, float(np.sqrt(len(kept) / MOST_POINTS)))
+        kept = drawn[np.unique(_cells(thinned.points[drawn], cell), return_index=True)[1]]
+    kept = np.sort(kept)
+    return Thinned(thinned.points[kept], thinned.directions[kept], thinned.sigma[kept], even=not squares)
 
 
 def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
