@@ -21,7 +21,6 @@ from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
 from service.server.database.schema import upgrade
 from service.server.storage.part_files import PartFile, PartFileLocked
-from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.tus import VERSION, Answer, Tus, checksum, encoded
 from tests.service.server_process import Server, serving
@@ -351,13 +350,9 @@ def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.skipif(binaries() is None, reason="no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-def test_postgresql_tells_the_same_paths_and_requests(tmp_path):
-    programs = binaries()
-    assert programs is not None
-    with postgres(programs) as database, serving(
-            tmp_path, "--anonymous", "--device", "none", database_url=database.new_database(), min_free_bytes="0",
-            requests_per_second="10000", request_burst="10000") as server, server.client() as client:
+def test_postgresql_tells_the_same_paths_and_requests(tmp_path, server_postgres):
+    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database(), min_free_bytes="0",
+                 requests_per_second="10000", request_burst="10000") as server, server.client() as client:
         place, tus = made(client, "captures"), Tus(server.url)
         answers = at_once(8, lambda number: tus.create(place, 10 + number, encoded(path="same.bin")))
         assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
