@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.service.server.api.tus import Tus
 from tests.service.server_process import Server, serving
 
 HOME = Path(__file__).resolve().parents[4]
@@ -64,3 +65,13 @@ def sky(server: Server, client):
     """An environment, registered and ready."""
     made = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl" / "environment.exr")}).raise_for_status().json()
     return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
+
+
+@pytest.fixture(scope="session")
+def tus(server: Server) -> Tus:
+    return Tus(server.url)
+
+
+@pytest.fixture
+def capture(client) -> str:
+    return f"/v1/captures/{client.post('/v1/captures', json={'name': 'uploads'}).raise_for_status().json()['id']}"

@@ -1,0 +1,247 @@
+"""Uploads when something goes wrong: the server is killed, the disk refuses, a part is lost, nobody goes on, and what limits refuse."""
+
+import hashlib
+import os
+import random
+import resource
+import signal
+import socket
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from service.requests.identifiers import CAPTURE, new_id
+from service.requests.keys import NewKey, Scope
+from service.server.database import keys, tables, uploads
+from service.server.database.engine import connect
+from service.server.database.intakes import insert as insert_intake
+from service.server.database.schema import upgrade
+from service.server.storage.part_files import PartFile, PartFileLocked
+from tests.service.server.api.test_uploads import at_once, begun, made, part, soon, stored
+from tests.service.server.api.tus import Tus, checksum, encoded
+from tests.service.server_process import serving
+
+KIB, MIB = 1 << 10, 1 << 20
+PATIENCE_S = 30.0
+
+
+@pytest.mark.long
+def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
+    settings = {"requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
+    contents = {f"{number}.bin": random.Random(number).randbytes(4 * MIB + number) for number in range(4)}
+    told: dict[str, int] = {}
+    place, uploads_of = "", {}
+    for delay in (0.15, 0.4, None):
+        with serving(tmp_path, "--anonymous", "--device", "none", **settings) as server, server.client() as client:
+            tus = Tus(server.url)
+            place = place or made(client, "captures")
+            for name, content in contents.items():
+                if name not in uploads_of:
+                    uploads_of[name] = begun(tus, place, len(content), name, sha256=hashlib.sha256(content).hexdigest())
+
+            def go_on(name: str, tus: Tus = tus) -> None:
+                content, upload = contents[name], uploads_of[name]
+                offset = tus.head(upload).offset
+                assert offset >= told.get(name, 0)
+                while offset < len(content):
+                    piece = content[offset : offset + MIB // 2]
+                    checked = {"Upload_Checksum": checksum("sha256", piece)} if name < "2" else {}
+                    offset = told[name] = tus.patch(upload, offset, piece, **checked).offset
+
+            with ThreadPoolExecutor(len(contents)) as pool:
+                futures = [pool.submit(go_on, name) for name in contents]
+                if delay is not None:
+                    time.sleep(delay)
+                    os.killpg(server.process.pid, signal.SIGKILL)
+            broken = [error for future in futures if (error := future.exception()) is not None]
+            assert all(isinstance(error, OSError) or "http" in type(error).__module__ for error in broken), broken
+            if delay is None:
+                assert not broken
+                for name, content in contents.items():
+                    assert stored(server, place, name).read_bytes() == content
+                assert list((server.data / "uploads").iterdir()) == []
+
+
+@pytest.mark.long
+def test_postgresql_tells_the_same_paths_and_requests(tmp_path, server_postgres):
+    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database(), min_free_bytes="0",
+                 requests_per_second="10000", request_burst="10000") as server, server.client() as client:
+        place, tus = made(client, "captures"), Tus(server.url)
+        answers = at_once(8, lambda number: tus.create(place, 10 + number, encoded(path="same.bin")))
+        assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
+        answers = at_once(8, lambda _: tus.create(place, 10, encoded(path="a b/once.bin"), Idempotency_Key="once"))
+        assert {answer.status for answer in answers} == {201}
+        assert len({answer.headers["location"] for answer in answers}) == 1
+        for path in ("A B/other", "a b", "SAME.bin/x", "sAme.bin"):
+            assert tus.create(place, 1, encoded(path=path)).status == 409
+        for path in ("a b/other", "a b2", "a!b/x", "ä/x"):
+            tus.send(place, path, b"data")
+        listed = client.get(f"{place}/files").json()["files"]
+        assert [file["path"] for file in listed] == ["a b/once.bin", "a b/other", "a b2", "a!b/x", "ä/x", "same.bin"]  # ä begins with an a
+        assert client.get(f"{place}/files", params={"after": "a b2"}).json()["files"] == listed[3:]
+        assert client.delete(place).status_code == 204
+
+
+def test_bytes_behind_what_was_counted_are_cut_off(server, tus, capture):
+    """As a kill leaves them: written, and neither synchronised nor found right."""
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    with open(part(server, upload), "ab") as file:
+        file.write(b"bad and more")
+    assert tus.head(upload).offset == 4
+    assert tus.patch(upload, 4, b"data").status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == b"gooddata"
+
+
+def test_a_complete_file_that_was_moved_and_not_noted_is_complete(server, client, tus, capture):
+    """As a kill leaves it between the two."""
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    stored(server, capture, "").mkdir(parents=True)
+    part(server, upload).rename(stored(server, capture, "file.bin"))
+    assert tus.head(upload).offset == 0  # half of it is not all of it
+    with open(stored(server, capture, "file.bin"), "ab") as file:
+        file.write(b"data")
+    assert tus.head(upload).offset == 8
+    assert [file["done"] for file in client.get(f"{capture}/files").json()["files"]] == [True]
+
+
+def test_a_part_that_is_lost_begins_again(server, tus, capture):
+    upload = begun(tus, capture, 8)
+    assert tus.patch(upload, 0, b"good").status == 204
+    part(server, upload).unlink()
+    assert tus.head(upload).offset == 0
+    assert tus.patch(upload, 4, b"data").status == 409
+    assert tus.patch(upload, 0, b"all of it"[:8]).status == 204
+    assert stored(server, capture, "file.bin").read_bytes() == b"all of i"
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="the limit of another process can be set on Linux alone")
+def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+        place, tus = made(client, "captures"), Tus(server.url)
+        content = random.Random(5).randbytes(12 * MIB)
+        upload = begun(tus, place, len(content))
+        assert tus.patch(upload, 0, content[:MIB]).status == 204
+        before = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (8 * MIB, before[1]))  # files grow no further, as on a full disk
+        full = tus.patch(upload, MIB, content[MIB:])
+        assert (full.status, full.headers["retry-after"].isdigit()) == (507, True)
+        assert tus.head(upload).offset == part(server, upload).stat().st_size == MIB
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, before)
+        assert tus.patch(upload, MIB, content[MIB:]).status == 204
+        assert stored(server, place, "file.bin").read_bytes() == content
+
+
+def test_limits_and_projects(tmp_path):
+    with serving(tmp_path, "--device", "none", max_upload_bytes=str(MIB), max_capture_files="2", min_free_bytes="0",
+                 upload_hours="0.0005") as server:
+        database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
+        ours, theirs = (keys.create(database, NewKey(project=project, name="test", scope=Scope.WRITE)) for project in ("ours", "theirs"))
+        with server.client(ours) as client:
+            place, tus, key = made(client, "captures"), Tus(server.url), {"Authorization": f"Bearer {ours}"}
+            large = tus.create(place, MIB + 1, encoded(path="a"), **key)
+            assert (large.status, str(MIB).encode() in large.body) == (413, True)
+            upload = tus.create(place, 8, encoded(path="a"), **key).headers["location"]
+            assert tus.create(place, 8, encoded(path="b"), **key).status == 201
+            many = tus.create(place, 8, encoded(path="c"), **key)
+            assert (many.status, b"2 files" in many.body) == (413, True)
+            other = {"Authorization": f"Bearer {theirs}"}
+            assert tus.create(place, 8, encoded(path="d"), **other).status == 404
+            assert tus.ask("HEAD", upload, **other).status == tus.ask("DELETE", upload, **other).status == 404
+            assert tus.patch(upload, 0, b"12345678", **other).status == 404
+            assert tus.ask("HEAD", upload).status == 401
+            soon(lambda: tus.ask("HEAD", upload, **key).status == 410)  # 1.8 s after it was touched
+            assert tus.patch(upload, 0, b"data", **key).status == 410
+        database.close()
+
+
+@pytest.mark.parametrize("headers", [{}, {"Idempotency_Key": "once"}], ids=["plain", "with a token"])
+def test_an_expired_upload_is_begun_again_at_once(server, client, tus, capture, headers):
+    """410 says so; it was 409 until the next housekeeping."""
+    content = b"12345678"
+    first = tus.create(capture, len(content), encoded(path="a.bin"), **headers).headers["location"]
+    assert tus.patch(first, 0, content[:3]).offset == 3
+    database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
+    database.transact(lambda connection: connection.execute(tables.uploads.update().where(
+        tables.uploads.c.id == first.rpartition("/")[2]).values(touched_at=time.time() - 49 * 3600)))
+    database.close()
+    assert tus.patch(first, 3, content[3:]).status == tus.head(first).status == 410
+    again = tus.create(capture, len(content), encoded(path="a.bin"), **headers)
+    assert (again.status, again.offset) == (201, 0)
+    assert again.headers["location"] != first
+    assert tus.patch(again.headers["location"], 0, content).offset == len(content)
+    assert stored(server, capture, "a.bin").read_bytes() == content
+    assert tus.head(first).status == 404
+
+
+def test_a_length_that_is_said_twice_is_refused(server, capture):
+    """A proxy before the service may have believed the other header, and taken the rest of the body for the next request."""
+    upload = Tus(server.url).create(capture, 8, encoded(path="a.bin")).headers["location"]
+    port = int(server.url.rpartition(":")[2])
+    smuggled = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    for method, path in (("PATCH", upload), ("POST", "/v1/captures"), ("GET", "/healthz")):
+        with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as connection:
+            connection.sendall((f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nTus-Resumable: 1.0.0\r\nUpload-Offset: 0\r\n"
+                                "Content-Type: application/offset+octet-stream\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n"
+                                "0\r\n\r\n").encode() + smuggled)
+            answer = b"".join(iter(lambda: connection.recv(4096), b""))
+        assert answer.startswith(b"HTTP/1.1 400") and answer.count(b"HTTP/1.1") == 1, (path, answer)
+        assert b"both Content-Length and Transfer-Encoding" in answer
+
+
+def test_files_are_not_for_everybody(server, tus, capture):
+    tus.send(capture, "a.bin", b"12345678")
+    half = tus.create(capture, 8, encoded(path="b.bin")).headers["location"]
+    tus.patch(half, 0, b"1234")
+    files = [*server.data.glob("relit.sqlite*"), stored(server, capture, "a.bin"), part(server, half)]
+    folders = {folder for file in files for folder in file.parents if folder.is_relative_to(server.data)}
+    assert len(files) >= 3 and [path for path in (*files, *folders) if path.stat().st_mode & 0o027] == []
+
+
+def test_a_server_without_space_takes_nothing(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes=str(1 << 60)) as server, server.client() as client:
+        database, capture = connect(f"sqlite:///{server.data / 'relit.sqlite'}"), new_id(CAPTURE)
+        database.transact(lambda connection: insert_intake(  # a request for one is refused, too
+            connection, identifier=capture, project="default", kind=CAPTURE, name="test", folder=None))
+        database.close()
+        answer = Tus(server.url).create(f"/v1/captures/{capture}", 1, encoded(path="a"))
+        assert (answer.status, "retry-after" in answer.headers) == (507, True)
+        assert client.get(f"/v1/captures/{capture}/files").json()["files"] == []
+
+
+def test_what_nobody_adds_to_expires(tmp_path):
+    database, folder = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), tmp_path / "uploads"
+    upgrade(database)
+    ids = {name: f"up_{name:0>20}" for name in ("old", "busy", "new", "done")}
+
+    def fill(connection) -> None:
+        insert_intake(connection, identifier="cap_1", project="p", kind="cap", name="test", folder=None)
+        for name, identifier in ids.items():
+            uploads.insert(connection, identifier=identifier, project="p", intake="cap_1", path=name, length=4, sha256=None)
+
+    database.transact(fill)
+    assert uploads.finish(database, ids["done"], 4)
+    for identifier in ids.values():
+        PartFile.open(folder, identifier).close()
+    limit = time.time()
+    assert uploads.advance(database, ids["new"], 2)
+    PartFile.open(folder, "up_orphan").close()
+    os.utime(folder / "up_orphan.part", (limit + 1, limit + 1))  # the clock of files is a coarse one
+    with PartFile.open(folder, ids["busy"]):
+        assert uploads.expire(database, folder, limit) == 1
+    assert {name for name, identifier in ids.items() if uploads.find(database, identifier, "p") is not None} == {"busy", "new", "done"}
+    assert {path.stem for path in folder.iterdir()} == {ids["busy"], ids["new"], "up_orphan"}
+    assert uploads.expire(database, folder, time.time() + 60) == 2
+    assert list(folder.iterdir()) == []
+    assert uploads.find(database, ids["done"], "p") is not None
+    database.close()
+
+
+def test_a_part_is_locked_once(tmp_path):
+    with PartFile.open(tmp_path, "up_1") as first, pytest.raises(PartFileLocked):
+        first.append([b"da", b"", b"ta"])
+        PartFile.open(tmp_path, "up_1")
+    with PartFile.open(tmp_path, "up_1") as again:
+        assert again.size == 4
