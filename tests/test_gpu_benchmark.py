@@ -25,7 +25,7 @@ def test_it_needs_only_warp_and_numpy():
 
 @pytest.mark.skipif("cuda:0" in devices.names(), reason="there is a GPU")
 def test_a_machine_without_a_gpu_is_told_so():
-    """As a program: Warp's own words about the driver are not to be seen."""
+    """The benchmark runs as a program: Warp's own words about the driver are not to be seen."""
     said = python("-m", "benchmarks.gpu")
     assert said.returncode == 1 and "cuda:0 is not on this machine" in said.stderr
     assert len(said.stderr.strip().splitlines()) == 1

@@ -71,7 +71,7 @@ class SmallLights(NamedTuple):
     """The small bright places of neighbouring frames."""
 
     frames: slice
-    """Which of the frames that are made."""
+    """The place of these frames in all that are made."""
     sources: FrameSources
     direction: np.ndarray  # [n, 3] of the samples of all these frames
 

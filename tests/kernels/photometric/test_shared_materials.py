@@ -81,7 +81,7 @@ def test_dielectrics_have_one_f0(device):
 
 
 def test_dielectrics_keep_f0_of_their_own_where_they_pay(device):
-    """Of two F0 four fold apart each is found, within the ten per cent that one pixel's noise moves it."""
+    """Each of two F0 four fold apart is found, within the ten per cent that one pixel's noise moves it."""
     radiance, normal = lobes((0.03, 0.12), (0.4, 0.4))
     shared = choose_materials(sample(radiance, device)[0], normal, shape=LAMBERT)
     for f0 in (0.03, 0.12):

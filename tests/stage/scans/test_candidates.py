@@ -1,4 +1,4 @@
-"""Which of many scans are tried with each other: those that see the same side of a surface, and some of each scale."""
+"""The choice of pairs of many scans to try: those that see the same side of a surface, and some of each scale."""
 
 import numpy as np
 

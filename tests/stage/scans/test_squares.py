@@ -36,7 +36,7 @@ def test_the_depth_is_that_at_the_centre(surface, most):
 
 @pytest.mark.parametrize("side", [2, 3, 5])
 def test_sigma_is_what_noise_does(side):
-    """Of some 1700 squares of 5 pixels, whose standard deviation is known to 1.7 %, and more smaller ones."""
+    """There are some 1700 squares of 5 pixels, so that their standard deviation is known to 1.7 %, and more smaller ones."""
     rng = np.random.default_rng(2)
     off = []
     for _ in range(4):

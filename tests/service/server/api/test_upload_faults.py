@@ -84,7 +84,7 @@ def test_postgresql_tells_the_same_paths_and_requests(tmp_path, server_postgres)
 
 
 def test_bytes_behind_what_was_counted_are_cut_off(server, tus, capture):
-    """As a kill leaves them: written, and neither synchronised nor found right."""
+    """A kill leaves them like this: written, and neither synchronised nor found right."""
     upload = begun(tus, capture, 8)
     assert tus.patch(upload, 0, b"good").status == 204
     with open(part(server, upload), "ab") as file:
@@ -95,7 +95,7 @@ def test_bytes_behind_what_was_counted_are_cut_off(server, tus, capture):
 
 
 def test_a_complete_file_that_was_moved_and_not_noted_is_complete(server, client, tus, capture):
-    """As a kill leaves it between the two."""
+    """A kill between the two leaves the file like this."""
     upload = begun(tus, capture, 8)
     assert tus.patch(upload, 0, b"good").status == 204
     stored(server, capture, "").mkdir(parents=True)
