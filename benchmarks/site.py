@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.site_scene import STATUES, Scene, distance, look, looking, make_scene
+from benchmarks.site_scene import STATUES, Scene, distance, look, make_scene
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
 from stage.files import write_text
@@ -30,6 +30,7 @@ from stage.ply import PointCloud, write_ply
 from stage.scans.ply_points import read_ply_points
 from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from stage.scans.rigid import exponential, inverse, rigid_between
+from tests.reference.projector import look_at
 
 FAR_SHARE, CLOUD_EVERY = 0.6, 10
 FAR_DEGREES, NEAR_DEGREES = 85.0, 32.0
@@ -80,11 +81,11 @@ def write_scan(scene: Scene, folder: Path, name: str, number: int, count: int, s
     if far:
         turn = 2 * np.pi * 0.381966 * number
         eye = np.array([rng.uniform(-8.5, 8.5), rng.uniform(1.5, 2.5), rng.uniform(-1.5, 1.5)])
-        pose = looking(eye, eye + np.array([np.cos(turn), rng.uniform(-0.2, 0.0), np.sin(turn)]))
+        pose = look_at(eye, eye + np.array([np.cos(turn), rng.uniform(-0.2, 0.0), np.sin(turn)]))
     else:
         statue = scene.statues[number % STATUES]
         turn = 2 * np.pi * (number // STATUES) / max((count - far_count) / STATUES, 1) + 0.3 * (number % STATUES)
-        pose = looking(statue + NEAR_M * np.array([np.cos(turn), rng.uniform(-0.1, 0.4), np.sin(turn)]), statue)
+        pose = look_at(statue + NEAR_M * np.array([np.cos(turn), rng.uniform(-0.1, 0.4), np.sin(turn)]), statue)
     focal = shape[0] / 2 / np.tan(np.radians(FAR_DEGREES if far else NEAR_DEGREES) / 2)
     camera = Camera(projection="perspective", resolution=shape, focal_px=(focal, focal))
     depth = look(scene, camera, pose)

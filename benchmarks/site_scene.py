@@ -198,13 +198,3 @@ def _lists(scene: Scene, camera: Camera, pose: np.ndarray) -> tuple[np.ndarray, 
     of_square = reached.reshape(-1, len(boxes))
     start = np.concatenate([[0], np.cumsum(of_square.sum(axis=1))]).astype(np.int32)
     return start, np.nonzero(of_square)[1].astype(np.int32)
-
-
-def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return world_from_camera [4, 4] of a camera that looks at a point."""
-    back = (eye - target) / np.linalg.norm(eye - target)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, np.cross(back, right), back, eye
-    return pose

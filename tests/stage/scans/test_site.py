@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.site_scene import distance, look, looking, make_scene
+from benchmarks.site_scene import distance, look, make_scene
 from stage.camera import Camera
 from stage.scans import cloud
 from stage.scans.fine import fit
@@ -13,6 +13,7 @@ from stage.scans.pairs import PairState, prepare, refine
 from stage.scans.registration import RegistrationOptions, register
 from stage.scans.rigid import inverse, moved, step_between
 from stage.scans.scan import Scan
+from tests.reference.projector import look_at
 
 SIGMA = 1e-3
 EYES = [((-3.0, 2.0, 0.5), (2.0, 1.0, 3.0)), ((-1.0, 2.2, -1.0), (3.0, 1.0, 2.0))]
@@ -36,7 +37,7 @@ def scan_of(number: int, camera: Camera, pose: np.ndarray, sigma: float, range_m
 def scans() -> list[Scan]:
     """Pixels of 8 cm at 6 m."""
     camera = Camera(projection="perspective", resolution=(150, 120), focal_px=(80.0, 80.0))
-    return [scan_of(number, camera, looking(np.array(eye), np.array(target)), SIGMA) for number, (eye, target) in enumerate(EYES)]
+    return [scan_of(number, camera, look_at(eye, target), SIGMA) for number, (eye, target) in enumerate(EYES)]
 
 
 def test_poses_of_squares_of_pixels_are_as_sure_as_they_say(monkeypatch):
@@ -45,7 +46,7 @@ def test_poses_of_squares_of_pixels_are_as_sure_as_they_say(monkeypatch):
     monkeypatch.setattr(cloud, "MOST_POINTS", 5000)
     camera, statue = Camera(projection="perspective", resolution=(400, 320), focal_px=(700.0, 700.0)), make_scene().statues[5]
     eyes = [statue + 1.3 * np.array([np.cos(turn), 0.2, np.sin(turn)]) for turn in (0.0, 0.8)]
-    near = [scan_of(number, camera, looking(eye, statue), 1e-4, 2.2) for number, eye in enumerate(eyes)]
+    near = [scan_of(number, camera, look_at(eye, statue), 1e-4, 2.2) for number, eye in enumerate(eyes)]
     a, b = (prepare(scan, cell_m=0.02) for scan in near)
     assert len(a.fine.points) < 5000
     assert near[0].pose is not None and near[1].pose is not None
