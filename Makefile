@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo serve test test-all clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
+.PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -22,6 +22,10 @@ test: $(VENV)/installed-dev
 # with the long suites: workers and servers killed, databases restarted, load, random requests
 test-all: $(VENV)/installed-dev
 	$(PYTEST)
+
+# keeps what Python compiles of modules and tests
+compiled: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -q --collect-only >/dev/null
 
 # Blender, Mitsuba and three.js, which tests/clients opens assets with; needs Python 3.11 exactly, npm, and Chromium beside it
 clients: .clients/installed
