@@ -1,4 +1,4 @@
-"""The surface of many range images, brick by brick, so that memory is bounded whatever the size of the site.
+"""The surface of many range images, brick by brick, so that memory grows with the views that see one brick, not with the site.
 
 The arrays of the scans lie in files that are mapped into memory. A brick takes from each view the window of pixels in which the brick can
 lie. Bricks compute the lattice alike, so that their triangles share vertices where they meet. What the views show at such a vertex is
