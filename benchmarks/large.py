@@ -198,13 +198,13 @@ def large_table(folder: Path, megapixels: float = MEGAPIXELS, lights: int = LIGH
             measured = measure(command, work, method, frames, compression)
             stages += measured
             found = rows(measured)
-            if command == COMMANDS[-1]:
-                found.append(sum_row("all commands", stages))
             print("\n".join(found), flush=True)
             lines += found
             if command == "export":  # relight reads the capture and the stack beside it
                 shutil.rmtree(work / "out")
                 shutil.rmtree(work / "asset")
+        lines.append(sum_row("all commands", stages))
+        print(lines[-1], flush=True)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return lines

@@ -152,11 +152,15 @@ def pose_errors(registered: Path, truth: dict[str, Truth]) -> dict[str, tuple[fl
     common = rigid_between(placed[None], true[None], np.ones((1, len(true))))[0]
     out = {}
     for name, pose in found.items():
-        motion = common @ pose @ np.linalg.inv(truth[name].pose)
-        cosine = np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)
-        out[name] = (float(np.linalg.norm(motion[:3, :3] @ truth[name].middle + motion[:3, 3] - truth[name].middle)),
-                     float(np.degrees(np.arccos(cosine))))
+        out[name] = off_by(common @ pose, truth[name])
     return out
+
+
+def off_by(pose: np.ndarray, true: Truth) -> tuple[float, float]:
+    """Return by how much a pose in the true world is wrong: metres at the middle of its points, and degrees."""
+    motion = pose @ inverse(true.pose)
+    cosine = np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)
+    return float(np.linalg.norm(motion[:3, :3] @ true.middle + motion[:3, 3] - true.middle)), float(np.degrees(np.arccos(cosine)))
 
 
 def surface_errors(scene: Scene, tiles: Path, motion: np.ndarray) -> np.ndarray:
@@ -170,7 +174,7 @@ def surface_errors(scene: Scene, tiles: Path, motion: np.ndarray) -> np.ndarray:
 
 def common_motion(registered: Path, truth: dict[str, Truth]) -> np.ndarray:
     """[4, 4] true world from the world of the found poses."""
-    found = [(truth[entry.name], np.array(entry.scan_to_world)) for entry in read_scan_set(registered)[1].scans if entry.scan_to_world]
+    found = [(truth[name], pose) for name, pose in poses_of(registered).items()]
     true = np.stack([each.middle for each, _ in found])
     placed = np.stack([pose[:3, :3] @ (each.pose[:3, :3].T @ (each.middle - each.pose[:3, 3])) + pose[:3, 3] for each, pose in found])
     return np.asarray(rigid_between(placed[None], true[None], np.ones((1, len(true))))[0])
@@ -189,11 +193,8 @@ def errors_in_sigmas(registered: Path, truth: dict[str, Truth]) -> dict[str, tup
     out = {}
     for scan in report["scans"]:
         if scan["name"] in found and scan["name"] != reference:
-            true = truth[scan["name"]]
-            motion = common @ found[scan["name"]] @ inverse(true.pose)
-            turn = np.degrees(np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1)))
-            place = np.linalg.norm(motion[:3, :3] @ true.middle + motion[:3, 3] - true.middle)
-            out[scan["name"]] = float(place / scan["pose_sigma_m"]), float(turn / scan["pose_sigma_degrees"])
+            place, turn = off_by(common @ found[scan["name"]], truth[scan["name"]])
+            out[scan["name"]] = place / scan["pose_sigma_m"], turn / scan["pose_sigma_degrees"]
     return out
 
 

@@ -147,11 +147,12 @@ def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float,
         raise CalibrationError(f"{capture.folder}: the board of {board[0]}x{board[1]} inner corners is not found")
     plane = board_plane(corners, board, square_m, capture.camera)
     inside = inside_board(corners, board, grey.shape)
+    dark = np.float32(0) if black is None else black
     found = []
     # squares would shift the middle of a stripe that runs along their edges: it is divided by what the board looks like
     albedo = np.where(inside, np.maximum(grey, 0), 0).astype(np.float32)
     for frame in _laser_frames(capture):
-        signal = stripe_signal(correction.apply(frame).pixels - (np.float32(0) if black is None else black), inside)
+        signal = stripe_signal(correction.apply(frame).pixels - dark, inside)
         best = np.zeros((0, 2))
         for along in ("row", "column"):
             stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)

@@ -230,12 +230,9 @@ class FrameWriter:
 def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray], form: FrameFormat) -> tuple[list[exr.Part], int]:
     """Return what the file of a frame holds, of the whole frame or of rows, and the number of clipped pixels."""
     frame = _finished(frame, file, form)
-    clipped = 0
-    if _is_beyond_half(frame):
-        clipped = int(((frame > exr.HALF_MAX) | (frame < -exr.HALF_MAX)).any(axis=0).sum())
-        picture = _half(np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX), form, "")
-    else:
-        picture = _half(frame, form, "")
+    bounded = _bounded(frame)
+    clipped = 0 if bounded is frame else int((bounded != frame).any(axis=0).sum())
+    picture = _half(bounded, form, "")
     if form.alpha is not None:
         picture[ALPHA] = form.alpha
     parts = [exr.Part(BEAUTY_PART, picture, form.space, COMPRESSIONS[form.compression])]
@@ -244,8 +241,7 @@ def _parts(file: FrameFile, frame: np.ndarray, colours: Mapping[str, np.ndarray]
         layers[Layer.DIFFUSE] = frame - layers[Layer.SPECULAR]
     for name, layer in layers.items():
         if name != Layer.SPECULAR or name in form.parts:
-            bounded = np.clip(layer, -exr.HALF_MAX, exr.HALF_MAX) if _is_beyond_half(layer) else layer
-            parts.append(exr.Part(name, _half(bounded, form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
+            parts.append(exr.Part(name, _half(_bounded(layer), form, f"{name}."), form.space, COMPRESSIONS[form.compression]))
     parts += [exr.Part(layer.name, layer.channels, form.space if layer.is_colour else exr.DATA) for layer in form.layers]
     if not form.in_parts:
         parts = [parts[0]._replace(channels={name: plane for part in parts for name, plane in part.channels.items()})]
@@ -267,6 +263,7 @@ def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.nda
     return {prefix + name: plane for name, plane in zip("RGB", planes, strict=True)}
 
 
-def _is_beyond_half(frame: np.ndarray) -> bool:
-    """Return whether a value has to be clipped, by two passes over the frame that take less than counting or clipping."""
-    return bool(frame.max() > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)
+def _bounded(frame: np.ndarray) -> np.ndarray:
+    """Return a frame within the range of half: itself where no value is beyond it, which takes less than to clip it."""
+    beyond = bool(frame.max() > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)
+    return np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX) if beyond else frame

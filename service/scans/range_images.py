@@ -91,7 +91,7 @@ def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = N
         camera = scan.camera
     depth = scan.image(-scan.points[:, 2]).astype(np.float32)
     mask = scan.image(np.ones(len(scan.points), dtype=bool))
-    sigma = scan.image((scan.sigma * -scan.directions()[:, 2]).astype(np.float32)) if parallel else _depth_sigma(scan)
+    sigma = scan.image(scan.depth_sigma())
     maps = None if scan.maps is None else SurfaceMaps.read(scan.maps)
     if maps is not None and maps.height is not None and maps.height_sigma is not None:  # depth and normals have been joined
         joined = mask & maps.mask & (maps.height_sigma > 0) & (parallel | (maps.height < 0))
@@ -123,12 +123,6 @@ def _square_side(scan: Scan, camera: Camera, voxel_m: float) -> int:
     pitch = float(np.median(-scan.points[:, 2])) / min(focal_of(camera))
     side = min(int(SQUARE_VOXELS * voxel_m / pitch), min(camera.resolution) // LEAST_SQUARES)
     return side if side >= LEAST_SIDE else 1
-
-
-def _depth_sigma(scan: Scan) -> np.ndarray:
-    """Return σ of the depth, not along the line of sight, of a perspective camera, [rows, cols] float32 metres."""
-    along = scan.points.astype(np.float64)
-    return scan.image((scan.sigma * -along[:, 2] / np.linalg.norm(along, axis=1)).astype(np.float32))
 
 
 def focal_of(camera: Camera) -> tuple[float, float]:

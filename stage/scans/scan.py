@@ -59,6 +59,10 @@ class Scan:
         image[self.pixels] = values
         return image.reshape(self.camera.height, self.camera.width, *values.shape[1:])
 
+    def depth_sigma(self) -> np.ndarray:
+        """Return the standard deviation of the depth, not along the line of sight, of each point of a range image, [n] float32 metres."""
+        return np.asarray((self.sigma * -self.directions()[:, 2]).astype(np.float32))
+
     def directions(self) -> np.ndarray:
         """Return the unit vector from the camera through each point, [n, 3] float64."""
         if self.camera is not None and self.camera.projection == "orthographic":

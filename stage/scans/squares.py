@@ -64,9 +64,7 @@ def coarser(scan: Scan, side: int) -> Scan:
         side: of a square, pixels.
     """
     assert scan.camera is not None
-    z = -scan.points[:, 2]
-    length = np.sqrt((scan.points * scan.points) @ np.ones(3, dtype=np.float32))
-    found = squares_of(scan.image(z), scan.image(scan.sigma * z / length), scan.camera, side)
+    found = squares_of(scan.image(-scan.points[:, 2]), scan.image(scan.depth_sigma()), scan.camera, side)
     there = found.depth > 0
     points = found.camera.points(-found.depth)[there]
     stretch = np.sqrt((points * points) @ np.ones(3, dtype=np.float32)) / found.depth[there]
