@@ -30,6 +30,9 @@ def serve(
         show_default=False)] = None,
 ) -> None:
     """Run the service: the API, and a worker on each device."""
+    from service.server.malloc import restart_without_thread_caches
+
+    restart_without_thread_caches()  # before the service is imported, which takes a second
     from service.server.serve import serve as run
 
     run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
