@@ -213,6 +213,16 @@ def test_the_client_starts_without_heavy_libraries():
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize(("process", "heavy"), [
+    ("service.server.serve", ("numpy", "warp", "alembic", "service.solve")),
+    ("service.server.work", ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
+])
+def test_what_watches_workers_starts_without_what_they_need(process, heavy):
+    code = f"import sys, {process}; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_references_judge_without_what_they_judge():
     for path in sorted((HOME / "tests" / "reference").glob("*.py")):
         assert not {i.target for i in imports_of(path) if top(i.target) in ROOTS}, path.name

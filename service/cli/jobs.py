@@ -10,7 +10,7 @@ import typer
 from service.cli.groups import make_group
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected
 from service.cli.waiting import download, wait_for
-from service.requests.jobs import DEFAULT_SERVER
+from service.requests.address import DEFAULT_SERVER
 
 if TYPE_CHECKING:
     from service.client import Client

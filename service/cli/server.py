@@ -5,6 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from service.server.garbage import spared
+
 ConfigOption = Annotated[Path | None, typer.Option(
     "--config", metavar="FILE.toml", show_default=False,
     help="File of settings, which docs/service.md lists. A variable RELIT_… of the environment overrides it.")]
@@ -33,7 +35,8 @@ def serve(
     from service.server.malloc import restart_without_thread_caches
 
     restart_without_thread_caches()  # before the service is imported, which takes a second
-    from service.server.serve import serve as run
+    with spared():
+        from service.server.serve import serve as run
 
     run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
 
@@ -45,7 +48,8 @@ def worker(
     config: ConfigOption = None,
 ) -> None:
     """Run one more worker, on any machine that reaches the database and the storage."""
-    from service.server.work import work as run
+    with spared():
+        from service.server.work import work as run
 
     run(settings_of(config, data=data), device)
 

@@ -8,7 +8,7 @@ import httpx2
 from service.client.connection import Connection
 from service.client.intakes import Intakes
 from service.client.jobs import Jobs
-from service.requests.jobs import DEFAULT_SERVER
+from service.requests.address import DEFAULT_SERVER
 
 
 class Client:

@@ -26,10 +26,6 @@ from service.requests.view import ViewOptions
 from stage.board.records import BoardRegions, GaugeRuns
 from stage.model import Count, Line
 
-DEFAULT_PORT = 8470
-DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
-"""The address at which a client looks for the service if it is given no other."""
-
 MAPS = Spelling(argument=True, metavar="JOB")
 KEYS = Spelling(metavar="FILE")
 MOST_SCANS = 500

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from service.server.settings import Settings
 
 T = TypeVar("T")
+CPU = "cpu"
+"""The device that every machine has: no process is asked whether it is there."""
 
 
 def of_workers(settings: "Settings") -> list[str]:
@@ -25,7 +27,7 @@ def of_workers(settings: "Settings") -> list[str]:
         return []
     if settings.devices:
         return [resolve(device) for device in settings.devices]
-    return [name for name in _elsewhere(_names) if name.startswith("cuda")] or ["cpu"]
+    return [name for name in _elsewhere(_names) if name.startswith("cuda")] or [CPU]
 
 
 def resolve(device: str | None) -> str:
@@ -34,7 +36,7 @@ def resolve(device: str | None) -> str:
     Raises:
         DeviceError: the device is not on this machine.
     """
-    return _elsewhere(_resolve, device)
+    return device if device == CPU else _elsewhere(_resolve, device)
 
 
 def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:

@@ -17,7 +17,6 @@ from service.server.database import idempotency, intakes, jobs, workers
 from service.server.database.clock import ClockWatch
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.jobs.queue import JobQueue
-from service.server.jobs.worker import cache_folder
 from service.server.jobs.worker_lock import FileWorkerLock
 from service.server.log import logger
 from service.server.settings import Settings
@@ -132,7 +131,7 @@ class Housekeeper:
         self._silent = silent - self._silent
 
     def _caches(self) -> None:
-        folder = cache_folder(self._settings)
+        folder = self._settings.cache
         if not folder.is_dir():
             return
         there = {path.name: path for path in folder.iterdir() if path.is_dir()}
@@ -164,7 +163,7 @@ class Housekeeper:
     def _interrupted(self) -> None:
         """Finish deletions, and delete unfinished files, that a power failure or a kill interrupted."""
         self._storage.tidy()
-        for path in cache_folder(self._settings).rglob(".*"):  # of a worker that was killed while it wrote a stack
+        for path in self._settings.cache.rglob(".*"):  # of a worker that was killed while it wrote a stack
             if path.is_file() and path.stat().st_mtime < self._clock() - UNFINISHED_S:
                 path.unlink(missing_ok=True)
                 logger.info("unfinished stack removed", file=path.name)

@@ -18,8 +18,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, PydanticBaseSettingsSource, SettingsConfigDict
 
 from service.errors import RequestError
+from service.requests.address import DEFAULT_PORT
 from service.requests.identifiers import PROJECT_PATTERN
-from service.requests.jobs import DEFAULT_PORT
 from service.requests.keys import Scope
 from stage.model import Count, Positive
 
@@ -273,6 +273,11 @@ class Settings(BaseSettings):
     def locks(self) -> Path:
         """Folder of the lock files by which the workers of SQLite are known to be alive."""
         return self.data / "locks"
+
+    @property
+    def cache(self) -> Path:
+        """Folder of the image stacks that this machine caches."""
+        return self.data / "cache"
 
     @property
     def sqlalchemy_url(self) -> str:

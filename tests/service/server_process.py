@@ -60,7 +60,7 @@ def serving(folder: Path, *options: str, descriptors: int | None = None, **setti
         deadline = time.monotonic() + START_S
         while True:
             try:
-                httpx2.get(f"{server.url}/v1/openapi.json", timeout=5)
+                httpx2.get(f"{server.url}/healthz", timeout=5)
                 break
             except httpx2.TransportError:
                 assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-4000:]

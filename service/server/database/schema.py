@@ -57,6 +57,12 @@ def upgrade(database: Database) -> None:
             audit.protect(connection)
 
 
+def is_current(database: Database) -> bool:
+    """Return whether the tables are those of this program; nothing is changed."""
+    with database.engine.connect() as connection:
+        return _revision(connection) == _newest()
+
+
 def require_current(database: Database) -> None:
     """Check that the tables are those of this program; nothing is changed.
 

@@ -6,8 +6,8 @@ import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
 
+from service.server.garbage import spared
 from service.server.jobs.heartbeat import Heartbeat
-from service.server.jobs.worker import run_worker
 from service.server.log import logger
 from service.server.settings import Settings
 
@@ -17,6 +17,13 @@ PAUSES_S = (0.0, 1.0, 5.0, 15.0, 60.0)
 once: a job or a person killed it, and `max_lost` ends a job that kills workers."""
 KILL_AFTER_S = 10.0
 """Seconds beyond `drain_s` before a worker that does not end is killed."""
+
+
+def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
+    """Run a worker in this process, which alone imports what jobs need; the arguments are those of `worker.run_worker`."""
+    with spared():
+        from service.server.jobs import worker
+    worker.run_worker(settings, device, heartbeat)
 
 
 @dataclass
@@ -67,12 +74,13 @@ class Supervisor:
                 process.kill()
 
     def _run(self) -> None:
-        while not self._ended.wait(LOOK_S):
+        while not self._ended.is_set():
             for slot in self._slots:
                 try:
                     self._look(slot)
                 except OSError as error:  # there is no memory or no process left; at the next look there may be
                     logger.error("worker cannot be started", device=slot.device, error=str(error))
+            self._ended.wait(LOOK_S)
 
     def _look(self, slot: _Slot) -> None:
         now = time.monotonic()

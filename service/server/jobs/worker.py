@@ -6,7 +6,6 @@ import signal
 import socket
 import threading
 from multiprocessing import parent_process
-from pathlib import Path
 
 from dbos import DBOS, DBOSConfig
 from dbos import error as dbos_error
@@ -56,7 +55,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     if lock.hold() is LockState.REFUSED:
         raise RuntimeError(f"another process holds the lock of {name}")  # its name is random
     queue = JobQueue(database)
-    context = WorkerContext(database, open_storage(settings), cache_folder(settings), device, settings.max_pixels, settings.roots_of,
+    context = WorkerContext(database, open_storage(settings), settings.cache, device, settings.max_pixels, settings.roots_of,
                             worker=name, queue=queue, settings=settings)
     runner = JobRunner(context, name, alive=heartbeat.step)
     config: DBOSConfig = {
@@ -96,11 +95,6 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     telemetry.close(tracing)
     logger.info("worker ended", worker=name)
     os._exit(0)  # threads of DBOS are blocked before steps that do not start
-
-
-def cache_folder(settings: Settings) -> Path:
-    """Return the folder of the image stacks that this machine caches."""
-    return settings.data / "cache"
 
 
 def _prepared(database: Database, settings: Settings, ending: threading.Event) -> None:

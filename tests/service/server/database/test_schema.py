@@ -13,7 +13,7 @@ from alembic.script import ScriptDirectory
 
 from service.server.database import intakes, jobs, keys, schema, tables, uploads
 from service.server.database.engine import Database, DatabaseError, connect
-from service.server.database.schema import REVISIONS, require_current, upgrade
+from service.server.database.schema import REVISIONS, is_current, require_current, upgrade
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
 
@@ -58,6 +58,7 @@ def differences(database: Database) -> list:
 
 
 def test_yesterdays_database_is_upgraded_and_keeps_all_it_has(settings, yesterday):
+    assert not is_current(yesterday)
     prepare(settings, yesterday)
     require_current(yesterday)
     assert differences(yesterday) == []
@@ -75,7 +76,9 @@ def test_yesterdays_database_is_upgraded_and_keeps_all_it_has(settings, yesterda
 
 
 def test_a_new_database_equals_an_upgraded_one(settings, database):
+    assert not is_current(database)
     prepare(settings, database)
+    assert is_current(database)
     prepare(settings, database)  # a second process finds nothing to do
     require_current(database)
     assert differences(database) == []

@@ -8,7 +8,6 @@ from service.server.database.jobs import FRAMES
 from service.server.jobs import progress as progresses
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.steps import KEYS_FILE
-from service.server.jobs.worker import cache_folder
 from service.server.settings import Settings
 from service.server.storage import layout, objects, scratch
 from service.server.storage.open import SCRATCH
@@ -23,7 +22,7 @@ def test_every_name_is_in_the_docs(tmp_path):
         assert f"{os.path.dirname(layout.intake('PROJECT', new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
     assert f"{os.path.dirname(layout.results('PROJECT', new_id(JOB)))}/ID/…" in TEXT
     for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", KEYS_FILE,
-                 f"{part_files_folder(settings).name}/", f"{cache_folder(settings).name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
+                 f"{part_files_folder(settings).name}/", f"{settings.cache.name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
                  objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
         assert name in TEXT, name
     assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
