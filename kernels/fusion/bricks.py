@@ -1,8 +1,8 @@
-"""Bricks: the parts into which space is cut, each with an array of blocks of 8³ voxels that exist near measured surface alone.
+"""Bricks: the cubes into which space is cut, each with an array of blocks of 8³ voxels that exist near measured surface alone.
 
-A brick has BRICK³ blocks, and one more on its high side along each axis, which its last cells need. Its blocks are found by their index
-in a dense array, so that neighbours are found without a search. Voxels lie on one lattice for all bricks, voxel (i, j, k) at that many
-voxel sizes from the origin.
+A brick has at most BRICK³ blocks, and one more on its high side along each axis, which its last cells need. Its blocks are found by their
+index in a dense array, so that neighbours are found without a search. Voxels lie on one lattice for all bricks, voxel (i, j, k) at that
+many voxel sizes from the origin.
 """
 
 from typing import Any, NamedTuple
@@ -18,14 +18,12 @@ BLOCK = 8
 """Voxels along each side of a block."""
 VOXELS = BLOCK**3
 BRICK = 32
-"""Blocks along each side of a brick."""
-SIDE = BRICK + 1
-"""Blocks along each side of the array of a brick."""
+"""Most blocks along each side of a brick."""
 BRICK_VOXELS = BRICK * BLOCK
-"""Voxels along each side of a brick."""
+"""Most voxels along each side of a brick."""
 VOXEL_BYTES = 27
 """Bytes of one voxel in every array of a brick together: of Volume, and what `extract` counts and numbers."""
-MEMORY_BOUND = SIDE**3 * VOXELS * VOXEL_BYTES
+MEMORY_BOUND = (BRICK + 1) ** 3 * VOXELS * VOXEL_BYTES
 """Most bytes on the device that the voxels of a brick can take, where every block exists; the triangles come on top."""
 
 STEP_BLOCKS = 0.5
@@ -37,24 +35,19 @@ MARGIN_VOXELS = 1.8
 class Blocks(NamedTuple):
     """The blocks of a brick that exist."""
 
-    index: Any  # wp.array [SIDE³] int32, number of each block, −1 where there is none
-    place: Any  # wp.array [B] int32, place of each block in `index`
+    index: Any  # wp.array [side, side, side] int32 by z, y and x, number of each block, −1 where there is none
+    place: Any  # wp.array [B] of vec3i, x, y and z of each block in its brick
     count: int
     corner: tuple[int, int, int]  # lattice coordinates, in voxels, of the lowest voxel
     voxel: float  # metres
     device: str
 
 
-@wp.func
-def block_place(x: int, y: int, z: int) -> int:
-    """Return the place of a block in the array of its brick."""
-    return (z * SIDE + y) * SIDE + x
-
-
 @wp.kernel(enable_backward=False)
 def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtype=View), cells: wp.array(dtype=Cell),
                  # outputs
-                 marked: wp.array(dtype=wp.uint8)):
+                 marked: wp.array3d(dtype=wp.uint8)):
+    side = marked.shape[0]
     cell = cells[first + wp.tid()]
     view = views[cell.view]
     row = (cell.place - view.first) // view.cols
@@ -92,45 +85,45 @@ def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtyp
                 y1 = int(wp.floor((point[1] + margin) / size))
                 z0 = int(wp.floor((point[2] - margin) / size))
                 z1 = int(wp.floor((point[2] + margin) / size))
-                for z in range(wp.max(z0, 0), wp.min(z1, SIDE - 1) + 1):
-                    for y in range(wp.max(y0, 0), wp.min(y1, SIDE - 1) + 1):
-                        for x in range(wp.max(x0, 0), wp.min(x1, SIDE - 1) + 1):
-                            marked[block_place(x, y, z)] = wp.uint8(1)
+                for z in range(wp.max(z0, 0), wp.min(z1, side - 1) + 1):
+                    for y in range(wp.max(y0, 0), wp.min(y1, side - 1) + 1):
+                        for x in range(wp.max(x0, 0), wp.min(x1, side - 1) + 1):
+                            marked[z, y, x] = wp.uint8(1)
 
 
-def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], *, device: str) -> Blocks:
+def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], blocks: int = BRICK, *, device: str) -> Blocks:
     """Find the blocks of a brick that come near a measured surface.
 
     Args:
         views: the range images.
         voxel: side of a voxel, metres.
         corner: lattice coordinates of the lowest voxel of the brick; voxel (0, 0, 0) lies at the origin of the views' coordinates.
+        blocks: along each side of the brick, 1…BRICK.
         device: where the views are.
 
     Convention:
         Waits for the device.
     """
-    marked = wp.zeros(SIDE**3, dtype=wp.uint8, device=device)
+    side = blocks + 1
+    marked = wp.zeros((side, side, side), dtype=wp.uint8, device=device)
     low = wp.vec3(*(float(voxel * c) for c in corner))
     devices.launch(_mark_kernel, len(views.cells), [voxel, low, views.views, views.cells], [marked], device=device, uneven=True)
-    place = np.flatnonzero(marked.numpy()).astype(np.int32)
-    index = np.full(SIDE**3, -1, dtype=np.int32)
-    index[place] = np.arange(len(place), dtype=np.int32)
-    return Blocks(wp.array(index, dtype=int, device=device), wp.array(place, dtype=int, device=device), len(place), corner, voxel, device)
+    z, y, x = np.nonzero(marked.numpy())
+    index = np.full((side, side, side), -1, dtype=np.int32)
+    index[z, y, x] = np.arange(len(x), dtype=np.int32)
+    place = wp.array(np.stack([x, y, z], axis=-1).astype(np.int32), dtype=wp.vec3i, device=device)
+    return Blocks(wp.array(index, dtype=int, device=device), place, len(x), corner, voxel, device)
 
 
 @wp.kernel(enable_backward=False)
-def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int), views: wp.array(dtype=View),
+def _watch_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=wp.vec3i), views: wp.array(dtype=View),
                   farthest: wp.array(dtype=float),
                   # outputs
                   watched: wp.array2d(dtype=wp.int16)):
     i = first + wp.tid()
-    at = place[i]
-    x = at % SIDE
-    y = (at // SIDE) % SIDE
-    z = at // (SIDE * SIDE)
+    at = corner + BLOCK * place[i]
     half = 0.5 * float(BLOCK) * voxel
-    centre = voxel * wp.vec3(float(corner[0] + BLOCK * x), float(corner[1] + BLOCK * y), float(corner[2] + BLOCK * z))
+    centre = voxel * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     centre = centre + wp.vec3(half, half, half)
     radius = 1.7320508 * half
     found = wp.int32(0)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.bricks import BRICK_VOXELS, VOXELS
+from kernels.fusion.bricks import BLOCK, VOXELS
 from kernels.fusion.cube_cases import EDGE_CORNER, MOST_TRIANGLES, cube_table
 from kernels.fusion.integrate import SURFACE, Volume, voxel_number, voxel_position
 
@@ -28,7 +28,7 @@ class Triangles(NamedTuple):
 
 
 @wp.func
-def _known(x: int, y: int, z: int, index: wp.array(dtype=int), state: wp.array(dtype=wp.uint8)) -> int:
+def _known(x: int, y: int, z: int, index: wp.array3d(dtype=int), state: wp.array(dtype=wp.uint8)) -> int:
     """Return the number of a voxel that is measured surface, else −1."""
     number = voxel_number(x, y, z, index)
     if number < 0:
@@ -39,7 +39,7 @@ def _known(x: int, y: int, z: int, index: wp.array(dtype=int), state: wp.array(d
 
 
 @wp.kernel(enable_backward=False)
-def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=int), value: wp.array(dtype=float),
+def _count_kernel(first: int, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int), value: wp.array(dtype=float),
                   state: wp.array(dtype=wp.uint8), triangles: wp.array(dtype=int),
                   # outputs
                   crossed: wp.array(dtype=wp.uint8), vertices: wp.array(dtype=int), cases: wp.array(dtype=wp.uint8),
@@ -59,7 +59,7 @@ def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=
                 flips = wp.where((value[there] < 0.0) != inside, 1, 0)
                 bits = bits | (flips << axis)
                 count += flips
-        if at[0] < BRICK_VOXELS and at[1] < BRICK_VOXELS and at[2] < BRICK_VOXELS:
+        if wp.max(wp.max(at[0], at[1]), at[2]) < (index.shape[0] - 1) * BLOCK:
             for corner in range(8):
                 if case >= 0:
                     number = _known(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), index, state)
@@ -75,7 +75,7 @@ def _count_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=
 
 
 @wp.kernel(enable_backward=False)
-def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(dtype=int), index: wp.array(dtype=int),
+def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int),
                    value: wp.array(dtype=float), variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8),
                    start: wp.array(dtype=int),
                    # outputs
@@ -100,7 +100,7 @@ def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(d
 
 
 @wp.kernel(enable_backward=False)
-def _face_kernel(first: int, place: wp.array(dtype=int), index: wp.array(dtype=int), crossed: wp.array(dtype=wp.uint8),
+def _face_kernel(first: int, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int), crossed: wp.array(dtype=wp.uint8),
                  vertex_start: wp.array(dtype=int), cases: wp.array(dtype=wp.uint8), face_start: wp.array(dtype=int),
                  triangles: wp.array(dtype=int), edges: wp.array(dtype=int), corners: wp.array(dtype=int),
                  # outputs

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.bricks import BLOCK, SIDE, VOXELS, Blocks, block_place, find_watching
+from kernels.fusion.bricks import BLOCK, VOXELS, Blocks, find_watching
 from kernels.fusion.projection import View, image_point, in_front, to_camera, turned_back
 from kernels.fusion.views import ALONG, Cell, ViewArrays, read_view, truncation
 
@@ -45,24 +45,22 @@ class Volume(NamedTuple):
 
 
 @wp.func
-def voxel_position(i: int, place: wp.array(dtype=int)) -> wp.vec3i:
+def voxel_position(i: int, place: wp.array(dtype=wp.vec3i)) -> wp.vec3i:
     """Return the coordinates of a voxel in its brick; voxels of a block follow each other with x the fastest."""
     block = i // VOXELS
     inside = i - block * VOXELS
-    at = place[block]
-    return wp.vec3i((at % SIDE) * BLOCK + inside % BLOCK, ((at // SIDE) % SIDE) * BLOCK + (inside // BLOCK) % BLOCK,
-                    (at // (SIDE * SIDE)) * BLOCK + inside // (BLOCK * BLOCK))
+    return BLOCK * place[block] + wp.vec3i(inside % BLOCK, (inside // BLOCK) % BLOCK, inside // (BLOCK * BLOCK))
 
 
 @wp.func
-def voxel_number(x: int, y: int, z: int, index: wp.array(dtype=int)) -> int:
+def voxel_number(x: int, y: int, z: int, index: wp.array3d(dtype=int)) -> int:
     """Return the number of a voxel of a brick, −1 where its block does not exist."""
     bx = x // BLOCK
     by = y // BLOCK
     bz = z // BLOCK
-    if bx >= SIDE or by >= SIDE or bz >= SIDE:
+    if bx >= index.shape[2] or by >= index.shape[1] or bz >= index.shape[0]:
         return -1
-    block = index[block_place(bx, by, bz)]
+    block = index[bz, by, bx]
     if block < 0:
         return -1
     return block * VOXELS + ((z - bz * BLOCK) * BLOCK + (y - by * BLOCK)) * BLOCK + (x - bx * BLOCK)
@@ -85,7 +83,7 @@ def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.ar
 
 
 @wp.kernel(enable_backward=False)
-def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=int),
+def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=wp.vec3i),
                       watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), cell: wp.array(dtype=int),
                       cells: wp.array(dtype=Cell), clear: wp.array(dtype=float),
                       # outputs

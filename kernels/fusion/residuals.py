@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.bricks import BRICK_VOXELS, Blocks
+from kernels.fusion.bricks import BLOCK, Blocks
 from kernels.fusion.integrate import EMPTY, SURFACE, Volume, voxel_number
 from kernels.fusion.projection import View, line_of_sight, sight_start
 from kernels.fusion.views import Cell, ViewArrays
@@ -17,7 +17,7 @@ around it; or other views saw its place to be empty."""
 
 
 @wp.kernel(enable_backward=False)
-def _residual_kernel(first: int, voxel: float, corner: wp.vec3i, index: wp.array(dtype=int), value: wp.array(dtype=float),
+def _residual_kernel(first: int, voxel: float, corner: wp.vec3i, index: wp.array3d(dtype=int), value: wp.array(dtype=float),
                      state: wp.array(dtype=wp.uint8), views: wp.array(dtype=View), cells: wp.array(dtype=Cell),
                      # outputs
                      distance: wp.array(dtype=float), fate: wp.array(dtype=wp.uint8)):
@@ -38,7 +38,7 @@ def _residual_kernel(first: int, voxel: float, corner: wp.vec3i, index: wp.array
     x = int(wp.floor(point[0])) - corner[0]
     y = int(wp.floor(point[1])) - corner[1]
     z = int(wp.floor(point[2])) - corner[2]
-    if wp.min(wp.min(x, y), z) >= 0 and wp.max(wp.max(x, y), z) < BRICK_VOXELS:
+    if wp.min(wp.min(x, y), z) >= 0 and wp.max(wp.max(x, y), z) < (index.shape[0] - 1) * BLOCK:
         found = wp.int32(FUSED)
         total = float(0.0)
         for k in range(8):

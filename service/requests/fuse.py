@@ -52,5 +52,7 @@ class FuseRequest(FuseOptions, DeviceRequest):
     """A scan-set.json with poses, as `relit register` writes it, or its folder."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder for mesh.ply, asset.usdc and report.json, or site.usda and tiles."""
+    threads: Annotated[int | None, Field(ge=1), Role.MACHINE] = None
+    """Scans that are read at one time; each takes some 200 bytes a pixel. None: one for each core."""
     cache: Annotated[Path | None, Role.MACHINE] = None
     """Folder for fused bricks, from which a run that was interrupted goes on; it may be deleted afterwards. None: a temporary folder."""

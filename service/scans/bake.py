@@ -3,15 +3,15 @@
 import numpy as np
 import warp as wp
 
-from kernels.fusion.bricks import BRICK_VOXELS
 from kernels.fusion.gather import gather
 from kernels.fusion.rasterise import rasterise
 from kernels.fusion.views import upload_views
 from service.asset.mesh import SurfaceMesh
 from service.asset.tangent import vertex_tangents
 from service.asset.textures import BakedImages, TangentNormals
+from service.scans.boxes import boxes
 from service.scans.range_images import ALBEDO, COLOUR, NORMAL, ROUGHNESS, SPECULAR, PreparedScan, channels
-from service.scans.surface import Watching, upload_layers, watching_views
+from service.scans.surface import upload_layers
 from stage.camera import Camera
 from stage.maps import SurfaceMaps
 
@@ -74,25 +74,17 @@ def bake(mesh: SurfaceMesh, scans: list[PreparedScan], names: tuple[str, ...], v
 
 def _gathered(points: np.ndarray, normals: np.ndarray, scans: list[PreparedScan], names: tuple[str, ...], voxel: float,
               device: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the blended layers [n, C] at points, and where a view shows one, brick by brick."""
-    size = BRICK_VOXELS * voxel
-    brick, number = np.unique(np.floor(points / size).astype(np.int64), axis=0, return_inverse=True)
+    """Return the blended layers [n, C] at points, and where a view shows one, box by box."""
     width = channels(names)[names[-1]].stop + (names[-1] != NORMAL)
     values, known = np.zeros((len(points), width), dtype=np.float32), np.zeros(len(points), dtype=bool)
-    order = np.argsort(number.ravel(), kind="stable")
-    bounds = np.searchsorted(number.ravel()[order], np.arange(len(brick) + 1))
-    for k in range(len(brick)):
-        chosen = order[bounds[k]:bounds[k + 1]]
-        low = brick[k] * size
-        watching: list[Watching] = watching_views(scans, low - 4 * voxel, low + size + 4 * voxel)
-        if not watching:
-            continue
-        views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], low, device=device)
-        layers, feathers = upload_layers(watching, device)
-        shown = gather(views, layers, feathers, wp.array((points[chosen] - low).astype(np.float32), dtype=wp.vec3, device=device),
-                       wp.array(normals[chosen].astype(np.float32), dtype=wp.vec3, device=device),
-                       wp.zeros(len(chosen), dtype=float, device=device), vectors=3, slack=SLACK_VOXELS * voxel, device=device)
-        values[chosen], known[chosen] = shown.values.numpy(), shown.weight.numpy() > 0
+    for box in boxes(np.floor(points / voxel).astype(np.int64), scans, voxel, np.zeros(3)):
+        low = np.array(box.corner) * voxel
+        views = upload_views([scan.image.cropped(*window) for _, scan, window in box.watching], low, device=device)
+        layers, feathers = upload_layers(box.watching, device)
+        shown = gather(views, layers, feathers, wp.array((points[box.chosen] - low).astype(np.float32), dtype=wp.vec3, device=device),
+                       wp.array(normals[box.chosen].astype(np.float32), dtype=wp.vec3, device=device),
+                       wp.zeros(len(box.chosen), dtype=float, device=device), vectors=3, slack=SLACK_VOXELS * voxel, device=device)
+        values[box.chosen], known[box.chosen] = shown.values.numpy(), shown.weight.numpy() > 0
     return values, known
 
 

@@ -4,6 +4,7 @@ A piece reads the scans that it needs alone, so that memory is bounded whatever 
 workers can do the pieces of one fusion.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.fusion.bricks import BRICK_VOXELS
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.fuse import FuseRequest, Misplaced
@@ -22,7 +24,7 @@ from service.scans.placing_words import placing_warnings
 from service.scans.prepared_scans import PreparedScans, ScanSummary
 from service.scans.range_images import WIDTHS, PreparedScan
 from service.scans.stored_bricks import packed_brick, unpacked_brick
-from service.scans.surface import BrickSurface, box_of, bricks_of, fuse_brick, origin_of, watching_views
+from service.scans.surface import BrickSurface, fuse_brick, origin_of, places_near
 from service.solve.sharing import digest, kind_of_worker
 from stage.packed_arrays import packed, unpacked
 from stage.scans.records import read_scan_set
@@ -76,9 +78,10 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
 
 def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:
     numbers = [f"{number:05d}" for number in range(len(scans))]
+    threads = request.threads or os.cpu_count() or 1
     timings.stage("read", len(scans))
     content = pieces.do("read", numbers, lambda piece: scans.summary(int(piece)).packed(), follows_from=request.voxel_m,
-                        advance=timings.advance)
+                        threads=threads, advance=timings.advance)
     summaries = [ScanSummary.unpacked(content(piece)) for piece in numbers]
     names = tuple(name for name in WIDTHS if any(name in summary.names for summary in summaries))
     voxel = request.voxel_m or _voxel(summaries)
@@ -100,19 +103,18 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     timings.stage("bricks", len(used))
     origin = origin_of(np.stack([summaries[number].centre for number in used]), voxel)
     content = pieces.do("bricks", [numbers[number] for number in used],
-                        lambda piece: packed({"bricks": bricks_of(scans.prepared(int(piece)), origin, voxel)}),
-                        follows_from=(known, voxel, tuple(used)), advance=timings.advance)
-    places = np.unique(np.concatenate([unpacked(content(numbers[number]))["bricks"] for number in used]), axis=0)
+                        lambda piece: packed({"places": places_near(scans.prepared(int(piece)), origin, voxel)}),
+                        follows_from=(known, voxel, tuple(used)), threads=threads, advance=timings.advance)
+    near = np.unique(np.concatenate([unpacked(content(numbers[number]))["places"] for number in used]), axis=0)
+    places, of_brick = np.unique(near // BRICK_VOXELS, axis=0, return_inverse=True)
     outlines = [summaries[number].outline() for number in used]
 
     def fused(piece: str) -> bytes:
-        brick = places[int(piece)]
-        watching = watching_views(outlines, *box_of(brick, voxel, origin))
-        seen = [each._replace(scan=scans.with_layers(used[each.number], names)) for each in watching]
-        return packed_brick(fuse_brick(brick, seen, names, voxel, origin, device=device))
+        return packed_brick(fuse_brick(near[of_brick.ravel() == int(piece)], outlines, lambda place: scans.with_layers(used[place], names),
+                                       names, voxel, origin, device=device))
 
     timings.stage("fuse", max(len(places), 1))
-    content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), places),
+    content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
                         advance=timings.advance)
     return FusedBricks(summaries, placings, used, names, voxel, places, lambda number: unpacked_brick(content(f"{number:06d}")),
                        lambda place: scans.with_layers(used[place], names), warnings)

@@ -76,7 +76,7 @@ class PreparedScans:
         self._file, self._scan_set, self._folder, self._voxel_m = file, scan_set, folder, voxel_m
         self._prepared: dict[int, PreparedScan] = {}
         self._complete: dict[int, PreparedScan] = {}
-        self._lock = threading.Lock()
+        self._locks = [threading.Lock() for _ in scan_set.scans]
 
     def __len__(self) -> int:
         """Return the number of scans."""
@@ -88,7 +88,7 @@ class PreparedScans:
         Raises:
             RequestError: it has no pose, is no range image, or has too few pixels.
         """
-        with self._lock:
+        with self._locks[number]:
             if number not in self._prepared:
                 self._prepared[number] = self._read(number)
             return self._prepared[number]
@@ -96,7 +96,7 @@ class PreparedScans:
     def with_layers(self, number: int, names: tuple[str, ...]) -> PreparedScan:
         """Return a scan with these layers, of which those that it lacks are 0."""
         prepared = self.prepared(number)
-        with self._lock:
+        with self._locks[number]:
             if number not in self._complete:
                 self._complete[number] = with_layers(prepared, names, self._folder / str(number))
             return self._complete[number]

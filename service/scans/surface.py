@@ -1,11 +1,13 @@
 """The surface of many range images, brick by brick, so that memory grows with the views that see one brick, not with the site.
 
-The arrays of the scans lie in files that are mapped into memory. A brick takes from each view the window of pixels in which the brick can
-lie. Bricks compute the lattice alike, so that their triangles share vertices where they meet. What the views show at such a vertex is
-blended by the angle to the triangles around it, of which a brick has its own alone: the first brick that has the vertex decides.
+The arrays of the scans lie in files that are mapped into memory. A brick is computed in boxes, each of which takes from each view the
+window of pixels in which the box can lie. Boxes compute the lattice alike, so that their triangles share vertices where they meet. What the
+views show at such a vertex is blended by the angle to the triangles around it, of which a box has its own alone: the first box that has the
+vertex decides.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,24 +20,15 @@ from kernels.fusion.integrate import integrate
 from kernels.fusion.residuals import FUSED, LOST, REFUSED, residuals
 from kernels.fusion.views import LEAST_COSINE, TRUNCATION_SIGMAS, TRUNCATION_VOXELS, ViewArrays, corners_of, upload_views
 from service.asset.mesh import vertex_normals
+from service.scans.boxes import LEAST_VOXELS, Box, Watching, boxes
 from service.scans.range_images import NORMAL, PreparedScan, channels
 from stage.frames import pixel_centres
 
-WINDOW_PIXELS = 4
-"""Pixels around the window of a view in which a brick can lie."""
 HISTOGRAM_STEP, HISTOGRAM_END = 0.05, 20.0
 """Width and end of the bins, in standard deviations, in which residuals are counted."""
 PHOTOMETRIC = 0.5
 """Length of the blended normal from which on it is mostly photometric: normals fitted to depths count a hundredth in it."""
 NO_QUADS = np.zeros((0, 4), dtype=np.int32)
-
-
-class Watching(NamedTuple):
-    """A scan that can see a box, and the part of its image in which the box can lie."""
-
-    number: int
-    scan: PreparedScan
-    window: tuple[int, int, int, int]  # first and last row, first and last column
 
 
 class Surface(NamedTuple):
@@ -123,14 +116,15 @@ def origin_of(centres: np.ndarray, voxel: float) -> np.ndarray:
     return np.asarray(np.round(centres.mean(axis=0) / voxel) * voxel)
 
 
-def fuse_brick(brick: np.ndarray, watching: list[Watching], names: tuple[str, ...], voxel: float, origin: np.ndarray, *, device: str
-               ) -> BrickSurface:
+def fuse_brick(places: np.ndarray, outlines: list[PreparedScan], scan: Callable[[int], PreparedScan], names: tuple[str, ...],
+               voxel: float, origin: np.ndarray, *, device: str) -> BrickSurface:
     """Fuse what lies in a brick.
 
     Args:
-        brick: its place [3], in bricks from the origin.
-        watching: the scans that can see `box_of` the brick.
-        names: their layers.
+        places: lattice coordinates [n, 3], in voxels, of the lowest voxels of the smallest boxes of the brick that surface comes near.
+        outlines: of all scans, by which it is known which can see a box.
+        scan: returns a scan by its place in `outlines`.
+        names: the layers of the scans.
         voxel: side of a voxel, metres.
         origin: of the lattice, [3] metres.
         device: where to compute.
@@ -138,50 +132,54 @@ def fuse_brick(brick: np.ndarray, watching: list[Watching], names: tuple[str, ..
     Convention:
         The surface lies at the mean of the measured distances weighted by the inverse of their variances.
     """
-    corner = (int(brick[0]) * BRICK_VOXELS, int(brick[1]) * BRICK_VOXELS, int(brick[2]) * BRICK_VOXELS)
+    parts = (_fuse_box(box, [each._replace(scan=scan(each.number)) for each in box.watching], names, voxel, origin, device)
+             for box in boxes(places, outlines, voxel, origin))
+    return _welded(chain([_nothing(names)], parts), LEAST_VOXELS)
+
+
+def _nothing(names: tuple[str, ...]) -> BrickSurface:
+    """Return the surface of a brick in which there is none."""
+    width = channels(names)[names[-1]].stop + (names[-1] != NORMAL) - channels(names)[NORMAL].stop
+    return BrickSurface(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.uint16), np.zeros(0, bool),
+                        np.zeros((0, width), np.float32), np.zeros((0, 4), np.int32), np.zeros((0, 3), np.int32), {}, 0)
+
+
+def _fuse_box(box: Box, watching: list[Watching], names: tuple[str, ...], voxel: float, origin: np.ndarray, device: str) -> BrickSurface:
+    """Fuse what lies in a box, as the scans that can see it measured it."""
     views = upload_views([scan.image.cropped(*window) for _, scan, window in watching], origin, device=device)
-    found = find_blocks(views, voxel, corner, device=device)
+    found = find_blocks(views, voxel, box.corner, box.blocks, device=device)
     volume = integrate(found, views)
     triangles = extract(volume)
     distance, fate = residuals(volume, views)
     tallies = {}
     for place, (number, scan, (top, bottom, left, right)) in enumerate(watching):
         tally, part = Tally(), slice(views.first_cell[place], views.first_cell[place + 1])
-        box = slice(top, bottom - 1), slice(left, right - 1)
-        tally.add(distance[part], np.asarray(scan.image.sigma[box])[np.asarray(scan.image.cell[box])], fate[part])
+        inner = slice(top, bottom - 1), slice(left, right - 1)
+        tally.add(distance[part], np.asarray(scan.image.sigma[inner])[np.asarray(scan.image.cell[inner])], fate[part])
         tallies[number] = tally.numbers()
-    width = channels(names)[names[-1]].stop + (names[-1] != NORMAL) - channels(names)[NORMAL].stop
-    values, normals, seen = np.zeros((0, width), np.float32), np.zeros((0, 3), np.float32), np.zeros(0, np.uint16)
-    photometric = np.zeros(0, dtype=bool)
-    if len(triangles.faces):
-        values, normals, photometric, seen = _shown(triangles, watching, views, names, voxel, device)
+    if not len(triangles.faces):
+        return _nothing(names)._replace(tallies=tallies, blocks=found.count)
+    values, normals, photometric, seen = _shown(triangles, watching, views, names, voxel, device)
     return BrickSurface(triangles.points.astype(np.float64) + origin, normals, triangles.sigma, seen, photometric, values, triangles.edge,
                         triangles.faces, tallies, found.count)
 
 
-def box_of(brick: np.ndarray, voxel: float, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest corner [3], metres, of what the views of a brick must be asked for."""
-    low = origin + np.asarray(brick) * (BRICK_VOXELS * voxel)
-    return low - 4 * voxel, low + (BRICK_VOXELS + 12) * voxel
-
-
 def joined_surface(bricks: Iterable[BrickSurface], scans: int) -> Surface:
     """Return the surfaces of bricks, in their order, as one; `scans` is the number of scans."""
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in (*VERTEX, "edge", "faces")}
+    total = 0
+
+    def counted() -> Iterator[BrickSurface]:
+        nonlocal total
+        for brick in bricks:
+            total += 1
+            yield brick
+
+    joined = _welded(counted(), BRICK_VOXELS)
     tallies = [Tally() for _ in range(scans)]
-    count = blocks = total = 0
-    for brick in bricks:
-        for number, numbers in brick.tallies.items():
-            tallies[number].add_numbers(numbers)
-        blocks, total = blocks + brick.blocks, total + 1
-        if not len(brick.faces) and count:
-            continue
-        for name in parts:
-            parts[name].append(getattr(brick, name) if name != "faces" else brick.faces.astype(np.int64) + count)
-        count += len(brick.points)
-    kept, faces = _welded(np.concatenate(parts.pop("edge")), parts.pop("faces"))
-    joined = {name: np.concatenate(parts.pop(name))[kept] for name in VERTEX}  # one after another, so that few exist twice
-    return Surface(**joined, faces=faces, tallies=tallies, bricks=total, blocks=blocks)
+    for number, numbers in joined.tallies.items():
+        tallies[number].add_numbers(numbers)
+    return Surface(**{name: getattr(joined, name) for name in VERTEX}, faces=joined.faces, tallies=tallies, bricks=total,
+                   blocks=joined.blocks)
 
 
 def centre_of(scan: PreparedScan) -> np.ndarray:
@@ -206,9 +204,10 @@ def world_points(scan: PreparedScan) -> tuple[np.ndarray, np.ndarray]:
     return points @ world[:3, :3].T + world[:3, 3], used
 
 
-def bricks_of(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarray:
-    """Return the bricks [n, 3] that the measured surface of a scan comes near."""
-    size = BRICK_VOXELS * voxel
+def places_near(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarray:
+    """Return the smallest boxes that the measured surface of a scan comes near, as the lattice coordinates [n, 3] of their lowest
+    voxels."""
+    size = LEAST_VOXELS * voxel
     points, used = world_points(scan)
     if len(points) == 0:
         return np.zeros((0, 3), dtype=np.int64)
@@ -220,31 +219,8 @@ def bricks_of(scan: PreparedScan, origin: np.ndarray, voxel: float) -> np.ndarra
     base, count = low.min(axis=0), np.ptp(low, axis=0) + 1
     numbers = np.ravel_multi_index(tuple(np.concatenate([low - base, high - low], axis=1).T), (*count, *[beyond] * 3))
     ranges = np.stack(np.unravel_index(np.unique(numbers), (*count, *[beyond] * 3)), axis=1)  # few, so that each is looked at alone
-    return np.unique(np.concatenate([base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)]
-                                     for step in np.ndindex(*[beyond] * 3)]), axis=0)
-
-
-def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int, int, int, int] | None:
-    """Return the first and last rows and columns in which a box can lie, or None where the view cannot see it."""
-    corners = np.array([[(low, high)[side][axis] for axis, side in enumerate(sides)] for sides in np.ndindex(2, 2, 2)])
-    there = corners @ scan.image.camera_from_world[:3, :3].T + scan.image.camera_from_world[:3, 3]
-    rows, cols = scan.image.depth.shape
-    if not scan.image.orthographic:
-        if (there[:, 2] >= 0).all():
-            return None
-        if (there[:, 2] > -1e-3 * np.abs(there).max()).any():
-            return 0, rows, 0, cols
-    u, v = scan.camera.image_coordinates(there)
-    first_row, last_row = int(np.floor(v.min())) - WINDOW_PIXELS, int(np.ceil(v.max())) + WINDOW_PIXELS
-    first_col, last_col = int(np.floor(u.min())) - WINDOW_PIXELS, int(np.ceil(u.max())) + WINDOW_PIXELS
-    box = max(first_row, 0), min(last_row, rows), max(first_col, 0), min(last_col, cols)
-    return box if box[1] - box[0] > 1 and box[3] - box[2] > 1 else None
-
-
-def watching_views(scans: list[PreparedScan], low: np.ndarray, high: np.ndarray) -> list[Watching]:
-    """Return the scans that can see a box of the world from its lowest to its highest corner, [3] metres."""
-    found = ((number, scan, _window(scan, low, high)) for number, scan in enumerate(scans))
-    return [Watching(number, scan, window) for number, scan, window in found if window is not None]
+    return LEAST_VOXELS * np.unique(np.concatenate([base + (ranges[:, :3] + step)[(np.array(step) <= ranges[:, 3:]).all(axis=1)]
+                                                    for step in np.ndindex(*[beyond] * 3)]), axis=0)
 
 
 def upload_layers(watching: list[Watching], device: str) -> tuple[Any, Any]:
@@ -273,12 +249,33 @@ def _shown(triangles: Any, watching: list[Watching], views: ViewArrays, names: t
     return values[:, place.stop:], normals, length[:, 0] > PHOTOMETRIC, shown.seen.numpy().astype(np.uint16)
 
 
-def _welded(edge: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which vertices are kept, [V] bool, and the faces with their numbers, [F, 3] int32: those of one edge of the lattice become
-    one."""
+def _welded(parts: Iterable[BrickSurface], side: int) -> BrickSurface:
+    """Return surfaces, in their order, as one. Vertices of one edge of the lattice become one, that of the first part; it lies where the
+    coordinates of the edge are multiples of `side`, in voxels: others lie inside of one part."""
+    held: dict[str, list[np.ndarray]] = {name: [] for name in (*VERTEX, "edge", "faces")}
+    tallies: dict[int, np.ndarray] = {}
+    count = blocks = 0
+    for part in parts:
+        for number, numbers in part.tallies.items():
+            tallies[number] = tallies[number] + numbers if number in tallies else numbers
+        blocks += part.blocks
+        if not len(part.faces) and held["faces"]:
+            continue
+        for name, arrays in held.items():
+            arrays.append(getattr(part, name) if name != "faces" else part.faces.astype(np.int64) + count)
+        count += len(part.points)
+    edge = np.concatenate(held.pop("edge"))
+    kept, renumbered = _shared_once(edge, side)
+    faces = np.concatenate([renumbered[each] for each in held.pop("faces")])
+    joined = {name: np.concatenate(held.pop(name))[kept] for name in VERTEX}  # one after another, so that few exist twice
+    return BrickSurface(**joined, edge=edge[kept], faces=faces, tallies=tallies, blocks=blocks)
+
+
+def _shared_once(edge: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return which vertices of lattice edges [V, 4] are kept, [V] bool, and by which of the kept ones each is replaced, [V] int32."""
     kept = np.ones(len(edge), dtype=bool)
     owner = np.arange(len(edge), dtype=np.int32)
-    shared = np.flatnonzero((edge[:, :3] % BRICK_VOXELS == 0).any(axis=1))  # others lie inside of one brick
+    shared = np.flatnonzero((edge[:, :3] % side == 0).any(axis=1))
     if len(shared):
         low, size = edge[shared].min(axis=0), np.ptp(edge[shared], axis=0).astype(np.int64) + 1
         names = np.ravel_multi_index(tuple((edge[shared] - low).T), tuple(size))
@@ -286,5 +283,4 @@ def _welded(edge: np.ndarray, faces: list[np.ndarray]) -> tuple[np.ndarray, np.n
         kept[shared] = False
         kept[shared[first]] = True
         owner[shared] = shared[first][number.ravel()]
-    renumbered = (np.cumsum(kept, dtype=np.int32) - 1)[owner]
-    return kept, np.concatenate([renumbered[each] for each in faces])
+    return kept, (np.cumsum(kept, dtype=np.int32) - 1)[owner]

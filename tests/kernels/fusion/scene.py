@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from kernels.fusion.bricks import BRICK_VOXELS, find_blocks
+from kernels.fusion.bricks import BLOCK, BRICK, find_blocks
 from kernels.fusion.extract import extract
 from kernels.fusion.integrate import integrate
 from kernels.fusion.views import RangeImage, upload_views
@@ -30,15 +30,15 @@ def range_image(shot: Shot, sigma: float, *, world_from_camera=None) -> RangeIma
     return RangeImage(shot.depth, sigmas, normal, cell, clear, np.linalg.inv(pose), (shot.focal, shot.focal), (cols / 2, rows / 2))
 
 
-def fuse(images: list[RangeImage], voxel: float, low, high, *, device: str):
-    """Points, standard deviations and faces of the surface within a box, welded over all bricks."""
-    size = BRICK_VOXELS * voxel
+def fuse(images: list[RangeImage], voxel: float, low, high, *, blocks: int = BRICK, device: str):
+    """Points, standard deviations and faces of the surface within a box, welded over all bricks of so many blocks."""
+    size = blocks * BLOCK * voxel
     first, last = (np.floor(np.array(corner) / size).astype(int) for corner in (low, high))
     views = upload_views(images, np.zeros(3), device=device)
     points, sigmas, keys, faces, count = [], [], [], [], 0
     for brick in np.ndindex(*(last - first + 1)):
-        corner = (np.array(brick) + first) * BRICK_VOXELS
-        found = extract(integrate(find_blocks(views, voxel, tuple(map(int, corner)), device=device), views))
+        corner = (np.array(brick) + first) * (blocks * BLOCK)
+        found = extract(integrate(find_blocks(views, voxel, tuple(map(int, corner)), blocks, device=device), views))
         points.append(found.points)
         sigmas.append(found.sigma)
         keys.append(found.edge)

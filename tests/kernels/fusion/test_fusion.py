@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.fusion.bricks import BLOCK, BRICK_VOXELS, SIDE, VOXELS, Blocks, find_blocks
+from kernels.fusion.bricks import BLOCK, BRICK_VOXELS, VOXELS, Blocks, find_blocks
 from kernels.fusion.extract import extract
 from kernels.fusion.integrate import SURFACE, Volume, integrate
 from kernels.fusion.views import upload_views
@@ -36,10 +36,10 @@ def test_every_pattern_of_signs_gives_a_closed_surface(device):
     for axis in range(3):
         for end in (0, -1):
             np.moveaxis(values, axis, 0)[end] = 1.0
-    index = np.full(SIDE**3, -1, dtype=np.int32)
-    index[0] = 0
-    volume = Volume(Blocks(wp.array(index, dtype=int, device=device), wp.zeros(1, dtype=int, device=device), 1, (0, 0, 0), 1.0, device),
-                    wp.array(values.ravel(), dtype=float, device=device), wp.zeros(VOXELS, dtype=float, device=device),
+    index = np.full((2, 2, 2), -1, dtype=np.int32)
+    index[0, 0, 0] = 0
+    blocks = Blocks(wp.array(index, dtype=int, device=device), wp.zeros(1, dtype=wp.vec3i, device=device), 1, (0, 0, 0), 1.0, device)
+    volume = Volume(blocks, wp.array(values.ravel(), dtype=float, device=device), wp.zeros(VOXELS, dtype=float, device=device),
                     wp.full(VOXELS, SURFACE, dtype=wp.uint8, device=device))
     found = extract(volume)
     assert edge_counts(found.faces).tolist() == [0, 0, len(found.faces) * 3 // 2]
@@ -78,6 +78,8 @@ def test_bricks_meet_without_seams_and_crops_change_nothing(device, sphere_shots
     one = extract(integrate(find_blocks(views, voxel, (-64, -64, -64), device=device), views))
     parts, _, faces = fuse(images, voxel, *BOX, device=device)
     assert len(faces) == len(one.faces) and np.array_equal(parts, one.points[np.lexsort(one.edge.T[::-1])])
+    small, _, small_faces = fuse(images, voxel, *BOX, blocks=4, device=device)  # 27 boxes that the sphere comes into
+    assert np.array_equal(small, parts) and len(small_faces) == len(faces)
     cropped = upload_views([image.cropped(10, 110, 5, 115) for image in images], np.zeros(3), device=device)  # all of the sphere
     again = extract(integrate(find_blocks(cropped, voxel, (-64, -64, -64), device=device), cropped))
     assert np.array_equal(again.points, one.points)
