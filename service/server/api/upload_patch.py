@@ -118,6 +118,7 @@ class UploadPatch:
         if self._part is not None:
             self._part.close()
             being_written.discard(self._row["id"])
+        vars(self).pop("writer", None)  # it refers to this patch by `_save`: both would wait for the garbage collector
 
     def _save(self, at: int) -> None:
         self._saved = at

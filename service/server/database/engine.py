@@ -66,14 +66,14 @@ class Database:
             time.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
 
-    def rows(self, query: "sa.Select[Any]") -> list[sa.RowMapping]:
-        """Return all rows of a query."""
+    def rows(self, query: "sa.Select[Any]", **parameters: Any) -> list[sa.RowMapping]:
+        """Return all rows of a query, with the values of its `bindparam`s."""
         with self.engine.connect() as connection:
-            return list(connection.execute(query).mappings())
+            return list(connection.execute(query, parameters).mappings())
 
-    def row(self, query: "sa.Select[Any]") -> sa.RowMapping | None:
-        """Return the first row of a query; None: there is none."""
-        found = self.rows(query.limit(1))
+    def row(self, query: "sa.Select[Any]", **parameters: Any) -> sa.RowMapping | None:
+        """Return the first row of a query, as `rows` does; None: there is none."""
+        found = self.rows(query.limit(1), **parameters)
         return found[0] if found else None
 
     def check(self) -> None:

@@ -23,6 +23,12 @@ PATIENCE_S = 600.0
 """How long a change by a worker waits for a database that does not answer."""
 LATELY_S = 60.0
 """How long `watched` returns a job after it ended; the clocks of workers may differ by this much."""
+OF_IDENTIFIERS = sa.select(jobs).where(jobs.c.id.in_(sa.bindparam("jobs", expanding=True)))
+WATCHED = sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(sa.or_(
+    jobs.c.id.in_(sa.bindparam("topics", expanding=True)),
+    sa.and_(jobs.c.project.in_(sa.bindparam("topics", expanding=True)),
+            sa.or_(jobs.c.state.in_(ACTIVE), jobs.c.updated_at > sa.bindparam("since")))))
+"""Queries for the streams of events, made once, as those of `keys` are."""
 
 
 class Claim(NamedTuple):
@@ -106,14 +112,12 @@ def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
         database: of the service.
         topics: identifiers of jobs, and projects: of a project, the jobs that have not ended or ended lately.
     """
-    lately = jobs.c.state.in_(ACTIVE) | (jobs.c.updated_at > time.time() - LATELY_S)
-    return database.rows(sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(
-        jobs.c.id.in_(topics) | (jobs.c.project.in_(topics) & lately)))
+    return database.rows(WATCHED, topics=list(topics), since=time.time() - LATELY_S)
 
 
 def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.RowMapping]:
     """Return jobs by their identifiers."""
-    return {row["id"]: row for row in database.rows(sa.select(jobs).where(jobs.c.id.in_(identifiers)))}
+    return {row["id"]: row for row in database.rows(OF_IDENTIFIERS, jobs=list(identifiers))}
 
 
 def count_queued(connection: sa.Connection, project: str, key: str | None) -> int:

@@ -22,6 +22,11 @@ ORDER = list(Scope)
 DAY_S = 86_400.0
 USED_S = 60.0
 """Seconds to which the last use of a key is recorded, so that not every request writes."""
+VALID = sa.and_(keys.c.revoked_at.is_(None), sa.or_(keys.c.expires_at.is_(None), keys.c.expires_at > sa.bindparam("now")))
+FOUND = sa.select(keys).where(keys.c.id == sa.bindparam("key"), VALID)
+STILL_VALID = sa.select(keys.c.id).where(keys.c.id.in_(sa.bindparam("keys", expanding=True)), VALID)
+"""Conditions and queries for every request and every stream of events, made once: parts of SQLAlchemy's expressions refer to each other,
+and those of each request would wait for the garbage collector."""
 
 
 class Caller(NamedTuple):
@@ -60,7 +65,7 @@ def insert(connection: sa.Connection, wanted: NewKey) -> str:
 def find(database: Database, presented: str) -> Caller | None:
     """Return the caller to whom a key belongs; None: the key is unknown, was revoked or has expired. Record that it was used."""
     identifier, _, secret = presented.partition(".")
-    row = database.row(sa.select(keys).where(keys.c.id == identifier, _valid()))
+    row = database.row(FOUND, key=identifier, now=time.time())
     if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
         return None
     now = time.time()
@@ -71,7 +76,7 @@ def find(database: Database, presented: str) -> Caller | None:
 
 def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
     """Return those of the keys that have neither been revoked nor expired."""
-    return {row["id"] for row in database.rows(sa.select(keys.c.id).where(keys.c.id.in_(identifiers), _valid()))}
+    return {row["id"] for row in database.rows(STILL_VALID, keys=list(identifiers), now=time.time())}
 
 
 def revoke(database: Database, identifier: str) -> bool:
@@ -94,10 +99,6 @@ def listing(database: Database, project: str | None = None) -> list[sa.RowMappin
     query = sa.select(keys.c.id, keys.c.project, keys.c.name, keys.c.scope, keys.c.created_at, keys.c.revoked_at,
                       keys.c.expires_at, keys.c.used_at)
     return database.rows((query if project is None else query.where(keys.c.project == project)).order_by(keys.c.created_at))
-
-
-def _valid() -> "sa.ColumnElement[bool]":
-    return keys.c.revoked_at.is_(None) & (keys.c.expires_at.is_(None) | (keys.c.expires_at > time.time()))
 
 
 def _digest(secret: str) -> str:
