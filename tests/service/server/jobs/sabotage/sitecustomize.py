@@ -4,17 +4,16 @@ kill  end the process by SIGKILL, as want of memory would      hang  stand still
 
 With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
 has begun one: TOGETHER is the folder in which each leaves a file.
+
+Only the process of a worker is changed: the others that begin with it, which watch it, do no jobs and are not kept waiting for its modules.
 """
 
 import os
 import random
 import signal
+import sys
 import threading
 import time
-
-import service.server.jobs.steps as steps
-
-relight = steps._relight
 
 
 def kill(*_):
@@ -41,10 +40,15 @@ def slow(job, request, only, context, progress):
     relight(job, request, only, context, Slow(progress))
 
 
-if "SABOTAGE" in os.environ:
+is_worker = "--multiprocessing-fork" in sys.orig_argv  # as Python calls a process that multiprocessing starts
+
+if is_worker and "SABOTAGE" in os.environ:
+    import service.server.jobs.steps as steps
+
+    relight = steps._relight
     steps._relight = {"kill": kill, "hang": hang, "slow": slow}[os.environ["SABOTAGE"]]
 
-if "PIECES" in os.environ:
+if is_worker and "PIECES" in os.environ:
     from pathlib import Path
 
     import service.solve.batches as batches
