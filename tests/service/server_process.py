@@ -1,5 +1,6 @@
 """A real server process for tests: `relit serve` on a free port, its log in a file."""
 
+import json
 import os
 import re
 import signal
@@ -9,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx2
 
@@ -20,6 +22,17 @@ class Server:
 
     def __init__(self, process: subprocess.Popen[str], url: str, data: Path, log: Path) -> None:
         self.process, self.url, self.data, self.log = process, url, data, log
+        self._lines: list[dict[str, Any]] = []
+        self._log_read = 0
+
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of the log, of which each is JSON; each is parsed once."""
+        with open(self.log, "rb") as log:
+            log.seek(self._log_read)
+            whole, end, _ = log.read().rpartition(b"\n")
+        self._log_read += len(whole + end)
+        self._lines += [json.loads(line) for line in whole.splitlines()]
+        return self._lines
 
     def client(self, key: str | None = None) -> httpx2.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}

@@ -2,76 +2,16 @@
 
 import os
 import time
-from pathlib import Path
 
-import pytest
 import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
-from service.requests.jobs import ExportJob, SolveJob
-from service.server import housekeeping
+from service.requests.jobs import ExportJob
 from service.server.database import idempotency, intakes, jobs, tables, uploads, workers
-from service.server.database.engine import connect
-from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S, Housekeeper
-from service.server.jobs.queue import JobQueue, prepare
-from service.server.settings import Settings
+from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S
 from service.server.storage import layout
-from service.server.storage.open import open_storage
 from service.server.storage.part_files import PartFile, part_files_folder
-
-DAYS = 30.0
-PROJECT = "larch"
-
-
-class House:
-    """A service without processes, and its housekeeper."""
-
-    def __init__(self, data: Path, **settings: object) -> None:
-        self.settings = Settings(data=data, **settings)
-        self.database = connect(self.settings.sqlalchemy_url)
-        prepare(self.settings, self.database)
-        self.storage, self.queue = open_storage(self.settings), JobQueue(self.database)
-        self.now, self.jumped = time.time(), 0.0
-        self.keeper = Housekeeper(self.settings, self.database, self.storage, self.queue, clock=lambda: self.now,
-                                  monotonic=lambda: self.now - self.jumped)
-
-    def capture(self, kind: str = CAPTURE) -> str:
-        made = new_id(kind)
-        self.database.transact(lambda connection: intakes.insert(
-            connection, identifier=made, project=PROJECT, kind=kind, name="x", folder=None))
-        return made
-
-    def job(self, state: str = jobs.SUCCEEDED, *, inputs: tuple[str, ...] = (), request=None) -> str:
-        request = request or SolveJob(kind="solve", capture=inputs[0] if inputs else new_id(CAPTURE))
-        made = self.database.transact(lambda connection: self.queue.submit(
-            connection, project=PROJECT, key=None, request=request, chunk_frames=8, inputs=list(inputs)))
-        self.database.transact(lambda connection: connection.execute(tables.jobs.update().where(tables.jobs.c.id == made).values(
-            state=state, finished_at=self.now if state in jobs.ENDED else None)))
-        (self.results(made)).mkdir(parents=True)
-        (self.results(made) / "maps.exr").write_bytes(b"maps")
-        return made
-
-    def results(self, job: str) -> Path:
-        return self.settings.data / layout.results(PROJECT, job)
-
-    def cache(self, capture: str, size: int = 1000) -> Path:
-        folder = self.settings.data / "cache" / capture
-        folder.mkdir(parents=True)
-        (folder / "stack.npy").write_bytes(b"\0" * size)
-        return folder
-
-    def workflows(self) -> set[str]:
-        """What the queue knows, in its own table."""
-        table = "workflow_status" if self.database.is_sqlite else "dbos.workflow_status"
-        return {row["workflow_uuid"] for row in self.database.rows(sa.select(sa.text("workflow_uuid")).select_from(sa.text(table)))}
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def house(request, tmp_path):
-    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
-    made = House(tmp_path / "data", retention_days=DAYS, upload_hours=48, database_url=url)
-    yield made
-    made.database.close()
+from tests.service.server.house import DAYS, PROJECT, House
 
 
 def test_old_jobs_go_with_their_results_and_their_place_in_the_queue(house):
@@ -222,18 +162,6 @@ def test_stacks_that_a_killed_worker_began_are_removed(house):
     assert not begun.exists() and (begun.parent / "stack.npy").exists()
 
 
-def test_one_piece_that_fails_does_not_stop_the_others(house, monkeypatch):
-    def fail(*_arguments: object) -> None:
-        raise OSError("no such disk")
-
-    old = house.job()
-    house.now += 2 * DAYS * DAY_S
-    monkeypatch.setattr(type(house.storage), "remove", fail)
-    capture = house.cache(new_id(CAPTURE))
-    house.keeper.round()
-    assert not capture.exists() and jobs.find(house.database, old) is None
-
-
 def test_the_thread_makes_a_round_at_once_and_ends_when_it_is_asked(house):
     folder = house.cache(new_id(CAPTURE))
     house.keeper.start()
@@ -277,82 +205,3 @@ def test_marks_of_removed_jobs_do_not_stay_for_ever(tmp_path):
     house.keeper.round()
     assert not marks[0].exists()
     house.database.close()
-
-
-def test_one_bad_row_stops_neither_the_other_rows_nor_the_thread(house, monkeypatch):
-    """As a value in a request that PostgreSQL cannot read did, for all projects and for good; it is logged once."""
-    bad, good = house.job(), house.job()
-    house.now += 2 * DAYS * DAY_S
-    forget = housekeeping._forget
-
-    def fail(connection, job):
-        if job == bad:
-            raise ValueError("no such character")
-        return forget(connection, job)
-
-    monkeypatch.setattr(housekeeping, "_forget", fail)
-    logged = []
-    monkeypatch.setattr(housekeeping.logger, "error", lambda event, **fields: logged.append((event, fields["piece"])))
-    stale = house.cache(new_id(CAPTURE))
-    house.keeper.round()
-    house.keeper.round()
-    assert jobs.find(house.database, bad) and jobs.find(house.database, good) is None and not stale.exists()
-    assert logged == [("housekeeping failed", bad)]
-
-
-def jump(house, seconds):
-    """The clock is set, and no time passes."""
-    house.now += seconds
-    house.jumped += seconds
-
-
-def test_a_clock_that_jumps_removes_nothing_at_once(house):
-    job = house.job()
-    house.keeper.round()
-    jump(house, 20 * 365 * DAY_S)
-    for hours in (0, 10, 23):
-        house.now += hours * HOUR_S / 2
-        house.keeper.round()
-        assert house.results(job).is_dir() and jobs.find(house.database, job) is not None
-    jump(house, -20 * 365 * DAY_S)  # the operator has seen it
-    house.keeper.round()
-    house.now += 0.9 * DAYS * DAY_S  # as time passes, and nobody touches the clock
-    house.keeper.round()
-    assert house.results(job).is_dir()
-    house.now += 0.1 * DAYS * DAY_S
-    house.keeper.round()
-    assert not house.results(job).exists() and jobs.find(house.database, job) is None
-
-
-def test_a_clock_that_stays_ahead_is_believed_after_a_day(house):
-    job = house.job()
-    house.keeper.round()
-    jump(house, 60 * DAY_S)
-    house.keeper.round()
-    house.now += 0.9 * DAY_S
-    house.keeper.round()
-    assert house.results(job).is_dir()
-    house.now += 0.2 * DAY_S
-    house.keeper.round()
-    assert not house.results(job).exists()
-
-
-def test_a_machine_that_starts_with_another_year_removes_nothing_at_once(house):
-    """The process that saw the time before is gone."""
-    job = house.job()
-    house.keeper.round()
-    for seconds in (9 * 365 * DAY_S, 0.0):
-        house.now += seconds
-        house.keeper = Housekeeper(house.settings, house.database, house.storage, house.queue, clock=lambda: house.now,
-                                   monotonic=lambda: house.now)
-        house.keeper.round()
-        assert house.results(job).is_dir()
-
-
-def test_a_clock_that_is_set_right_by_minutes_is_no_jump(house):
-    job = house.job()
-    house.keeper.round()
-    house.now += 1.01 * DAYS * DAY_S
-    jump(house, -600)
-    house.keeper.round()
-    assert not house.results(job).exists()

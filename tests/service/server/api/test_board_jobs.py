@@ -9,7 +9,7 @@ import pytest
 from service.requests.identifiers import new_id
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
-from tests.service.server.api.test_jobs import NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
 
 OTHER = new_id("job")

@@ -1,4 +1,4 @@
-"""Bad input through a real server and its worker: refused by name, logged once, nothing left behind, and both go on."""
+"""Bad captures, environments and images through a real server and its worker: refused by name, and both go on."""
 
 import json
 import os
@@ -6,7 +6,6 @@ import pickle
 import random
 import re
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,128 +27,11 @@ from tests.service.server.api.captures import (
     write_image,
 )
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.tus import Tus, encoded
+from tests.service.server.api.tus import Tus
 
-PEAK_BYTES = 1 << 30
-"""Of a worker: its libraries take a fifth, and a manifest of MAX_MANIFEST_BYTES up to 40 times its size."""
-PATIENCE_S = 30.0
 TOF = {"type": "cw", "modulation_hz": 3e7, "reference_phase_rad": 0.0}
 
-
-@pytest.fixture(scope="module", autouse=True)
-def worker_lives(server, client, owl):
-    """None of this costs the worker its life, or more memory than it may have."""
-    before = workers(server)
-    assert before
-    yield
-    assert client.get("/v1/captures").status_code == 200
-    assert workers(server) == before
-    for pid in before:
-        peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-        assert peak is not None and 1024 * int(peak[1]) < PEAK_BYTES
-    assert '"level": "error"' not in server.log.read_text()
-
-
-def workers(server) -> list[int]:
-    """Processes of the server's workers, from their names."""
-    names = [json.loads(line)["worker"] for line in server.log.read_text().splitlines() if '"event": "worker ready"' in line]
-    return [pid for pid in (int(name.split("-")[-2]) for name in names) if Path(f"/proc/{pid}").exists()]
-
-
-def test_bad_requests_are_refused_by_name_and_logged_once(server, client, registered):
-    (registered / "out").symlink_to(SAMPLES.parent)
-    (registered / "circle").symlink_to(registered / "circle")
-    (registered / "file").write_text("no folder")
-    bad = [
-        ("/v1/captures", {"name": "x", "colour": "red"}, "colour"),
-        ("/v1/captures", {}, "name"),
-        ("/v1/captures", {"name": ""}, "name"),
-        ("/v1/captures", {"name": "a\0b"}, "name"),
-        ("/v1/captures", {"name": "half \ud800"}, ""),
-        ("/v1/captures", {"name": "x" * 201}, "name"),
-        ("/v1/captures", {"name": 5}, "name"),
-        ("/v1/captures", {"name": "x", "folder": "relative"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": ""}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/../data"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/a\0b"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/\ud800"}, ""),
-        ("/v1/captures", {"name": "x", "folder": "/etc"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": str(server.data)}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/out/tests"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/circle"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/nothing"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/file"}, "folder"),
-        ("/v1/captures", {"name": "x", "folder": f"{registered}/{'x' * 5000}"}, "folder"),
-        ("/v1/environments", {"name": "x", "file": str(registered)}, "file"),
-        ("/v1/jobs", {"kind": "depth", "capture": "cap_0123456789abcdefghjk", "tof_calibration": "a\0b"}, "tof_calibration"),
-        ("/v1/jobs", {"kind": "relight", "capture": "cap_0123456789abcdefghjk", "options": {"frames": "1\0"}}, "frames"),
-        ("/v1/environments", {"name": "x", "file": "/etc/passwd"}, "file"),
-        ("/v1/environments", {"name": "x", "folder": "/etc"}, "folder"),
-    ]
-    count = len(client.get("/v1/captures", params={"limit": 500}).json()["items"])
-    refused = []
-    for path, body, field in bad:
-        answer = client.post(path, content=json.dumps(body), headers={"Content-Type": "application/json"})
-        assert answer.status_code in (400, 422), (body, answer.text)
-        problem = answer.json()
-        assert problem["status"] == answer.status_code and field in problem["detail"], (body, problem)
-        assert "passwd" not in problem["detail"]
-        refused.append(problem["request_id"])
-    assert [len(lines_of(server, request)) for request in refused] == [1] * len(bad)
-    assert len(client.get("/v1/captures", params={"limit": 500}).json()["items"]) == count
-
-
-def lines_of(server, request_id: str) -> list[dict]:
-    """What was logged of a request; the last line of it may come after its answer."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := [json.loads(line) for line in server.log.read_text().splitlines() if request_id in line]):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    return found
-
-
-@pytest.mark.parametrize("body", [b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"name": 1e999}', b'\xff\xfe{"name": "x"}',
-                                  b'{"name": ' + b"9" * 10_000 + b"}"])
-def test_bodies_that_are_no_request_are_refused(client, body):
-    answer = client.post("/v1/captures", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code in (400, 422)
-    assert answer.json()["status"] == answer.status_code
-
-
-@pytest.mark.parametrize("path", [
-    "../capture.json", "a/../../b", "/etc/passwd", "C:/x", "\\\\server\\share", "a\\b", "nul\0", "new\nline", "\u202egnp.exe",
-    "zero\u200bwidth",
-    "e\u0301.exr", ".hidden", "a/.part", "CON", "aux.exr", "end.", "end ", "x" * 256, "/".join("abcdefghi"), ""])
-def test_names_that_are_not_safe_are_refused_and_leave_nothing(server, client, path):
-    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'names'}).json()['id']}"
-    before = sorted((server.data / "uploads").glob("*")) if (server.data / "uploads").exists() else []
-    answer = Tus(server.url).create(capture, 4, encoded(path=path))
-    problem = json.loads(answer.body)
-    assert (answer.status, problem["detail"].startswith("path ")) == (422, True)
-    assert problem["detail"].isprintable()
-    assert client.get(f"{capture}/files").json()["files"] == []
-    assert (sorted((server.data / "uploads").glob("*")) if (server.data / "uploads").exists() else []) == before
-    logged = lines_of(server, problem["request_id"])
-    assert [line["problem"] for line in logged] == [problem["detail"]]
-
-
-@pytest.mark.parametrize(("first", "second"), [
-    ("Frame.exr", "frame.EXR"), ("straße", "STRASSE"), ("a/x", "A/y"), ("a", "a/b"), ("A", "a/b"), ("a/b", "a"), ("a/b/c", "a/B")])
-def test_names_that_are_one_without_case_are_refused(server, client, first, second):
-    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'names'}).json()['id']}"
-    tus = Tus(server.url)
-    tus.send(capture, first, b"first")
-    answer = tus.create(capture, 4, encoded(path=second))
-    assert (answer.status, first in json.loads(answer.body)["detail"]) == (409, True)
-    assert [file["path"] for file in client.get(f"{capture}/files").json()["files"]] == [first]
-
-
-@pytest.mark.parametrize("metadata", ["", "path", "filename YQ==", "path YQ==,owner YQ==", "path YQ==,path Yg==", "path !!!", "path /w==",
-                                      "path YQ==,sha256 YQ==", "sha256 YQ=="])
-def test_metadata_that_is_not_known_is_refused(server, client, metadata):
-    capture = f"/v1/captures/{client.post('/v1/captures', json={'name': 'metadata'}).json()['id']}"
-    answer = Tus(server.url).create(capture, 4, metadata)
-    assert (answer.status, json.loads(answer.body)["detail"].startswith(("Upload-Metadata", "path "))) == (422, True)
+pytestmark = pytest.mark.usefixtures("worker_lives")
 
 
 def edited(**more: object) -> Callable[[Path], None]:
@@ -259,7 +141,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 def failures(server) -> list[str]:
     """Errors of jobs, one a job."""
-    return [json.loads(line)["error"] for line in server.log.read_text().splitlines() if '"event": "job failed"' in line]
+    return [line["error"] for line in server.lines() if line["event"] == "job failed"]
 
 
 @pytest.mark.long

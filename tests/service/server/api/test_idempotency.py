@@ -13,7 +13,6 @@ from service.server.database import idempotency, intakes, keys
 from service.server.database.engine import Database, connect
 from service.server.database.schema import upgrade
 from service.server.settings import Settings
-from tests.service.postgres import binaries, postgres
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 
@@ -150,13 +149,11 @@ def database(request, tmp_path) -> Iterator[Database]:
         yield made
         made.close()
         return
-    if (programs := binaries()) is None:
-        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-    with postgres(programs) as server:
-        made = connect(Settings(data=tmp_path, database_url=server.new_database()).sqlalchemy_url, connections=AT_ONCE)
-        upgrade(made)
-        yield made
-        made.close()
+    url = request.getfixturevalue("server_postgres").new_database()
+    made = connect(Settings(data=tmp_path, database_url=url).sqlalchemy_url, connections=AT_ONCE)
+    upgrade(made)
+    yield made
+    made.close()
 
 
 def test_at_once_on_either_database(database):

@@ -8,7 +8,7 @@ from stage.maps import SurfaceMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import write_exr, write_manifest
 from tests.scenes.depth import BLACK_WHITE, CENTRE, NORMAL, RADIUS, entry_of, gray_patterns, make_scene, phase_patterns, write_patterns
-from tests.service.server.api.test_jobs import NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
 
 CAMERA = reference.Device(96, 72, 140.0)

@@ -9,7 +9,7 @@ import pytest
 
 from service.depth.projection import make_patterns
 from service.requests.patterns import PatternsRequest
-from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+from tests.service.server.api.job_calls import finish, made_by, refused, submit
 
 TUS = {"Tus-Resumable": "1.0.0"}
 

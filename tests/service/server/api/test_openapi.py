@@ -27,7 +27,6 @@ from service.server.jobs.queue import prepare
 from service.server.settings import Settings
 from service.views.intakes import IntakeView
 from service.views.jobs import JobView, ResultView
-from tests.service.postgres import binaries, postgres
 from tests.service.server.api.fuzz import fuzz, seed
 from tests.service.server_process import serving
 
@@ -201,11 +200,9 @@ def test_schemathesis_finds_nothing_in_random_requests_and_sequences(tmp_path):
 @pytest.mark.long
 @pytest.mark.skipif(LONG_S == 0, reason="set FUZZ_SECONDS to run schemathesis for that long")
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-def test_schemathesis_finds_nothing_for_long(tmp_path, database):
+def test_schemathesis_finds_nothing_for_long(tmp_path, database, request):
     if database == "sqlite":
         run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000)
         return
-    if (programs := binaries()) is None:
-        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-    with postgres(programs) as server:
-        run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000, database_url=server.new_database())
+    url = request.getfixturevalue("server_postgres").new_database()
+    run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000, database_url=url)

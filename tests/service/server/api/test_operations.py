@@ -1,39 +1,22 @@
-"""Operating the service: health, numbers, the log, traces, and how it ends."""
+"""Operating the service: health, numbers and the log."""
 
 import json
-import os
-import re
 import shutil
-import signal
 import socket
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import httpx2
 import pytest
 from fastapi.testclient import TestClient
-from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.errors import RequestError
-from service.server import log, telemetry
+from service.server import log
 from service.server.api.app import create_app
-from service.server.database import jobs, workers
 from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
-from tests.service.postgres import binaries, postgres
-from tests.service.server.api.conftest import SAMPLES
-from tests.service.server_process import Server, serving
 
 PATIENCE_S = 60.0
-DRAIN_S = 4.0
-"""Of the server that is ended while it works; its step takes longer."""
 
 
 def until(look, what: str):
@@ -43,11 +26,6 @@ def until(look, what: str):
         assert time.monotonic() < deadline, what
         time.sleep(0.05)
     return found
-
-
-def lines_of(server: Server) -> list[dict]:
-    """The log, of which every line is JSON."""
-    return [json.loads(line) for line in server.log.read_text().splitlines()]
 
 
 def numbers_of(client: httpx2.Client) -> dict[str, list]:
@@ -89,42 +67,6 @@ def test_a_service_that_cannot_work_says_why_and_names_nothing(app, inside, tmp_
     assert said == "the database does not answer; the storage cannot be written"
     assert inside.get("/readyz").status_code == 503 and inside.get("/healthz").status_code == 200
     assert 'relit_database_up 0.0' in inside.get("/metrics").text
-
-
-@pytest.mark.long
-def test_a_database_that_goes_away_and_comes_back(tmp_path):
-    programs = binaries()
-    if programs is None:
-        pytest.skip("no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
-    with postgres(programs) as database, serving(tmp_path, "--anonymous", "--device", "none", database_url=database.new_database(),
-                                                 min_free_bytes="0") as server, server.client() as client:
-        assert client.get("/v1/jobs").status_code == 200
-        database.stop("immediate")
-        refused = client.get("/v1/jobs")
-        assert (refused.status_code, refused.headers["Content-Type"]) == (503, "application/problem+json")
-        assert refused.headers["Retry-After"] and "database does not answer" in refused.json()["detail"]
-        until(lambda: "the database does not answer" in client.get("/readyz").json()["detail"], "it does not say so")
-        assert client.get("/healthz").status_code == 200 and "relit_database_up 0.0" in client.get("/metrics").text
-        database.start()
-        until(lambda: client.get("/v1/jobs").status_code == 200, "it does not come back")
-        assert "Traceback" not in server.log.read_text()
-
-
-@pytest.mark.long
-def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
-        assert "no worker" in client.get("/readyz").json()["detail"]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
-        with open(tmp_path / "worker.txt", "w") as errors:
-            worker = subprocess.Popen([sys.executable, "-m", "service.cli.main", "worker", "--data", str(server.data), "--device", "cpu"],
-                                      stderr=errors, env=environment)
-        try:
-            until(lambda: client.get("/readyz").status_code == 200, "never ready")
-        finally:
-            worker.terminate()
-            assert worker.wait(PATIENCE_S) == 0
-        until(lambda: client.get("/readyz").status_code == 503, "still ready")
-        assert "interrupted" not in (tmp_path / "worker.txt").read_text()
 
 
 def test_what_was_found_is_told_again_for_a_moment(app, monkeypatch):
@@ -187,16 +129,19 @@ def test_the_queue_ages(inside, app):
 
 def test_every_request_is_one_line_of_the_log(server, client):
     name = client.get("/v1/jobs", params={"limit": 7}).headers["X-Request-ID"]
-    found = until(lambda: [line for line in lines_of(server) if line.get("request") == name], "not logged")
+    found = until(lambda: [line for line in server.lines() if line.get("request") == name], "not logged")
     assert len(found) == 1
     assert found[0] | {"ms": 0, "timestamp": ""} == {
         "event": "request", "level": "info", "timestamp": "", "request": name, "method": "GET", "path": "/v1/jobs", "status": 200, "ms": 0,
         "client": "127.0.0.1", "project": "default", "key": None}
     refused = client.get("/v1/jobs/job_00000000000000000000")
     assert refused.json()["request_id"] == refused.headers["X-Request-ID"]
-    until(lambda: any(line.get("request") == refused.headers["X-Request-ID"] for line in lines_of(server)), "not logged")
+    until(lambda: any(line.get("request") == refused.headers["X-Request-ID"] for line in server.lines()), "not logged")
     for path in ("/healthz", "/readyz", "/metrics"):  # of level debug, which is not asked for
-        assert not any(line.get("request") == client.get(path).headers["X-Request-ID"] for line in lines_of(server))
+        name = client.get(path).headers["X-Request-ID"]
+        later = client.get("/v1/jobs").headers["X-Request-ID"]
+        until(lambda later=later: any(line.get("request") == later for line in server.lines()), "not logged")
+        assert not any(line.get("request") == name for line in server.lines())
 
 
 def test_what_libraries_say_is_in_the_same_log(server):
@@ -205,7 +150,7 @@ def test_what_libraries_say_is_in_the_same_log(server):
     with socket.create_connection((host, int(port))) as connection:
         connection.sendall(b"\x16\x03\x01\x00\xff no http\r\n\r\n")
         connection.recv(100)
-    until(lambda: [line for line in lines_of(server) if line.get("logger") == "uvicorn.error"], "nothing of uvicorn")
+    until(lambda: [line for line in server.lines() if line.get("logger") == "uvicorn.error"], "nothing of uvicorn")
 
 
 def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, sky):
@@ -213,16 +158,16 @@ def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, 
     job = client.post("/v1/jobs", json=request).json()["id"]
     server.wait(client, f"/v1/jobs/{job}", ("running",))
     client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
-    until(lambda: [line for line in lines_of(server) if line.get("job") == job and line["event"] == "step stopped"], "not stopped")
+    until(lambda: [line for line in server.lines() if line.get("job") == job and line["event"] == "step stopped"], "not stopped")
     time.sleep(1.5)  # in which DBOS looks at the workflow's status
-    assert [line for line in lines_of(server) if line["level"] == "error"] == []
+    assert [line for line in server.lines() if line["level"] == "error"] == []
 
 
 def test_a_job_is_followed_through_the_log(server, client, owl):
     job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
     server.wait(client, f"/v1/jobs/{job}", ("succeeded",))
-    events = until(lambda: [line["event"] for line in lines_of(server) if line.get("job") == job][2:] and [
-        line["event"] for line in lines_of(server) if line.get("job") == job], "not logged")
+    events = until(lambda: [line["event"] for line in server.lines() if line.get("job") == job][2:] and [
+        line["event"] for line in server.lines() if line.get("job") == job], "not logged")
     assert events[:2] == ["step begins", "step done"]
 
 
@@ -242,130 +187,3 @@ def test_a_fault_of_our_own_is_a_problem_too_and_logged_once(app, capfd):
     assert len(faults) == 1 and "RuntimeError: a secret of the machine" in faults[0]["exception"]
     assert faults[0]["request"] == response.headers["X-Request-ID"]
     assert 'route="/v1/broken",status="500"} 1.0' in TestClient(app, base_url="http://localhost").get("/metrics").text
-
-
-@pytest.fixture
-def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
-    """A server whose worker is in a step that takes longer than it may take to drain."""
-    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S), min_free_bytes="0") as server, \
-            server.client() as client:
-        capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).json()["id"]
-        server.wait(client, f"/v1/captures/{capture}", ("ready",))
-        job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "options": {"method": "svbrdf"}}).json()["id"]
-        server.wait(client, f"/v1/jobs/{job}", ("running",))
-        yield server, client, job
-
-
-def test_the_service_drains_and_ends_clean(busy):
-    """While the worker drains, the service answers on and is not ready; streams end as streams do; the job waits for the next worker."""
-    server, client, job = busy
-    lines: list[str] = []
-
-    def listen() -> None:
-        with server.client() as other, other.stream("GET", f"/v1/jobs/{job}/events") as stream:
-            lines.extend(stream.iter_lines())
-        lines.append("END")
-
-    listener = threading.Thread(target=listen)
-    listener.start()
-    until(lambda: lines, "no event")
-    server.process.send_signal(signal.SIGTERM)
-    response = until(lambda: (found := client.get("/readyz")).status_code == 503 and found, "still ready")
-    assert response.json()["detail"] == "the service is ending" and response.headers["Retry-After"]
-    assert client.get("/healthz").status_code == 200
-    assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
-    assert server.process.wait(PATIENCE_S) == 0
-    listener.join(PATIENCE_S)
-    assert lines[-1] == "END"
-    text = server.log.read_text()
-    assert "interrupted" not in text and "Traceback" not in text
-    assert lines_of(server)[-1]["event"] == "service ended"
-    assert not list((server.data / "locks").glob("*.lock"))
-    database = connect(Settings(data=server.data).sqlalchemy_url)
-    assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
-    database.close()
-
-
-@pytest.mark.long
-def test_asked_twice_it_ends_at_once(busy):
-    server, _, _ = busy
-    children = children_of(server.process.pid)
-    assert children
-    server.process.send_signal(signal.SIGINT)
-    server.process.send_signal(signal.SIGINT)  # together with the first, it is the same
-    until(lambda: "service drains" in server.log.read_text(), "does not drain")
-    while server.process.poll() is None:
-        time.sleep(0.2)
-        server.process.send_signal(signal.SIGINT)
-    assert server.process.returncode == 128 + signal.SIGINT
-    assert "step is given up" not in server.log.read_text()  # which comes after DRAIN_S
-    until(lambda: not any(alive(child) for child in children), "a worker lives on")
-
-
-def children_of(pid: int) -> list[int]:
-    return [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
-
-
-def alive(pid: int) -> bool:
-    try:
-        return re.search(r"^State:\s+Z", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE) is None
-    except FileNotFoundError:
-        return False
-
-
-class Collector(BaseHTTPRequestHandler):
-    """Takes OTLP over HTTP as collectors do."""
-
-    spans: list
-
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        assert self.path == "/v1/traces"
-        for resource in ExportTraceServiceRequest.FromString(body).resource_spans:
-            attributes = {pair.key: pair.value.string_value for pair in resource.resource.attributes}
-            assert attributes["service.name"] == "relit"
-            self.spans.extend(span for scope in resource.scope_spans for span in scope.spans)
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, *_arguments: object) -> None:
-        """Say nothing."""
-
-
-@pytest.fixture
-def collector() -> Iterator[tuple[str, list]]:
-    spans: list = []
-    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Collecting", (Collector,), {"spans": spans}))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}", spans
-    server.shutdown()
-    thread.join()
-    server.server_close()
-
-
-@pytest.mark.long
-def test_a_request_and_the_steps_of_its_job_are_one_trace(collector, tmp_path):
-    address, spans = collector
-    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), otel_endpoint=address, min_free_bytes="0") as server, \
-            server.client() as client:
-        ours = "4bf92f3577b34da6a3ce929d0e0e4736"
-        made = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")},
-                           headers={"traceparent": f"00-{ours}-00f067aa0ba902b7-01"}).json()
-        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
-        client.get("/healthz")
-        server.process.send_signal(signal.SIGTERM)
-        assert server.process.wait(PATIENCE_S) == 0
-    found = {span.name: span for span in spans}
-    asked, step = found["POST /v1/captures"], found["check"]
-    assert asked.trace_id.hex() == step.trace_id.hex() == ours
-    assert step.parent_span_id == asked.span_id
-    assert {pair.key: pair.value.string_value for pair in step.attributes}["relit.job"].startswith("job_")
-    assert "GET /v1/captures/{capture}" in found and "GET /healthz" not in found
-
-
-def test_traces_without_the_extra_are_one_sentence(monkeypatch):
-    monkeypatch.setitem(sys.modules, "opentelemetry.exporter.otlp.proto.http.trace_exporter", None)
-    with pytest.raises(RequestError, match="otel_endpoint: the extra otel is not installed"):
-        telemetry.provider(Settings(otel_endpoint="http://127.0.0.1:4318"))
-    assert telemetry.provider(Settings()) is None

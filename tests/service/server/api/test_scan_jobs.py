@@ -7,7 +7,7 @@ import pytest
 
 from tests.reference import projector as reference
 from tests.scenes.depth import BLACK_WHITE, POSE, PROJECTOR, Scene, gray_patterns, phase_patterns, write_patterns
-from tests.service.server.api.test_jobs import NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
 
 CAMERA = reference.Device(96, 72, 140.0)

@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 
 from tests.scenes import depth as depths
 from tests.scenes.sequence import write_sequence
-from tests.service.server.api.test_jobs import finish, made_by, refused, submit
+from tests.service.server.api.job_calls import finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
 
 TIMES = [0.0, 0.1, 0.2]

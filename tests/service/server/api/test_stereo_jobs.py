@@ -11,8 +11,8 @@ from tests.scenes import stereo as scenes
 from tests.scenes.stereo import OTHER, POSE, Plane
 from tests.service.calibrate.test_calibrate_stereo import write_board
 from tests.service.depth.test_two_cameras import two_captures
+from tests.service.server.api.job_calls import finish, made_by, refused, submit
 from tests.service.server.api.test_calibrating import sent
-from tests.service.server.api.test_jobs import finish, made_by, refused, submit
 
 BOARD = {"board": "9x6", "square_m": 0.03}
 

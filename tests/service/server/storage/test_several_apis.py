@@ -22,13 +22,11 @@ from service.server.settings import Settings
 from service.server.storage import upload_parts
 from service.server.storage.open import open_storage
 from service.server.storage.upload_parts import open_upload_parts
-from tests.service.postgres import binaries, postgres
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving
 
 MIB = 1 << 20
 CONTENT = np.random.default_rng(5).bytes(3 * MIB)
-pytestmark = pytest.mark.skipif(binaries() is None, reason="no PostgreSQL server programs: neither on the PATH nor in /usr/lib/postgresql")
 
 
 class Site(NamedTuple):
@@ -39,14 +37,13 @@ class Site(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory) -> Iterator[Site]:
+def site(tmp_path_factory, server_postgres) -> Iterator[Site]:
     folder = tmp_path_factory.mktemp("apis")
-    with postgres(binaries()) as database:
-        settings = {"database_url": database.new_database(), "storage_url": (folder / "store").as_uri(), "min_free_bytes": "0",
-                    "requests_per_second": "10000", "request_burst": "10000"}
-        options = ("--anonymous", "--device", "none")
-        with serving(folder / "one", *options, **settings) as first, serving(folder / "two", *options, **settings) as second:
-            yield Site(first, second, folder / "store", settings)
+    settings = {"database_url": server_postgres.new_database(), "storage_url": (folder / "store").as_uri(), "min_free_bytes": "0",
+                "requests_per_second": "10000", "request_burst": "10000"}
+    options = ("--anonymous", "--device", "none")
+    with serving(folder / "one", *options, **settings) as first, serving(folder / "two", *options, **settings) as second:
+        yield Site(first, second, folder / "store", settings)
 
 
 def begun(site: Site, content: bytes, **words: str) -> tuple[str, str]:

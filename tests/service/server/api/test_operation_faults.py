@@ -1,0 +1,126 @@
+"""A service whose database or worker goes and comes back, and which ends when it is asked to."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from service.server.database import jobs, workers
+from service.server.database.engine import connect
+from service.server.settings import Settings
+from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.test_operations import PATIENCE_S, until
+from tests.service.server_process import Server, serving
+
+DRAIN_S = 4.0
+"""Of the server that is ended while it works; its step takes longer."""
+
+
+@pytest.mark.long
+def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):
+    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database(),
+                 min_free_bytes="0") as server, server.client() as client:
+        assert client.get("/v1/jobs").status_code == 200
+        server_postgres.stop("immediate")
+        refused = client.get("/v1/jobs")
+        assert (refused.status_code, refused.headers["Content-Type"]) == (503, "application/problem+json")
+        assert refused.headers["Retry-After"] and "database does not answer" in refused.json()["detail"]
+        until(lambda: "the database does not answer" in client.get("/readyz").json()["detail"], "it does not say so")
+        assert client.get("/healthz").status_code == 200 and "relit_database_up 0.0" in client.get("/metrics").text
+        server_postgres.start()
+        until(lambda: client.get("/v1/jobs").status_code == 200, "it does not come back")
+        assert "Traceback" not in server.log.read_text()
+
+
+@pytest.mark.long
+def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+        assert "no worker" in client.get("/readyz").json()["detail"]
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+        with open(tmp_path / "worker.txt", "w") as errors:
+            worker = subprocess.Popen([sys.executable, "-m", "service.cli.main", "worker", "--data", str(server.data), "--device", "cpu"],
+                                      stderr=errors, env=environment)
+        try:
+            until(lambda: client.get("/readyz").status_code == 200, "never ready")
+        finally:
+            worker.terminate()
+            assert worker.wait(PATIENCE_S) == 0
+        until(lambda: client.get("/readyz").status_code == 503, "still ready")
+        assert "interrupted" not in (tmp_path / "worker.txt").read_text()
+
+
+@pytest.fixture
+def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
+    """A server whose worker is in a step that takes longer than it may take to drain."""
+    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S), min_free_bytes="0") as server, \
+            server.client() as client:
+        capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).json()["id"]
+        server.wait(client, f"/v1/captures/{capture}", ("ready",))
+        job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "options": {"method": "svbrdf"}}).json()["id"]
+        server.wait(client, f"/v1/jobs/{job}", ("running",))
+        yield server, client, job
+
+
+def test_the_service_drains_and_ends_clean(busy):
+    """While the worker drains, the service answers on and is not ready; streams end as streams do; the job waits for the next worker."""
+    server, client, job = busy
+    lines: list[str] = []
+
+    def listen() -> None:
+        with server.client() as other, other.stream("GET", f"/v1/jobs/{job}/events") as stream:
+            lines.extend(stream.iter_lines())
+        lines.append("END")
+
+    listener = threading.Thread(target=listen)
+    listener.start()
+    until(lambda: lines, "no event")
+    server.process.send_signal(signal.SIGTERM)
+    response = until(lambda: (found := client.get("/readyz")).status_code == 503 and found, "still ready")
+    assert response.json()["detail"] == "the service is ending" and response.headers["Retry-After"]
+    assert client.get("/healthz").status_code == 200
+    assert client.get(f"/v1/jobs/{job}").json()["state"] == "running"
+    assert server.process.wait(PATIENCE_S) == 0
+    listener.join(PATIENCE_S)
+    assert lines[-1] == "END"
+    text = server.log.read_text()
+    assert "interrupted" not in text and "Traceback" not in text
+    assert server.lines()[-1]["event"] == "service ended"
+    assert not list((server.data / "locks").glob("*.lock"))
+    database = connect(Settings(data=server.data).sqlalchemy_url)
+    assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
+    database.close()
+
+
+@pytest.mark.long
+def test_asked_twice_it_ends_at_once(busy):
+    server, _, _ = busy
+    children = children_of(server.process.pid)
+    assert children
+    server.process.send_signal(signal.SIGINT)
+    server.process.send_signal(signal.SIGINT)  # together with the first, it is the same
+    until(lambda: "service drains" in server.log.read_text(), "does not drain")
+    while server.process.poll() is None:
+        time.sleep(0.2)
+        server.process.send_signal(signal.SIGINT)
+    assert server.process.returncode == 128 + signal.SIGINT
+    assert "step is given up" not in server.log.read_text()  # which comes after DRAIN_S
+    until(lambda: not any(alive(child) for child in children), "a worker lives on")
+
+
+def children_of(pid: int) -> list[int]:
+    return [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return re.search(r"^State:\s+Z", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE) is None
+    except FileNotFoundError:
+        return False
