@@ -5,8 +5,11 @@ stands elsewhere bends them all. The difference is averaged at lengths that doub
 by the share S / (S + N) of it, S being the variance of the drift, N that of the noise of the depth in this band (Wiener 1949).
 Vertices at which the two contradict each other (`stage.meshes.contradictions`) count little or nothing in both variances.
 (2) Vertices move along the corrected normals until the edges of the mesh are perpendicular to the normals at their ends, held by the depth:
-least squares weighted by the variances of both. Edges at vertices that contradict, before or after, are left out, and these vertices stay.
-No band of the motions is larger than the noise of the depth in it.
+least squares weighted by the variances of both. No band of the motions is larger than the noise of the depth in it.
+Edges at vertices that contradict, before or after, do not count at first. Then each edge counts by how well the last solution agrees with
+the photometric normals at its ends, in several rounds, so that normals which only the noise of the depth contradicted count again. Where
+an edge does not count, its ends move alike, by the variance of the slopes of the depth: a vertex that kept its noise beside neighbours
+without theirs would tilt the faces between them by more than either normal errs.
 
 Source: Nehab, Rusinkiewicz, Davis and Ramamoorthi, "Efficiently combining positions and normals for precise 3D geometry", SIGGRAPH 2005
     (sections 3 and 4), whose one scale of correction is replaced by bands; weights of edges by Pinkall and Polthier, "Computing discrete
@@ -25,12 +28,20 @@ BOUND_SIGMAS = 4.0
 """A vertex moves no farther than this many standard deviations of its depth: where normals ask for more, the depth decides."""
 ROUNDS = 4
 """Solutions, each without the edges at vertices that would move too far."""
-LEAST_COTANGENT, MOST_COTANGENT = 0.05, 10.0
+RETURNS = 4
+"""Further solutions, in which edges count by how well the one before agrees with the photometric normals."""
+DISAGREE = float(np.radians(10.0))
+"""Angle between the solution and the photometric normals, radians, at which an edge counts a quarter: as in `contradictions.DRIFT`."""
+LEAST_COTANGENT, MOST_COTANGENT = 0.05, 1e3
 """Bounds of the weights of edges, which thin triangles would make negative or very large."""
 BENT = 0.25
 """Standard deviation of the slope of an edge whose normals differ, in squares of their angle: a chord of a curve that is no circle."""
 TOLERANCE, MOST_ITERATIONS = 1e-4, 1000
 """Residual of the linear systems as a part of their right side, and the most iterations of conjugate gradients."""
+NEAR = 0.2
+"""Length in medians below which both ends of an edge move in about one direction: ends that part or meet turn thin faces over."""
+MOST_NEAR = 1e4
+"""Bound of the weight by which the ends of a short edge share a direction."""
 
 
 _OfMotions = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -45,7 +56,7 @@ class Joined(NamedTuple):
     moved: np.ndarray  # [V] float32 metres along the normal
     used: np.ndarray  # [V] bool, vertices that the normals moved
     contradicted: int
-    """Vertices whose photometric normals contradict the surface, or ask for more than its noise explains, which stay."""
+    """Vertices whose photometric normals contradict the surface, or ask for more than its noise explains."""
     drift_degrees: float
     """RMS of the correction of the normals."""
 
@@ -55,6 +66,14 @@ class _Mesh(NamedTuple):
     other: np.ndarray  # [E] int32
     weight: np.ndarray  # [E] float64, half the sum of the cotangents of the angles across
     area: np.ndarray  # [V] float64 square metres, a third of the faces around
+
+
+class _Weights(NamedTuple):
+    """What the least squares are weighted by."""
+
+    sigma: np.ndarray  # [V] metres, of the depth
+    tilt: np.ndarray  # [V] radians, standard deviation of the photometric normals
+    slope: float  # variance of the normals of the depth
 
 
 def join_normals(points: np.ndarray, faces: np.ndarray, sigma: np.ndarray, normals: np.ndarray, normal_sigma: np.ndarray, *, pixel_m: float
@@ -86,12 +105,15 @@ def join_normals(points: np.ndarray, faces: np.ndarray, sigma: np.ndarray, norma
     noise = _face_normals(own + alike[:, None] * given, tri) - measured
     trust = compared(bands, measured - given, noise, pixel_m)
     turned = _corrected(bands, measured, noise, given, trust.counts)
-    move, agree = _moves(own, mesh, spread, turned, tilt, trust.agree, lambda move, agree: _limited(bands, move, alike, agree),
+    ways = _ways(own, mesh, turned)
+    even = Bands(own, ways, mesh.area, pixel_m)  # its cells mean the same to both ends of a short edge
+    weights = _Weights(spread, tilt, bands.variance(noise, np.ones(len(own))))
+    move, agree = _moves(own, tri, mesh, weights, ways, turned, trust.agree, lambda move, agree: _limited(even, move, alike, agree),
                          lambda move, agree: unlike_noise(bands, move, spread, agree, pixel_m))
     moved = np.zeros(len(points), dtype=np.float32)
     moved[used] = move
     out, corrected = points.astype(np.float64).copy(), normals.copy()
-    out[used] = own + move[:, None] * turned
+    out[used] = own + move[:, None] * ways
     corrected[used] = turned
     angle = np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(turned - given, axis=1) / 2, 1)))
     return Joined(out, corrected, moved, used, int((~agree).sum()), float(np.sqrt(np.average(angle**2, weights=mesh.area * trust.counts))))
@@ -141,58 +163,81 @@ def _corrected(bands: Bands, measured: np.ndarray, noise: np.ndarray, normals: n
 
 
 def _limited(bands: Bands, move: np.ndarray, noise: np.ndarray, agree: np.ndarray) -> np.ndarray:
-    """Return the motions of the vertices, of which no band is larger than the noise of the depth in it.
+    """Return the motions of the vertices, of which no band of lengths above FINEST_PIXELS is larger than the noise of the depth in it.
 
     What the depth is wrong by has the variance N of its noise. If the motions have more, V, the rest is drift that was left in the normals,
-    and N / V of the band is the best estimate (Wiener 1949).
+    and N / V of the band is the best estimate (Wiener 1949). Below that length drift is nothing.
 
     Args:
         bands: of the mesh.
         move: [V] metres.
         noise: [V] an example of the noise of the depth, metres.
-        agree: [V] bool, the vertices that move.
+        agree: [V] bool, the vertices whose motions are compared.
     """
-    out = np.zeros_like(move)
-    for band in bands.of(np.stack([move, noise], axis=1), agree):
+    fine, *coarse = bands.of(np.stack([move, noise], axis=1), agree)
+    out = fine[:, 0].copy()
+    for band in coarse:
         found, expected = bands.variance(band[:, :1], agree), bands.variance(band[:, 1:], agree)
         out += min(expected / max(found, np.finfo(np.float64).tiny), 1.0) * band[:, 0]
-    return np.where(agree, out, 0.0)
+    return out
 
 
-def _moves(points: np.ndarray, mesh: _Mesh, sigma: np.ndarray, normals: np.ndarray, tilt: np.ndarray, agree: np.ndarray,
+def _ways(points: np.ndarray, mesh: _Mesh, normals: np.ndarray) -> np.ndarray:
+    """Return the unit directions [V, 3] in which vertices move: their normals, made alike at the ends of short edges."""
+    length = np.linalg.norm(points[mesh.one] - points[mesh.other], axis=1)
+    alike = np.minimum((NEAR * np.median(length) / np.maximum(length, np.finfo(np.float64).tiny)) ** 2, MOST_NEAR)
+    diagonal = 1 + np.bincount(mesh.one, alike, len(points)) + np.bincount(mesh.other, alike, len(points))
+    way = np.stack([_solved(mesh, diagonal, -alike, column, column) for column in normals.T], axis=1)
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+
+def _moves(points: np.ndarray, faces: np.ndarray, mesh: _Mesh, weights: _Weights, ways: np.ndarray, normals: np.ndarray, agree: np.ndarray,
            limited: _OfMotions, unlike: _OfMotions) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much each vertex moves along its normal, [V] metres, and which do, [V] bool.
+    """Return by how much each vertex moves, [V] metres, and which vertices do not contradict the normals, [V] bool.
 
     Args:
         points: [V, 3] metres.
+        faces: [F, 3] int.
         mesh: of them.
-        sigma: [V] metres, of the depth.
+        weights: of depth and normals.
+        ways: [V, 3] unit, the directions in which the vertices move.
         normals: [V, 3] corrected.
-        tilt: [V] radians, standard deviation of the normals.
-        agree: [V] bool, the vertices that may move.
+        agree: [V] bool, the vertices whose normals count at first.
         limited: returns the motions without what drift has left in them.
         unlike: returns which motions noise does not explain.
+
+    Source: the weights of edges are those of Geman and McClure (`stage.meshes.contradictions`), found again after each solution.
     """
     one, other, count = mesh.one, mesh.other, len(points)
     middle = normals[one] + normals[other]
     middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     rise = (middle * (points[other] - points[one])).sum(axis=1)
-    at_one, at_other = (middle * normals[one]).sum(axis=1), (middle * normals[other]).sum(axis=1)
+    at_one, at_other = (middle * ways[one]).sum(axis=1), (middle * ways[other]).sum(axis=1)
     angle = np.linalg.norm(normals[one] - normals[other], axis=1)
-    trust = mesh.weight / ((tilt[one] ** 2 + tilt[other] ** 2) / 2 + (BENT * angle**2) ** 2)
-    hold = mesh.area / sigma**2
+    trust = mesh.weight / ((weights.tilt[one] ** 2 + weights.tilt[other] ** 2) / 2 + (BENT * angle**2) ** 2)
+    hold = mesh.area / weights.sigma**2
+    bound = BOUND_SIGMAS * weights.sigma
     move, found = np.zeros(count), np.zeros(count)
-    for _ in range(ROUNDS):
-        weight = np.where(agree[one] & agree[other], trust, 0.0)
-        diagonal = hold + np.bincount(one, weight * at_one**2, count) + np.bincount(other, weight * at_other**2, count)
+
+    def solved(counts: np.ndarray) -> np.ndarray:
+        weight, still = trust * counts, mesh.weight * (1 - counts) / weights.slope
+        diagonal = hold + np.bincount(one, weight * at_one**2 + still, count) + np.bincount(other, weight * at_other**2 + still, count)
         right = np.bincount(one, weight * at_one * rise, count) - np.bincount(other, weight * at_other * rise, count)
-        move = _solved(mesh, diagonal, -weight * at_one * at_other, right, move)
+        return _solved(mesh, diagonal, -weight * at_one * at_other - still, right, move)
+
+    for _ in range(ROUNDS):
+        move = solved((agree[one] & agree[other]).astype(np.float64))
         found = limited(move, agree)
-        kept = agree & ~unlike(found, agree) & (np.abs(found) <= BOUND_SIGMAS * sigma)
+        kept = agree & ~unlike(found, agree) & (np.abs(found) <= bound)
         if (kept == agree).all():
             break
         agree = kept
-    return np.where(agree, found, 0.0), agree
+    for _ in range(RETURNS):
+        off = np.linalg.norm(_face_normals(points + found[:, None] * ways, faces) - normals, axis=1)
+        off[np.abs(found) > bound] = np.inf
+        move = solved(1 / (1 + (np.maximum(off[one], off[other]) / DISAGREE) ** 2) ** 2)
+        found = limited(move, agree)
+    return np.clip(found, -bound, bound), agree
 
 
 def _solved(mesh: _Mesh, diagonal: np.ndarray, between: np.ndarray, right: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -62,7 +62,23 @@ def rod(p: np.ndarray) -> np.ndarray:
     return _waved(np.minimum(_wall(p), np.linalg.norm(p - a - along[..., None] * (b - a), axis=-1) - 0.006), p)
 
 
-SCENES: dict[str, Field] = {"plates": plates, "disc": disc, "step": step, "rod": rod}
+CHAIR = [((-0.05, -0.06, 0.02), (0.005, 0.05, 0.005)), ((0.05, -0.06, 0.02), (0.005, 0.05, 0.005)),
+         ((-0.05, -0.06, -0.02), (0.005, 0.05, 0.005)), ((0.05, -0.06, -0.02), (0.005, 0.05, 0.005)),
+         ((0.0, -0.01, 0.0), (0.06, 0.004, 0.03)), ((-0.05, 0.05, -0.025), (0.005, 0.06, 0.005)),
+         ((0.05, 0.05, -0.025), (0.005, 0.06, 0.005)), ((0.0, 0.05, -0.025), (0.05, 0.005, 0.004)),
+         ((0.0, 0.09, -0.025), (0.05, 0.006, 0.004))]
+"""Middles and half sides of the bars of the chair, metres."""
+
+
+def chair(p: np.ndarray) -> np.ndarray:
+    """A chair of bars of 8 to 12 mm with a seat, turned, before a wall that is bent with a radius of 290 mm."""
+    bent = np.maximum(0.29 - np.hypot(p[..., 0], p[..., 2] - 0.27), np.maximum(np.abs(p[..., 0]) - 0.16, np.abs(p[..., 1]) - 0.15))
+    bent = np.maximum(bent, np.maximum(p[..., 2] - 0.12, -0.06 - p[..., 2]))
+    q = (p - [0, 0, 0.07]) @ exponential(np.radians([14.0, -23.0, 6.0]))
+    return _waved(np.min([bent, *(_box(q, centre, half) for centre, half in CHAIR)], axis=0), p)
+
+
+SCENES: dict[str, Field] = {"plates": plates, "disc": disc, "step": step, "rod": rod, "chair": chair}
 
 
 def gradient(scene: Field, points: np.ndarray) -> np.ndarray:
@@ -94,6 +110,16 @@ def photometric(scene: Field, shot: Shot, *, seed: int, noise_degrees: float, dr
     normal = np.zeros((*shot.side, 3), dtype=np.float32)
     normal[shot.mask] = unit(turned + np.radians(noise_degrees) * rng.standard_normal(own.shape))
     return SurfaceMaps(camera=camera, mask=shot.mask, normal=normal, sigma=np.full(shot.side, noise_degrees, dtype=np.float32))
+
+
+def with_dead_pixels(shots: list[Shot], maps: list[SurfaceMaps], part: float, seed: int = 5) -> tuple[list[Shot], list[SurfaceMaps]]:
+    """The same without a depth at some pixels, and without a normal at others."""
+    rng = np.random.default_rng(seed)
+    kept = [shot.mask & (rng.random(shot.mask.shape) >= part) for shot in shots]
+    seen = [each.mask & (rng.random(each.mask.shape) >= part) for each in maps]
+    return ([shot._replace(depth=np.where(mask, shot.depth, 0), mask=mask) for shot, mask in zip(shots, kept, strict=True)],
+            [SurfaceMaps(camera=each.camera, mask=mask, normal=np.where(mask[..., None], each.normal, np.float32(0)), sigma=each.sigma)
+             for each, mask in zip(maps, seen, strict=True)])
 
 
 def face_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

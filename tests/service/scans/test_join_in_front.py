@@ -8,7 +8,7 @@ from service.requests.fuse import FuseRequest
 from service.scans.fuse import FuseResult, fuse
 from stage.maps import SurfaceMaps
 from stage.scans.ply_points import read_ply_points
-from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit
+from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit, with_dead_pixels
 from tests.scenes.statue import Shot, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -18,9 +18,13 @@ RESOLVED = 1.0
 """Degrees that the face between three exact vertices errs by at most where the mesh resolves the surface."""
 
 
-def both(folder, shots: list[Shot], maps: list[SurfaceMaps]) -> tuple[FuseResult, FuseResult]:
+NOISE = [("plates", DEPTH_SIGMA)] + [(name, 3 * DEPTH_SIGMA) for name in SCENES]
+"""Scenes, and the standard deviation of their depths in metres."""
+
+
+def both(folder, shots: list[Shot], maps: list[SurfaceMaps], sigma: float = DEPTH_SIGMA) -> tuple[FuseResult, FuseResult]:
     """The surface of the depth alone, and joined with the normals; the second takes the bricks of the first."""
-    file = write_scans(folder, shots, sigma=DEPTH_SIGMA, maps=maps)
+    file = write_scans(folder, shots, sigma=sigma, maps=maps)
     request = FuseRequest(scan_set=file, out=folder / "depth", voxel_m=VOXEL, texture=False, device="cpu", cache=folder / "cache")
     return fuse(request), fuse(request.model_copy(update={"out": folder / "joined", "join_normals": True}))
 
@@ -33,13 +37,15 @@ def degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(one - other, axis=-1) / 2, 0, 1)))
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name):
+@pytest.mark.parametrize(("name", "sigma"), NOISE)
+def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     scene = SCENES[name]
-    shots = fan(scene, count=5, side=(96, 96), sigma=DEPTH_SIGMA)
+    shots = fan(scene, count=5, side=(96, 96), sigma=sigma)
     maps = [photometric(scene, shot, seed=number, noise_degrees=NORMAL_DEGREES, drift_degrees=DRIFT_DEGREES)
             for number, shot in enumerate(shots)]
-    alone, joined = both(tmp_path, shots, maps)
+    if name == "chair":
+        shots, maps = with_dead_pixels(shots, maps, 0.03)
+    alone, joined = both(tmp_path, shots, maps, sigma)
     before, after, faces = read_ply_points(alone.mesh_path), read_ply_points(joined.mesh_path), read_faces(alone.mesh_path)
     assert np.array_equal(faces, read_faces(joined.mesh_path))
     error, left = scene(before.points), scene(after.points)
@@ -56,7 +62,7 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name):
     assert resolved.mean() > 0.75
     found = degrees(face_normals(after.points, faces), unit(gradient(scene, after.points[faces].mean(axis=1))))[resolved]
     given = degrees(before.normals[faces[:, 0]].astype(float), unit(gradient(scene, before.points[faces[:, 0]])))[resolved]
-    assert rms(found) < np.hypot(1.1 * rms(given), rms(floor[resolved]))
+    assert rms(found) < 1.1 * rms(given)  # the reach of issue 18; docs/joining.md has at most 0.98 for such scenes
     assert np.median(found) < 0.6 * np.median(given)  # without most of the drift
     assert 0.005 < joined.facts["joined_normals"]["contradicted_vertices"] / len(before.points) < 0.2
     assert not [warning for warning in joined.warnings if warning.startswith("normals:")]

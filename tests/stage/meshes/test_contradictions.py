@@ -57,7 +57,8 @@ def test_a_ramp_over_a_step_contradicts_and_nothing_else_does(drift):
     found = join_normals(points, faces, sigma, normals, np.full(len(points), np.radians(0.5)), pixel_m=PIXEL)
     on = (points[:, 0] > MIDDLE) & (points[:, 0] < MIDDLE + PIXEL)
     away = np.abs(points[:, 0] - MIDDLE - PIXEL / 2) > 5 * PIXEL  # averages reach over four pixels
-    assert (found.moved[on] == 0).all() and (found.moved[away] != 0).mean() > 0.99
+    # the ramp moves with what is beside it, by less than the noise that is taken from there; its normals would ask for 3 mm
+    assert np.abs(found.moved[on]).max() < sigma[0] and on.sum() <= found.contradicted < (~away).sum()
     for side in (points[:, 0] < MIDDLE, points[:, 0] > MIDDLE + PIXEL):
         true = np.where(points[side, 0] > MIDDLE, STEP, 0)
         before, after = (float(np.sqrt(np.mean((each[side, 2] - true) ** 2))) for each in (points, found.points))
