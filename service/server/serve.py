@@ -23,6 +23,7 @@ from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Conne
 from service.server.database.engine import Database, open_database
 from service.server.garbage import collect_seldom
 from service.server.housekeeping import Housekeeper
+from service.server.interned import enlarge_interned
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
@@ -86,6 +87,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     ending = threading.Thread(target=end, name="relit-end", daemon=True)
     ending.start()
     collect_seldom()
+    enlarge_interned()
     try:
         server.run(sockets=[listening])
     finally:
