@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
+from benchmarks.fresnel import fresnel_table
 from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
@@ -100,6 +101,11 @@ def materials(given: argparse.Namespace) -> list[str] | None:
     return None if given.glossy is None else material_table(given.glossy)
 
 
+def fresnel(given: argparse.Namespace) -> list[str] | None:
+    """Measure what Schlick's approximation makes of F0."""
+    return fresnel_table(given.glossy, given.relighting)
+
+
 def ablation(given: argparse.Namespace) -> list[str] | None:
     """Measure the parts of the general solver, one at a time."""
     return ablation_table(given.data, given.glossy, given.relighting)
@@ -179,6 +185,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "real": ("Real objects", real),
     "glossy": ("Glossy and metallic objects", glossy),
     "materials": ("Effect of sharing materials", materials),
+    "fresnel": ("F0 of dielectrics under Schlick's approximation", fresnel),
     "ablation": ("Effect of each part of `svbrdf`", ablation),
     "relighting": ("Relighting", relighting),
     "left_out": ("Real lights left out", left_out),
