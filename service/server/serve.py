@@ -59,6 +59,8 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     limits = limits_of(settings, raise_descriptors())
     listening = _listen(settings)
     database = open_database(settings, prepare)
+    if database.is_sqlite:  # a server of PostgreSQL has connections for several processes, which others may need
+        database.open_connections()
     supervisor = Supervisor(settings, devices.of_workers(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -80,6 +80,18 @@ class Database:
         """Raises: DBAPIError: the database does not answer."""
         with self.engine.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
+
+    def open_connections(self) -> None:
+        """Open all connections that the pool may keep, so that none is opened, and fills its caches, when requests first coincide.
+
+        Raises:
+            DBAPIError: the database does not answer.
+        """
+        pool = self.engine.pool
+        assert isinstance(pool, sa.QueuePool), "connect makes it"
+        with ExitStack() as opened:
+            for _ in range(pool.size()):
+                opened.enter_context(self.engine.connect())
 
     def close(self) -> None:
         """Close the connections."""
