@@ -1,5 +1,6 @@
 """Fixtures of every test, and the order of test files."""
 
+import atexit
 import gc
 from collections.abc import Generator
 from pathlib import Path
@@ -24,11 +25,7 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.enable()
         gc.freeze()
-
-
-def pytest_unconfigure() -> None:
-    """What was spared can be freed as the interpreter ends: some libraries then look for leaks."""
-    gc.unfreeze()
+        atexit.register(gc.unfreeze)  # some libraries look for leaks as the interpreter ends; pytest's last search comes before
 
 
 PROGRAMS = ("clients", "server")
