@@ -23,6 +23,8 @@ HOME = Path(__file__).resolve().parents[1]
 LIGHTS = 96
 RTI_SIZE, RTI_RADIUS = (700, 1000), 138
 """Rows and columns of the images, and the radius of the object in them: 60 000 pixels."""
+FULL_SIZE, FULL_RADIUS = (200, 300), 190
+"""The same number of pixels where the object fills the images."""
 TINY_SIZE, TINY_RADIUS, TINY_LIGHTS = (64, 64), 30, 16
 NOISE = 0.004
 RELIT = ["-m", "service.cli.main"]
@@ -77,7 +79,8 @@ def main() -> None:
     given = arguments.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        rti, tiny, out = folder / "rti", folder / "tiny", folder / "out"
+        full, rti, tiny, out = folder / "full", folder / "rti", folder / "tiny", folder / "out"
+        make_capture(full, FULL_SIZE, FULL_RADIUS, LIGHTS, ".jpg")
         make_capture(rti, RTI_SIZE, RTI_RADIUS, LIGHTS, ".jpg")
         make_capture(tiny, TINY_SIZE, TINY_RADIUS, TINY_LIGHTS, ".png")
         solve = [*RELIT, "solve", "--out", str(out), "--device", "cpu"]
@@ -87,8 +90,10 @@ def main() -> None:
             "relit --help": Run([*RELIT, "--help"]),
             "solve, tiny, lambert": Run([*solve, str(tiny), "--method", "lambert"]),
             "solve, tiny": Run([*solve, str(tiny)]),
-            "solve, 60 000 pixels x 96 JPEGs, lambert": Run([*solve, str(rti), "--method", "lambert"],
-                                                            lambda: shutil.rmtree(rti / CACHE_FOLDER, ignore_errors=True)),
+            "solve, 96 JPEGs of 60 000 pixels, lambert": Run([*solve, str(full), "--method", "lambert"],
+                                                             lambda: shutil.rmtree(full / CACHE_FOLDER, ignore_errors=True)),
+            "solve, 96 JPEGs of 700 000 pixels, 60 000 in the mask, lambert": Run(
+                [*solve, str(rti), "--method", "lambert"], lambda: shutil.rmtree(rti / CACHE_FOLDER, ignore_errors=True)),
             "again, with the stack cached": Run([*solve, str(rti), "--method", "lambert"]),
         }
         if given.demo:

@@ -1,5 +1,6 @@
 """The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
 
+import gc
 import importlib
 import io
 import os
@@ -18,7 +19,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "imports": ("import",),
     "captures": ("info",),
     "calibrate": ("calibrate",),
-    "solve": ("solve", "export", "basis", "join"),
+    "solve": ("solve",),
+    "export": ("export", "basis", "join"),
     "inspect": ("inspect",),
     "depth": ("depth", "separate", "scan", "simulate", "patterns"),
     "boards": ("inspect-board", "gauge-board"),
@@ -41,6 +43,10 @@ BAD_INPUT, INTERRUPTED = 2, 130
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 """The variables by which NumPy's linear algebra is told its number of threads. Without them it has one: kernels divide the large work among
 the cores, and matrices of some hundred rows cost more to divide than to solve."""
+
+NEW_OBJECTS = 50_000
+"""Python looks for unreachable cycles of objects after so many new ones, not after 700: imports make hundreds of thousands of objects that
+stay, and to look through them time and again is a tenth of the start. No array of a solve is in a cycle, so that memory does not wait."""
 
 
 def program(wanted: str | None = None) -> typer.Typer:
@@ -70,6 +76,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
+    gc.set_threshold(NEW_OBJECTS)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # paths may hold bytes that are not text
     if not any(name in os.environ for name in BLAS_THREADS):  # numpy is not imported yet

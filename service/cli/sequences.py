@@ -6,14 +6,14 @@ import typer
 
 from service.cli.printing import print_warnings
 from service.errors import RequestError
-from service.requests.depth import DepthRequest
-from service.requests.solve import SolveRequest
 
 if TYPE_CHECKING:
+    from service.requests.depth import DepthRequest
+    from service.requests.solve import SolveRequest
     from service.sequences.run import SequenceResult
 
 
-def check_single(request: SolveRequest | DepthRequest) -> None:
+def check_single(request: "SolveRequest | DepthRequest") -> None:
     """Check that a capture that is no sequence has no option of sequences.
 
     Raises:

@@ -105,7 +105,7 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
         return None
     inward, decided = _is_clear(edge), None
     if lights is not None:
-        decided = _is_inverted(*_shadows(given, solution, small, lights), len(lights.direction) >= MANY_LIGHTS, alone=not inward)
+        decided = _is_inverted(_Shadows(given, solution, small, lights), len(lights.direction) >= MANY_LIGHTS, alone=not inward)
     if decided:
         return LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that "
                          "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
@@ -115,18 +115,18 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
                      "(turned by 180° about the view axis); nothing else in the images decides")
 
 
-def _is_inverted(height: tuple[int, float], inverse: tuple[int, float], many: bool, *, alone: bool) -> bool | None:
+def _is_inverted(shadows: "_Shadows", many: bool, *, alone: bool) -> bool | None:
     """Return whether cast shadows say that a surface is inverted; None where they do not decide.
 
     Args:
-        height: readings in shadow of the surface, and which part of them is lit.
-        inverse: the same of its inverse.
+        shadows: of the surface and its inverse.
         many: whether there are enough lights for the first to contradict the surface.
         alone: whether there is no outline that speaks for the inversion.
     """
-    (count, lit), (count_inverse, lit_inverse) = height, inverse
+    count, lit = shadows.of_surface()
     if count < (LEAST_SHADOWS_ALONE if alone else LEAST_SHADOWS):
         return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
+    count_inverse, lit_inverse = shadows.of_inverse()
     explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= LIT_SHADOW
     if alone:
         return many and explained and lit >= LIT_WRONG
@@ -176,29 +176,39 @@ def _is_clear(edge: Outline) -> bool:
     return abs(edge.outward) >= CLEAR and part >= CLEAR_PART
 
 
-def _shadows(given: SolveInput, solution: Solution, small: _Map, lights: DistantLights) -> tuple[tuple[int, float], tuple[int, float]]:
-    """Return how many readings the height, and its inverse, put in cast shadow, and which part of them is lit."""
-    rows, cols = small.mask.shape
-    across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
-    height = integrate_normals(small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
-                               options=IntegrationOptions(discontinuities=True), device=given.device).height.numpy()
-    surface = np.flatnonzero(small.mask)
-    chosen = surface[evenly(len(surface), SHADOW_PIXELS)]
-    some = evenly(len(lights.direction), SHADOW_LIGHTS)
-    pixels = small.pixels.reshape(-1)[chosen]
-    radiance, usable = given.stack.pick_radiance(pixels)
-    readings = grey_readings(radiance[some], lights.irradiance[some])
-    direction = lights.direction[some]
-    cosine = direction @ solution.normal[:, pixels]
-    level = median_of(readings / np.maximum(cosine, LEVEL_COSINE), (cosine > LEVEL_COSINE) & usable[some])
-    compared = (cosine > LEAST_COSINE) & usable[some] & (level > 0)
-    lit = readings > LIT * level * cosine
+class _Shadows:
+    """The cast shadows of a surface and of its inverse, compared with readings."""
 
-    def part_lit(height: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
-        shadow = cast_shadows(height, small.mask, chosen, direction) & compared
-        return int(shadow.sum()), float(lit[shadow].mean()) if shadow.any() else 0.0
+    def __init__(self, given: SolveInput, solution: Solution, small: _Map, lights: DistantLights) -> None:
+        """Integrate a small map, and read some of its pixels under some of the lights."""
+        rows, cols = small.mask.shape
+        across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
+        self._height = integrate_normals(
+            small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
+            options=IntegrationOptions(discontinuities=True), device=given.device).height.numpy()
+        surface = np.flatnonzero(small.mask)
+        self._mask, self._chosen = small.mask, surface[evenly(len(surface), SHADOW_PIXELS)]
+        some = evenly(len(lights.direction), SHADOW_LIGHTS)
+        pixels = small.pixels.reshape(-1)[self._chosen]
+        radiance, usable = given.stack.pick_radiance(pixels)
+        readings = grey_readings(radiance[some], lights.irradiance[some])
+        self._direction = lights.direction[some]
+        cosine = self._direction @ solution.normal[:, pixels]
+        level = median_of(readings / np.maximum(cosine, LEVEL_COSINE), (cosine > LEVEL_COSINE) & usable[some])
+        self._compared = (cosine > LEAST_COSINE) & usable[some] & (level > 0)
+        self._lit = readings > LIT * level * cosine
 
-    return part_lit(height, direction), part_lit(-height, direction @ INVERSE)
+    def of_surface(self) -> tuple[int, float]:
+        """Return how many readings the surface puts in cast shadow, and which part of them is lit."""
+        return self._part_lit(self._height, self._direction)
+
+    def of_inverse(self) -> tuple[int, float]:
+        """Return the same of the inverse."""
+        return self._part_lit(-self._height, self._direction @ INVERSE)
+
+    def _part_lit(self, height: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
+        shadow = cast_shadows(height, self._mask, self._chosen, direction) & self._compared
+        return int(shadow.sum()), float(self._lit[shadow].mean()) if shadow.any() else 0.0
 
 
 def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -70,6 +70,7 @@ def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, direc
     row, col = np.divmod(pixels, cols)
     start = height.reshape(-1)[pixels]
     surface = np.where(mask, height, -np.inf)
+    most = surface.max() - start.min() - LIFT  # a ray that has risen by more is above all of the surface
     far = float(np.hypot(rows, cols))
     steps = np.unique(np.round(np.concatenate([
         np.arange(2, FIRST_STEPS), np.geomspace(FIRST_STEPS, max(far, FIRST_STEPS + 1.0), STEPS - FIRST_STEPS)])))[:, None]
@@ -78,11 +79,13 @@ def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, direc
         across = np.hypot(x, y)
         if z <= 0 or across < 1e-3:
             continue
-        at_col = np.round(col + steps * x / across).astype(int)
-        at_row = np.round(row - steps * y / across).astype(int)
+        rise = z / across + LIFT_SLOPE
+        near = steps[steps[:, 0] * rise <= most]
+        at_col = np.round(col + near * x / across).astype(int)
+        at_row = np.round(row - near * y / across).astype(int)
         seen = (at_col >= 0) & (at_col < cols) & (at_row >= 0) & (at_row < rows)
         met = np.where(seen, surface[np.clip(at_row, 0, rows - 1), np.clip(at_col, 0, cols - 1)], -np.inf)
-        hidden[light] = (met > start + steps * (z / across + LIFT_SLOPE) + LIFT).any(axis=0)
+        hidden[light] = (met > start + near * rise + LIFT).any(axis=0)
     return hidden
 
 
