@@ -1,4 +1,5 @@
-"""Seconds of short runs, for the user who waits: `python -m benchmarks.short_runs`. It makes its captures by itself.
+"""Seconds of short runs, for the user who waits: `python -m benchmarks.short_runs` prints the table of docs/figures.md. It makes its
+captures by itself.
 
 Beside each run stands the floor: Python alone, and Python that imports Warp. The commands take turns, so that a busy machine slows all.
 """
@@ -12,14 +13,20 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from benchmarks.start import ENVIRONMENT
 from stage.ingest import CACHE_FOLDER
 
 HOME = Path(__file__).resolve().parents[1]
+RUNS = 5
+IDLE, LOOK_S, PATIENCE_S = 0.8, 0.5, 400.0
+"""The part of all cores that other programs leave idle before a run starts, the seconds in which it is measured, and the seconds that all
+runs together wait for it."""
 LIGHTS = 96
 RTI_SIZE, RTI_RADIUS = (700, 1000), 138
 """Rows and columns of the images, and the radius of the object in them: 60 000 pixels."""
@@ -66,17 +73,35 @@ def measure(run: Run) -> tuple[float, float]:
     """Return the wall seconds and the CPU seconds of one run."""
     run.prepare()
     before, began = os.times(), time.perf_counter()
-    subprocess.run([sys.executable, *run.arguments], cwd=HOME, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
+    subprocess.run([sys.executable, *run.arguments], cwd=HOME, env=ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                   check=True)
     seconds, after = time.perf_counter() - began, os.times()
     return seconds, after.children_user + after.children_system - before.children_user - before.children_system
 
 
-def main() -> None:
-    """Make the captures, time the commands in turn, and print the best of each."""
-    arguments = argparse.ArgumentParser(description=__doc__)
-    arguments.add_argument("--runs", type=int, default=5)
-    arguments.add_argument("--demo", action="store_true", help="the demo too, which takes longer than all others")
-    given = arguments.parse_args()
+def core_seconds() -> tuple[float, float]:
+    """Return the seconds that all cores were idle since the start of the machine, and all their seconds, as Linux counts them."""
+    counts = [int(word) for word in Path("/proc/stat").read_text(encoding="utf-8").split("\n")[0].split()[1:]]
+    return float(counts[3]), float(sum(counts))
+
+
+def wait_until_idle(deadline: float) -> None:
+    """Wait until other programs leave the cores idle, but not beyond a time of `time.monotonic`; not at all on other systems than Linux."""
+    while sys.platform == "linux" and time.monotonic() < deadline:
+        before = core_seconds()
+        time.sleep(LOOK_S)
+        idle, whole = (after - first for after, first in zip(core_seconds(), before, strict=True))
+        if idle >= IDLE * whole:
+            return
+
+
+def short_runs_table(runs: int = RUNS, *, demo: bool = False) -> list[str]:
+    """Make the captures, time the commands in turn, and return the best of each as lines of Markdown.
+
+    Args:
+        runs: of each command, after one that is not timed.
+        demo: whether to time the demo too, which takes longer than all others.
+    """
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         full, rti, tiny, out = folder / "full", folder / "rti", folder / "tiny", folder / "out"
@@ -84,31 +109,43 @@ def main() -> None:
         make_capture(rti, RTI_SIZE, RTI_RADIUS, LIGHTS, ".jpg")
         make_capture(tiny, TINY_SIZE, TINY_RADIUS, TINY_LIGHTS, ".png")
         solve = [*RELIT, "solve", "--out", str(out), "--device", "cpu"]
-        runs = {
-            "python -c pass": Run(["-c", "pass"]),
-            "import warp": Run(["-c", "import warp"]),
-            "relit --help": Run([*RELIT, "--help"]),
-            "solve, tiny, lambert": Run([*solve, str(tiny), "--method", "lambert"]),
-            "solve, tiny": Run([*solve, str(tiny)]),
-            "solve, 96 JPEGs of 60 000 pixels, lambert": Run([*solve, str(full), "--method", "lambert"],
-                                                             lambda: shutil.rmtree(full / CACHE_FOLDER, ignore_errors=True)),
-            "solve, 96 JPEGs of 700 000 pixels, 60 000 in the mask, lambert": Run(
+        commands = {
+            "`python -c pass`": Run(["-c", "pass"]),
+            "`import warp`": Run(["-c", "import warp"]),
+            "`relit --help`": Run([*RELIT, "--help"]),
+            "`relit solve` of 16 images of 4096 pixels, `lambert`": Run([*solve, str(tiny), "--method", "lambert"]),
+            "the same, with the method that Relit chooses": Run([*solve, str(tiny)]),
+            "`relit solve` of 96 JPEGs of 60 000 pixels, `lambert`": Run([*solve, str(full), "--method", "lambert"],
+                                                                         lambda: shutil.rmtree(full / CACHE_FOLDER, ignore_errors=True)),
+            "`relit solve` of 96 JPEGs of 700 000 pixels, 60 000 in the mask, `lambert`": Run(
                 [*solve, str(rti), "--method", "lambert"], lambda: shutil.rmtree(rti / CACHE_FOLDER, ignore_errors=True)),
             "again, with the stack cached": Run([*solve, str(rti), "--method", "lambert"]),
         }
-        if given.demo:
-            runs["demo"] = Run([*RELIT, "demo", "--out", str(folder / "demo"), "--device", "cpu"],
-                               lambda: shutil.rmtree(folder / "demo", ignore_errors=True))
-        for run in runs.values():
-            measure(run)  # compiles the kernels
-        taken: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
-        for _ in range(given.runs):
-            for name, run in runs.items():
+        if demo:
+            commands["`relit demo`"] = Run([*RELIT, "demo", "--out", str(folder / "demo"), "--device", "cpu"],
+                                           lambda: shutil.rmtree(folder / "demo", ignore_errors=True))
+        for run in commands.values():
+            measure(run)  # compiles the kernels, and keeps the bytecode of modules
+        taken: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
+        deadline = time.monotonic() + PATIENCE_S
+        for _ in range(runs):
+            for name, run in commands.items():
+                wait_until_idle(deadline)
                 taken[name].append(measure(run))
-    print("| run | wall s | CPU s |\n|---|---|---|")
-    for name, each in taken.items():
-        wall, cpu = (min(column) for column in zip(*each, strict=True))
-        print(f"| {name} | {wall:.2f} | {cpu:.2f} |")
+    rows = [f"| {name} | {min(wall):.2f} | {median(wall):.2f} | {min(cpu):.2f} |"
+            for name, each in taken.items() for wall, cpu in [zip(*each, strict=True)]]
+    return [f"Each command {runs} times, all of them in turn, with compiled kernels, as far as possible while other work left the machine "
+            "idle. The stack is made anew but in the last row.", "",
+            "| run | best, s | median, s | CPU s |", "|---|---|---|---|", *rows]
+
+
+def main() -> None:
+    """Print the table."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--runs", type=int, default=RUNS)
+    arguments.add_argument("--demo", action="store_true", help="the demo too, which takes longer than all others")
+    given = arguments.parse_args()
+    print("\n".join(short_runs_table(given.runs, demo=given.demo)))
 
 
 if __name__ == "__main__":

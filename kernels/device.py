@@ -30,9 +30,6 @@ UNEVEN_BLOCKS = 4
 """CPU blocks per core where some take longer than others. Where all take the same, one a core: starting a block takes a tenth of a
 millisecond of the interpreter, during which the other cores wait."""
 
-BRIEF_THREADS = 8192
-"""Brief threads that run faster on one core than it takes to start another."""
-
 CPU_BLOCK = 1
 """The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
 
@@ -182,12 +179,12 @@ class Recorded:
 
 
 def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any], *, device: str, uneven: bool = False,
-           brief: bool = False) -> Recorded:
+           brief: int = 0) -> Recorded:
     """Return a launch without running it.
 
     Args:
         kernel, count, inputs, outputs, device, uneven: as for launch. The arrays must live as long as the record.
-        brief: whether a thread takes less than a tenth of a microsecond; on the CPU few of them run on one core.
+        brief: count of threads up to which one core of the CPU has done them before another has been started.
 
     Raises:
         ArrayError: more threads than a launch can have.
@@ -202,8 +199,7 @@ def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
         return Recorded([wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device, block_dim=CUDA_BLOCK,
                                    record_cmd=True)])
     workers = worker_count()
-    alone = workers == 1 or (brief and count < BRIEF_THREADS)
-    blocks = 1 if alone else min(count, workers * (UNEVEN_BLOCKS if uneven else 1))
+    blocks = 1 if workers == 1 or count <= brief else min(count, workers * (UNEVEN_BLOCKS if uneven else 1))
     edges = [count * b // blocks for b in range(blocks + 1)]
 
     # recorded here, so that the pool's threads need the interpreter for a moment only

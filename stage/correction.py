@@ -101,8 +101,9 @@ class Correction:
         recorded = self.capture.recorded(frame.image, keep_half=True)
         saturated: np.ndarray | None = None
         limit = manifest.saturation
-        if limit is None and self.full_scale and images.read_header(self.capture.file(frame.image)).integer:
-            limit = FULL_SCALE
+        if limit is None and self.full_scale:
+            integer = recorded.dtype.kind == "u" or images.read_header(self.capture.file(frame.image)).integer  # 32 bits are read as float
+            limit = FULL_SCALE if integer else None
         if limit is not None:
             saturated = _any_from(limit, recorded)
         if self._is_pointwise and (recorded.dtype.kind == "u" or (recorded.dtype == np.float16 and is_linear(manifest.color_space))):

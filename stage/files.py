@@ -13,8 +13,13 @@ _umask_lock = threading.Lock()
 
 
 @contextmanager
-def replacing(path: str | Path) -> Iterator[Path]:
+def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces `path` when the block ends without an error and is removed otherwise.
+
+    Args:
+        path: the file.
+        flush: whether to wait until the file is on the disk. False for a file that its reader checks and can make again: it may be damaged
+            after a power failure.
 
     Convention:
         The temporary file lies in the same folder and has the same suffix, because writers choose a format by the suffix.
@@ -33,8 +38,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
         with storage("write", target):
             yield temporary
             os.chmod(temporary, 0o666 & ~_umask())
-            with open(temporary, "rb") as written:
-                os.fsync(written.fileno())
+            if flush:
+                with open(temporary, "rb") as written:
+                    os.fsync(written.fileno())
             os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)

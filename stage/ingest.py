@@ -170,7 +170,7 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
     lock = threading.Lock()
 
     values = stacks.values_path(folder, key)
-    with replacing(values) as temporary, open(temporary, "r+b") as file:
+    with replacing(values, flush=False) as temporary, open(temporary, "r+b") as file:  # the index has checksums of all planes
         np.lib.format.write_array_header_1_0(
             file, {"descr": "<f2", "fortran_order": False, "shape": (CHANNELS, lights, pixels)})
         start = file.tell()

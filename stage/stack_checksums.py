@@ -7,9 +7,10 @@ of giving other values. CRC-32 finds every change of up to 32 neighbouring bits,
 import os
 import threading
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -54,9 +55,9 @@ def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksu
             return False
         start, size = values.offset, values.nbytes // len(expected)
         del values
+        edges = [len(expected) * part // THREADS for part in range(THREADS + 1)]
         with ThreadPoolExecutor(THREADS, thread_name_prefix="relit-checksums") as pool:
-            if not all(pool.map(lambda number, checksum: _of_bytes(path, start + number * size, size) == checksum,
-                                range(len(expected)), expected)):
+            if not all(pool.map(lambda first, end: _have(path, start + first * size, size, expected[first:end]), edges, edges[1:])):
                 return False
     except (OSError, ValueError, EOFError, SyntaxError, MemoryError):  # gone, truncated, or the header is damaged
         return False
@@ -65,13 +66,18 @@ def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksu
     return True
 
 
-def _of_bytes(path: Path, start: int, size: int) -> int:
-    """Return the checksum of a part of a file, which is read: mapped pages would stay in the process."""
-    checksum = 0
+def _have(path: Path, start: int, size: int, checksums: Sequence[int]) -> bool:
+    """Return whether consecutive parts of a file have these checksums. They are read: mapped pages would stay in the process."""
     with open(path, "rb", buffering=0) as file:
         file.seek(start)
-        while size > 0 and (content := file.read(min(size, PIECE_BYTES))):
-            checksum, size = zlib.crc32(content, checksum), size - len(content)
+        return all(_of_next(file, size) == checksum for checksum in checksums)
+
+
+def _of_next(file: BinaryIO, size: int) -> int:
+    """Return the checksum of the next bytes of a file."""
+    checksum = 0
+    while size > 0 and (content := file.read(min(size, PIECE_BYTES))):
+        checksum, size = zlib.crc32(content, checksum), size - len(content)
     return checksum
 
 

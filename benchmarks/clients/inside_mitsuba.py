@@ -1,6 +1,6 @@
 """Renders an asset that benchmarks.clients.usd_arrays has read with Mitsuba; runs in a Python with mitsuba, which has nothing of relit.
 
-    python inside_mitsuba.py job.json
+    python one_after_another.py inside_mitsuba.py
 
 The scalar variant needs no LLVM. The material is Mitsuba's `principled`, what it makes of UsdPreviewSurface's metallic workflow.
 
@@ -9,7 +9,6 @@ poles, so rows are resampled by the nearest pixel on a finer grid.
 """
 
 import json
-import sys
 
 import mitsuba as mi
 import numpy as np
@@ -17,8 +16,9 @@ import numpy as np
 UPSAMPLE = 4
 
 
-def main() -> None:
-    with open(sys.argv[1]) as stream:
+def main(path: str) -> None:
+    """Render the job of this file."""
+    with open(path) as stream:
         job = json.load(stream)
     mi.set_variant("scalar_rgb")
     with np.load(job["arrays"]) as stored:
@@ -108,6 +108,3 @@ def sensor(camera: dict, world_from_camera: np.ndarray, nearest: float, farthest
             "far_clip": 2 * unit * width + farthest - nearest,
             "to_world": world @ mi.ScalarTransform4f().translate(centre) @ mi.ScalarTransform4f(half_turn)
             @ mi.ScalarTransform4f().scale([half, half, 1.0])}
-
-
-main()

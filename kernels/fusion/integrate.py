@@ -6,7 +6,8 @@ whichever brick computes it and in whichever order views are given to the same v
 
 Three rules keep thin parts and gaps as they are. Distances count within the truncation alone. Where the normals of the views
 disagree, as on both sides of a thin sheet, at an edge, or in a narrow gap, those views count whose surface is turned like that of the
-nearest one. And a voxel that as many views saw to be empty as measured a surface there is no surface.
+nearest one. And a voxel inside of what was measured that as many views saw to be empty as measured a surface there is no surface; outside
+of it a voxel is empty, as those see who look past the edge of a part.
 
 Source: Curless and Levoy, "A Volumetric Method for Building Complex Models from Range Images", SIGGRAPH 1996 (weights, the space in front
 of a surface is empty); Bylow et al., "Real-Time Camera Tracking and 3D Reconstruction Using Signed Distance Functions", RSS 2013 (distance
@@ -32,7 +33,7 @@ NEAR_SIGMAS = 3.0
 from the view, which is no evidence against another that sees the voxel to be empty."""
 
 UNKNOWN, SURFACE, EMPTY = 0, 1, 2
-"""States of a voxel: not measured; near a measured surface; measured by fewer views than saw it to be empty."""
+"""States of a voxel: not measured; near a measured surface; inside of one, and measured by fewer views than saw it to be empty."""
 
 
 class Volume(NamedTuple):
@@ -155,7 +156,7 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
         known = wp.int32(SURFACE)
         value[i] = total / weights
         variance[i] = spread / (weights * weights)
-    if empty > 0 and empty >= near:
+    if empty > 0 and empty >= near and total <= 0.0:
         known = wp.int32(EMPTY)
     state[i] = wp.uint8(known)
 

@@ -9,6 +9,11 @@ that costs clearly more and the surface is a metal, without diffuse reflection. 
 roughness: they take the materials that the object's pixels share (`shared_materials`), in the mixture that explains them, wherever that
 explains them about as well as a material of their own.
 
+A pixel of a dielectric whose F0 is far above those that the object's dielectrics share is searched again. For a narrow highlight, which few
+lights show, several roughnesses are local minima of the robust cost, and weights that begin with those of another roughness can take the
+brightest reading for an outlier: so each roughness begins anew, with a free F0 and with one that is shared, since dielectrics differ more
+in roughness than in F0. The shared F0 is taken where it explains the pixel about as well.
+
 Sources: the BRDF is that of `kernels.microfacet` (Walter et al., EGSR 2007; Heitz, JCGT 2014; Schlick 1994; Burley 2012); non-negative
 least squares after Lawson and Hanson, "Solving Least Squares Problems", 1974, chapter 23; highlights of the light's colour after Shafer,
 "Using color to separate reflection components", Color Research and Application 1985.
@@ -24,10 +29,10 @@ from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
 from kernels.photometric.lobes import direction_reflectance
-from kernels.photometric.material_kernel import GIVEN, NEUTRAL, TINTED, material_kernel
+from kernels.photometric.material_kernel import GIVEN, GIVEN_F0, NEUTRAL, TINTED, material_kernel
 from kernels.photometric.response_table import COLUMNS
 from kernels.photometric.robust_weights import WEIGHT_ROWS
-from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
+from kernels.photometric.samples import Samples, choose, per_pixel, scratch_memory, to_host
 from kernels.photometric.tabulated_lobes import tabulated_reflectance
 
 NEUTRAL_RISE = 1.25
@@ -44,6 +49,10 @@ SHARED_RISE = 1.4
 """Factor by which the cost of a shared material may exceed that of the pixel's own material."""
 COST_FLOOR = 0.005
 """Costs per light whose difference is below this count as equal: it is the cost of a residual of 0.07 σ at every light."""
+FAR_F0 = 2.0
+"""Factor by which the F0 of a dielectric pixel exceeds those that the object's dielectrics share from which on the pixel is searched again:
+that between the refractive indices 1.5 and 1.8, and more than paints, plastics and skin differ. A pixel with a low F0 stays as it is: it
+lacks a highlight, and one that is added where the normal is a degree off shines under the wrong light."""
 BLEND = 0.02
 """Temperature of the mixture of shared materials, whose weights are exp(-(cost - best) / (blend · (best + floor))): materials whose cost is
 within a few per cent of the best contribute."""
@@ -90,7 +99,36 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     if shared is None or not len(shared):
         return own
     blend = _blend([fit_given(samples, normal, material, shape=shape, options=options) for material in shared])
-    return _where(blend.cost <= SHARED_RISE * own.cost + COST_FLOOR, blend, own)
+    explained = explains(blend, own)
+    found = _where(explained, blend, own)
+    common = np.unique(shared[is_dielectric(shared), 0])
+    if not len(common):
+        return found
+    doubtful = np.flatnonzero(~explained & ~metal & outlying(own.specular, common))
+    if not len(doubtful):
+        return found
+    few, there = choose(samples, doubtful), normal[doubtful]
+    cold = _fit(few, there, shape, options, None, NEUTRAL, np.full(4, BRIGHTEST_DIELECTRIC), anew=True)
+    one_f0 = [fit_given_f0(few, there, f0, shape=shape, options=options) for f0 in common]
+    again = _reconcile(_pick(own, doubtful), cold, one_f0, _pick(blend, doubtful), common)
+    for plane, better in zip(found, again, strict=True):
+        plane[doubtful] = better
+    return found
+
+
+def outlying(specular: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """Return which F0, [n, 3] of dielectrics, exceed the largest of the common ones, [values], by more than FAR_F0."""
+    return np.asarray(specular[:, 0] > FAR_F0 * common.max())
+
+
+def explains(shared: Material, own: Material) -> np.ndarray:
+    """Return where what pixels share explains them about as well as a material of their own."""
+    return np.asarray(shared.cost <= SHARED_RISE * own.cost + COST_FLOOR)
+
+
+def is_dielectric(materials: np.ndarray) -> np.ndarray:
+    """Return which materials, [materials, 4] F0 and roughness, are dielectrics: F0 is the same in all channels and low."""
+    return np.asarray((np.ptp(materials[:, :3], axis=1) == 0) & (materials[:, 0] <= BRIGHTEST_DIELECTRIC))
 
 
 def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
@@ -113,8 +151,18 @@ def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, sha
     return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN, material)
 
 
+def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
+    """Fit albedo and roughness of sampled pixels to an F0 that is given. Each roughness begins with the weights of readings without misfit.
+
+    Args:
+        samples, normal, shape, options: as for fit_material.
+        f0: of all channels.
+    """
+    return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN_F0, np.full(4, f0), anew=True)
+
+
 def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions, table: wp.array | None, freedom: int,
-         given: np.ndarray | None = None) -> Material:
+         given: np.ndarray | None = None, *, anew: bool = False) -> Material:
     if table is not None and table.shape[1:] != (samples.light_count, COLUMNS):
         raise ArrayError(f"table is {table.shape}, the samples have {samples.light_count} lights: give their response table")
     device, lanes, packs = samples.device, samples.lanes, samples.packs
@@ -125,11 +173,34 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
     scratch, strides = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
     devices.launch(material_kernel(lanes, reflectance, table is not None), packs,
                    [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
-                    *criteria(options, shape), freedom, known, samples.light_count, samples.pack_stride, samples.light_stride, *strides],
+                    *criteria(options, shape), freedom, int(anew), known, samples.light_count, samples.pack_stride, samples.light_stride,
+                    *strides],
                    [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),
                     values[:, 7] / samples.light_count)
+
+
+def _reconcile(own: Material, cold: Material, one_f0: list[Material], blend: Material, common: np.ndarray) -> Material:
+    """Return the materials of dielectric pixels whose own F0 is far above the common ones.
+
+    Args:
+        own, cold: with an F0 of the pixel's own, from two starts.
+        one_f0: with each of the common F0.
+        blend: of the shared materials.
+        common: [values] F0.
+    """
+    own = _where(cold.cost < own.cost, cold, own)
+    best = one_f0[0]
+    for other in one_f0[1:]:
+        best = _where(other.cost < best.cost, other, best)
+    found = _where(outlying(own.specular, common) & explains(best, own), best, own)
+    return _where(explains(blend, own), blend, found)
+
+
+def _pick(material: Material, positions: np.ndarray) -> Material:
+    """Return the material of some pixels."""
+    return Material(*(plane[positions] for plane in material))
 
 
 def _where(first: np.ndarray, a: Material, b: Material) -> Material:

@@ -18,8 +18,8 @@ HALVINGS = 3
 """Number of times that the step about the best roughness is halved: to a resolution of 0.01."""
 REWEIGHTINGS, WARM_REWEIGHTINGS = 4, 2
 """Rounds of the robust fit at the first roughness, and at those that follow, which begin with the weights of the one before or of the best:
-three rounds change no error by more than a hundredth of itself. Under extended lights, whose tables have a surface without a lobe beside
-those with one, each roughness begins anew."""
+three rounds change no error by more than a hundredth of itself. Each roughness begins anew under extended lights, whose tables have a
+surface without a lobe beside those with one, and in pixels that are searched again because their F0 is an outlier."""
 COMMON_ROUNDS = 3
 """Rounds of the fit of an F0 that the channels share. Each round fixes which channels have an albedo above 0; after three this no longer
 changes."""
@@ -31,6 +31,8 @@ NEUTRAL = wp.constant(1)
 """Fit mode with free roughness and one F0 up to a bound, for dielectrics, whose highlights have the colour of the light."""
 GIVEN = wp.constant(2)
 """Fit mode in which F0 and roughness are given and the albedo alone is fitted."""
+GIVEN_F0 = wp.constant(3)
+"""Fit mode with free roughness and an F0 that is given."""
 
 
 @once
@@ -61,6 +63,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                    shadow: wp.vec2,  # r²/σ² of equal cost, depth
                    form: wp.vec2,  # diffuse roughness, slope
                    freedom: int,
+                   anew: int,  # 1: each roughness begins with the weights of readings without misfit
                    known: wp.vec4,  # F0 and roughness, where they are given; else the bound of a common F0, last
                    light_count: int,
                    pack_stride: int,
@@ -107,7 +110,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                     f0[c, k] = wp.where(late == 0, best_f0[c, k], f0[c, k])
             respond(table, nx, ny, nz, vx, vy, vz, rough, light_count, base, light_step, scratch_step, scratch)
             cost, product = lane_type(), lane_type()
-            cold = wp.where(trial * wp.static(int(not bare)) == 0, 1, 0)
+            cold = wp.where(trial * (1 - anew) * wp.static(int(not bare)) == 0, 1, 0)
             rounds = wp.where(cold == 1, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
             for turn in range(rounds + 1):
                 heeded = wp.where(cold * wp.where(turn == 0, 1, 0) == 1, 0.0, 1.0)  # at first nothing is known of the misfit

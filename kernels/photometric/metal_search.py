@@ -74,7 +74,7 @@ def search_metals(samples: Samples, normal: np.ndarray, material: Material, meta
         """Try candidates about `start`, at the positions `where`, under one metal."""
         part = choose(few, where)
         for offset in offsets:
-            candidate = _moved(start[where], offset, view[where])
+            candidate = moved(start[where], offset, view[where])
             trial = fit_given(part, candidate, lobe, shape=shape, options=options).cost
             lower = trial < cost[where]
             better = where[lower]
@@ -97,12 +97,12 @@ def _is_metal(material: Material) -> np.ndarray:
     return material.specular.max(axis=1) > BRIGHTEST_DIELECTRIC
 
 
-def _moved(normal: np.ndarray, offset: np.ndarray, view: np.ndarray) -> np.ndarray:
-    """Return unit normals [n, 3] at an offset of `rings`, moved along the view where they would look away from the viewer."""
+def moved(normal: np.ndarray, offset: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """Return unit normals [n, 3] at an offset of `rings`, moved along the view, [n, 3], where they would look away from the viewer."""
     sine, cosine, along, across = offset
     up = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(up, normal)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    moved = cosine * normal + sine * (along * tangent + across * np.cross(normal, tangent))
-    moved += np.maximum(LEAST_NZ - (moved * view).sum(axis=1, keepdims=True), 0) * view
-    return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+    candidate = cosine * normal + sine * (along * tangent + across * np.cross(normal, tangent))
+    candidate += np.maximum(LEAST_NZ - (candidate * view).sum(axis=1, keepdims=True), 0) * view
+    return candidate / np.linalg.norm(candidate, axis=1, keepdims=True)

@@ -13,7 +13,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 import numpy as np
 
 from kernels.photometric.hypotheses import Diffuse, SearchOptions
-from kernels.photometric.material import BRIGHTEST_DIELECTRIC, fit_given, fit_material
+from kernels.photometric.material import fit_given, fit_material, is_dielectric
 from kernels.photometric.samples import Samples, evenly
 
 CANDIDATES = 100
@@ -66,7 +66,7 @@ def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, co
         materials: [materials, 4] F0 and roughness.
         costs: [materials, n] of every pixel under each of them.
     """
-    dielectric = (np.ptp(materials[:, :3], axis=1) == 0) & (materials[:, 0] <= BRIGHTEST_DIELECTRIC)
+    dielectric = is_dielectric(materials)
     if dielectric.sum() < 2:
         return materials
     alike = materials[dielectric]

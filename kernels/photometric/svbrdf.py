@@ -16,6 +16,7 @@ import numpy as np
 
 from kernels.photometric.certainty import assess
 from kernels.photometric.descent import WARM, descend
+from kernels.photometric.f0_doubt import doubt_of_f0
 from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.metal_search import Metals, search_metals
@@ -107,6 +108,8 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         found = find_normals(samples, normal, shape=shape, options=options)  # the readings alone say how sure the normal is
         spread = np.hypot(spread, _angles(found.best.normal, normal))
     material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe, options=options)
+    if shared is not None:
+        spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe, options=options))
     certainty = assess(samples, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
                      certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)

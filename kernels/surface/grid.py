@@ -17,6 +17,9 @@ wp.set_module_options({"enable_backward": False})
 
 CPU_RUN = 8192
 """Number of cells that one CPU thread takes in a row: 32 KB of float32, so that the cost of starting a thread is negligible."""
+BRIEF_RUNS = 16
+"""Number of such runs that are faster on one core than divided: a run takes some microseconds, to start another core a tenth of a
+millisecond."""
 CUDA_SUM_THREADS = 65536
 """Number of threads of a sum on CUDA: enough to fill the largest device, and few enough for their partial sums to be cheap."""
 FOLD_THREADS = 256
@@ -113,7 +116,7 @@ def _sweep(start: int, end: int, stride: int, device: str, *, threads: int | Non
 
 def record(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any]) -> devices.Recorded:
     """Return the launch of `run` without running it."""
-    return devices.record(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=sweep.device)
+    return devices.record(kernel, sweep.threads, [sweep.walk, *inputs], outputs, device=sweep.device, brief=BRIEF_RUNS)
 
 
 def run(kernel: Any, sweep: Sweep, inputs: list[Any], outputs: list[Any]) -> None:

@@ -27,6 +27,8 @@ wp.set_module_options({"enable_backward": False})
 
 COARSEST = 2
 """Side, in pixels, of the coarsest level: smoothing alone solves it."""
+BRIEF_CELLS = 8191
+"""Number of coarse cells that are restricted faster on one core than it takes to start another."""
 COARSEST_SWEEPS = 4
 """Number of smoothing passes on the coarsest level, in each direction."""
 
@@ -198,7 +200,7 @@ class Multigrid:
         g = coarse.grid
         return [*self._start(fine), record(_scaled_residual, fine.grid.odd, [fine.weights, fine.target, fine.value], [fine.scratch]),
                 devices.record(_restrict, g.rows * g.cols, [fine.weights, fine.scratch, g.cols, g.pitch], [coarse.target], device=g.device,
-                               brief=True)]
+                               brief=BRIEF_CELLS)]
 
     def _up(self, coarse: Level, fine: Level) -> list[Recorded]:
         return [record(_prolong, fine.grid.odd, [fine.weights, coarse.value, coarse.grid.pitch], [fine.value]), self._smooth(fine, 0),

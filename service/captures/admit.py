@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from service.light.sequence import time_steps
+from service.light.time_steps import time_steps
 from service.reporting.progress import Progress, Timings
 from stage import images, inputs, jxl
 from stage.arrays import array_shape

@@ -1,6 +1,7 @@
 """relit keys and relit audit: who may use the service, and who did what."""
 
 from collections.abc import Callable
+from contextlib import closing
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -44,9 +45,9 @@ def _create(wanted: NewKey, data: DataOption = None, config: ConfigOption = None
     settings = settings_of(config, data=data)
     with usable(settings):
         settings.data.mkdir(parents=True, exist_ok=True)
-        database = connect(settings.sqlalchemy_url)
-        upgrade(database)
-        print(database.transact(work))
+        with closing(connect(settings.sqlalchemy_url)) as database:
+            upgrade(database)
+            print(database.transact(work))
     print("keep it: it is not shown again", file=sys.stderr)
 
 
@@ -110,7 +111,6 @@ def _existing(settings: Any, work: "Callable[[Database], T]") -> T:
 
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")
-    with usable(settings):
-        database = connect(settings.sqlalchemy_url)
+    with usable(settings), closing(connect(settings.sqlalchemy_url)) as database:
         require_current(database)
         return work(database)

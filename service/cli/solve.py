@@ -1,5 +1,7 @@
 """relit solve: maps of a capture."""
 
+from contextlib import nullcontext
+
 import typer
 
 from service.cli.printing import counted, print_warnings
@@ -23,11 +25,15 @@ def _solve(request: SolveRequest) -> None:
         with ProgressBar() as bar:
             print_sequence(solve_sequence(request, bar))
         return
-    from service.solve.solve import solve
+    from service.cli.ahead import reading_ahead
+    from stage.capture import Capture
 
     check_single(request)
-    with ProgressBar() as bar:
-        result = solve(request, bar)
+    capture = Capture.open(request.capture, request.pixels)
+    with nullcontext() if request.aligned else reading_ahead(capture, request.cache):
+        from service.solve.solve import solve
+    with ProgressBar() as bar:  # which starts a thread
+        result = solve(request, bar, capture=capture)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")

@@ -11,7 +11,7 @@ from service.light.groups import group_names
 from service.light.layers import check_layers, maps_file
 from service.light.outputs import check_outputs, frame_path
 from service.light.schedule import ScheduledFrame, schedule
-from service.light.sequence import capture_files, time_steps
+from service.light.time_steps import capture_files, time_steps
 from service.requests.frame_range import frame_numbers, part_of
 from service.requests.light_keys import LightKeys
 from service.requests.picture import Layer

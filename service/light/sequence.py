@@ -1,7 +1,7 @@
 """The captures that are relit: one, or a sequence with one capture for each time step, in order of name. Each is opened only while its
 frame is made."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,13 +14,8 @@ from stage.colour_spaces import linear_space
 from stage.ingest import Ingest
 from stage.light import PointLight
 from stage.lighting import lights_from_centre
-from stage.manifest import FILE_NAME, read_manifest
 from stage.motion.tracking import tracking_frames
 from stage.point_lights import DistantLights
-from stage.sequence import difference, is_sequence, read_sequence
-
-SHARED = {"camera.resolution": "resolution", "color_space": "colour space"}
-"""Fields of the manifest that the captures of a relit sequence share, and their words."""
 
 
 class OpenedCapture(NamedTuple):
@@ -35,45 +30,6 @@ class OpenedCapture(NamedTuple):
     """The file of its solved maps."""
     space: str
     """The scene-linear space of its stack."""
-
-
-def time_steps(path: Path) -> list[Path]:
-    """Return the capture folders that frames are made from.
-
-    Args:
-        path: a capture, or a sequence: a sequence.json, its folder, or a folder without capture.json whose sub-folders have one.
-
-    Returns:
-        The captures in the order of the file, else in order of name; the path alone where it is no sequence.
-
-    Raises:
-        RequestError: two captures differ in resolution or colour space.
-        ManifestError: a capture.json is wrong; names the field.
-        StorageError: a folder cannot be read.
-    """
-    if not is_sequence(path):
-        return [path]
-    folders = [step.folder for step in read_sequence(path).steps]
-    first = read_manifest(folders[0] / FILE_NAME)
-    for folder in folders[1:]:
-        if (apart := difference(read_manifest(folder / FILE_NAME), first, SHARED)) is not None:
-            raise RequestError(f"{folder}: is {apart.value}, {folders[0].name} {apart.other}: the captures of a sequence share one "
-                               f"{SHARED[apart.field]}")
-    return folders
-
-
-def capture_files(folder: Path) -> Iterator[Path]:
-    """Yield every file that a capture is read from; where there is no manifest, nothing: opening the capture says so.
-
-    Raises:
-        ManifestError: the manifest is wrong; names the field.
-    """
-    manifest = folder if folder.name == FILE_NAME else folder / FILE_NAME
-    if manifest.is_file():
-        yield manifest
-        capture = Capture(manifest.parent, read_manifest(manifest))
-        for _, name in capture.files():
-            yield capture.file(name)
 
 
 def open_capture(folder: Path, request: RelightRequest, captures: int, frames: Sequence[ScheduledFrame]) -> OpenedCapture:

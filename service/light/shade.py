@@ -26,8 +26,8 @@ from service.light.model_light import light_samples
 from service.light.near_light import NearLight, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
-from service.light.sequence import capture_files
 from service.light.surface_model import SurfaceModel
+from service.light.time_steps import capture_files
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata

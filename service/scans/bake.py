@@ -85,6 +85,8 @@ def _gathered(points: np.ndarray, normals: np.ndarray, scans: list[PreparedScan]
                        wp.array(normals[box.chosen].astype(np.float32), dtype=wp.vec3, device=device),
                        wp.zeros(len(box.chosen), dtype=float, device=device), vectors=3, slack=SLACK_VOXELS * voxel, device=device)
         values[box.chosen], known[box.chosen] = shown.values.numpy(), shown.weight.numpy() > 0
+        for each in box.watching:
+            each.scan.release()
     return values, known
 
 

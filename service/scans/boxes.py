@@ -20,6 +20,10 @@ LEAST_VOXELS = LEAST_BLOCKS * BLOCK
 """Voxels along each side of the smallest boxes."""
 WINDOW_PIXELS = 4
 """Pixels around the window of a view in which a box can lie."""
+NEAREST_M = 1e-4
+"""Distance of the plane before a camera behind which nothing is asked for, metres."""
+BORDER_POINTS = 33
+"""Points along each side of a window that are projected through the distortion of a camera."""
 VOXELS_BEFORE, VOXELS_BEHIND = 4, 12
 """Voxels around a box that the views must be asked for: a block more on its high sides, and what lies beside their voxels."""
 
@@ -96,12 +100,41 @@ def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int,
     there = corners @ scan.image.camera_from_world[:3, :3].T + scan.image.camera_from_world[:3, 3]
     rows, cols = scan.image.depth.shape
     if not scan.image.orthographic:
-        if (there[:, 2] >= 0).all():
+        there = _in_front(there)
+        if len(there) == 0:
             return None
-        if (there[:, 2] > -1e-3 * np.abs(there).max()).any():
-            return 0, rows, 0, cols
-    u, v = scan.camera.image_coordinates(there)
+    x, y = scan.camera.plane_at(*_border(0.0, cols, 0.0, rows))
+    seen = _projected(there, scan.image.orthographic)
+    first, last = np.maximum(seen.min(axis=0), (x.min(), y.min())), np.minimum(seen.max(axis=0), (x.max(), y.max()))
+    if (first > last).any():
+        return None
+    x, y = _border(first[0], last[0], first[1], last[1])
+    u, v = scan.camera.image_coordinates(np.stack([x, y, np.full_like(x, -1.0)], axis=-1))
     first_row, last_row = int(np.floor(v.min())) - WINDOW_PIXELS, int(np.ceil(v.max())) + WINDOW_PIXELS
     first_col, last_col = int(np.floor(u.min())) - WINDOW_PIXELS, int(np.ceil(u.max())) + WINDOW_PIXELS
     box = max(first_row, 0), min(last_row, rows), max(first_col, 0), min(last_col, cols)
     return box if box[1] - box[0] > 1 and box[3] - box[2] > 1 else None
+
+
+def _in_front(corners: np.ndarray) -> np.ndarray:
+    """Return the corners [n, 3] of what lies in front of a camera of a box, whose corners [8, 3] differ in one bit along each edge."""
+    before = corners[:, 2] <= -NEAREST_M
+    found = [corners[before]]
+    for one, other in ((one, one | bit) for bit in (1, 2, 4) for one in range(8) if not one & bit):
+        if before[one] != before[other]:
+            share = (-NEAREST_M - corners[one, 2]) / (corners[other, 2] - corners[one, 2])
+            found.append((corners[one] + share * (corners[other] - corners[one]))[None])
+    return np.concatenate(found)
+
+
+def _projected(points: np.ndarray, orthographic: bool) -> np.ndarray:
+    """Return the coordinates [n, 2] of camera-frame points on the plane at a depth of 1, or across parallel lines of sight."""
+    return points[:, :2] if orthographic else points[:, :2] / -points[:, 2:]
+
+
+def _border(left: float, right: float, top: float, bottom: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points along the border of a rectangle, of which the outermost are those of the whole, whatever the distortion."""
+    along = np.linspace(0.0, 1.0, BORDER_POINTS)
+    u, v = left + (right - left) * along, top + (bottom - top) * along
+    return (np.concatenate([u, u, np.full_like(v, left), np.full_like(v, right)]),
+            np.concatenate([np.full_like(u, top), np.full_like(u, bottom), v, v]))

@@ -169,8 +169,8 @@ def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]
 def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
     """Yield what the residuals of the scans against the fused surface say, and the normals that were joined with it."""
     if (normals := facts.get("joined_normals")) is not None and normals["contradicted_share"] > MANY_CONTRADICTED:
-        yield (f"normals: at {normals['contradicted_share']:.0%} of the vertices the photometric normals contradict the depth, which stays "
-               "as it is there: the maps may be of other scans, or the σ of the depth too small")
+        yield (f"normals: at {normals['contradicted_share']:.0%} of the vertices the photometric normals contradict the depth, which "
+               "decides there: the maps may be of other scans, or the σ of the depth too small")
     for scan in facts["scans"]:
         if not scan["fused"]:
             continue
@@ -179,4 +179,4 @@ def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
                    "other scans saw their places to be empty): a part may be thinner than two voxels, or the pose wrong")
         if scan["residual_median_sigmas"] > FAR_SIGMAS:
             yield (f"scan {scan['name']}: its pixels lie {scan['residual_median_sigmas']:.2g} of their σ from the fused surface in the "
-                   "median, where 0.67 is expected: its σ is too small, or its pose wrong")
+                   "median, where 0.67 is expected: its σ is too small, its pose wrong, or the voxels too large for what it shows")

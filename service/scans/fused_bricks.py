@@ -90,8 +90,8 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     timings.stage("compare", len(scans))
     samples = [summary.sample for summary in summaries]
     reach = reach_of(samples, voxel)
-    content = pieces.do("compare", numbers, lambda piece: packed(readings_of(
-        scans.prepared(int(piece)), int(piece), samples, reach, device=device)._asdict()), follows_from=(known, reach),
+    content = pieces.do("compare", numbers, lambda piece: scans.of(int(piece), lambda scan: packed(readings_of(
+        scan, int(piece), samples, reach, device=device)._asdict())), follows_from=(known, reach),
         advance=timings.advance)
     readings = [Readings(**unpacked(content(piece))) for piece in numbers]
     placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
@@ -103,7 +103,7 @@ def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: Shar
     timings.stage("bricks", len(used))
     origin = origin_of(np.stack([summaries[number].centre for number in used]), voxel)
     content = pieces.do("bricks", [numbers[number] for number in used],
-                        lambda piece: packed({"places": places_near(scans.prepared(int(piece)), origin, voxel)}),
+                        lambda piece: scans.of(int(piece), lambda scan: packed({"places": places_near(scan, origin, voxel)})),
                         follows_from=(known, voxel, tuple(used)), threads=threads, advance=timings.advance)
     near = np.unique(np.concatenate([unpacked(content(numbers[number]))["places"] for number in used]), axis=0)
     places, of_brick = np.unique(near // BRICK_VOXELS, axis=0, return_inverse=True)

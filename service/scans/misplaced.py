@@ -15,12 +15,15 @@ LEAST_COMMON = 50
 """Fewest pixels of a scan, of SAMPLES, that another must see before the place of the scan can be told."""
 REACH = 0.02
 """Largest distance between two surfaces that are still compared, in the median extent of the scans."""
+SAME_SIGMAS = 4.0
+"""Distance from another surface, in standard deviations, up to which that is the same surface. Where a point has one, what other scans
+measured farther in front of it hides it from them, and says nothing of its place."""
 LARGEST_SIGMAS = 2.0
 """Displacement, in median standard deviations of the comparison, from which on a scan counts as misplaced; smaller ones harm little."""
 UNDETERMINED = 1e-10
 """Directions in which a motion is determined less than this part of the best determined one do not move."""
 ROUNDS = 5
-"""Rounds of reweighting of the fit of a motion."""
+"""Rounds of reweighting of the fit of a motion, which begins with none: points that agree as they are decide, if they are most."""
 
 
 class Placing(NamedTuple):
@@ -122,6 +125,8 @@ def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, left_ou
     """Return how a scan lies to those that are not left out."""
     known = expected > 0
     known[:, sorted(left_out)] = False
+    agreeing = known & (np.abs(distance) <= SAME_SIGMAS * expected)
+    known &= ~agreeing.any(axis=1, keepdims=True) | (distance >= -SAME_SIGMAS * expected)
     seen = known.any(axis=1)
     if np.count_nonzero(seen) < LEAST_COMMON:
         return Placing(int(seen.sum()), 0.0, 0.0, 0.0, False)
@@ -131,12 +136,11 @@ def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, left_ou
     sigma = float(np.median(expected[seen][known[seen]]))
     place, normal = sample.points[seen] - sample.points[seen].mean(axis=0), sample.normals[seen]
     rows = np.concatenate([np.cross(place, normal), normal], axis=1) * ([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
-    weight, fit = np.ones(len(rows)), np.zeros(len(rows))
+    fit = np.zeros(len(rows))
     for _ in range(ROUNDS):
-        weighted = rows * (weight**2)[:, None]
-        fit = rows @ (np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ offset))
         rest = np.abs(offset - fit)
-        weight = np.sqrt(1 / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2))
+        weighted = rows / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)[:, None]
+        fit = rows @ (np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ offset))
     displacement = float(np.sqrt(np.mean(fit**2)))
     return Placing(int(seen.sum()), displacement, float(np.median(np.abs(offset))), sigma,
                    displacement > max(LARGEST_SIGMAS * sigma, voxel / 2))

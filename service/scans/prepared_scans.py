@@ -2,8 +2,9 @@
 
 import json
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from service.scans.surface import centre_of
 from stage.camera import Camera
 from stage.packed_arrays import packed, unpacked
 from stage.scans.records import ScanSet
+
+T = TypeVar("T")
 
 LEAST_PIXELS = 100
 """Fewest pixels in cells that a scan must have."""
@@ -93,6 +96,18 @@ class PreparedScans:
                 self._prepared[number] = self._read(number)
             return self._prepared[number]
 
+    def of(self, number: int, use: Callable[[PreparedScan], T]) -> T:
+        """Return what `use` makes of a scan with the layers that it has, of which nothing stays in memory then.
+
+        Raises:
+            RequestError: as `prepared`.
+        """
+        scan = self.prepared(number)
+        try:
+            return use(scan)
+        finally:
+            scan.release()
+
     def with_layers(self, number: int, names: tuple[str, ...]) -> PreparedScan:
         """Return a scan with these layers, of which those that it lacks are 0."""
         prepared = self.prepared(number)
@@ -103,12 +118,7 @@ class PreparedScans:
 
     def summary(self, number: int) -> ScanSummary:
         """Return the summary of a scan."""
-        scan = self.prepared(number)
-        cell = np.asarray(scan.image.cell)
-        pitch = scan.image.pixel_m(float(np.median(np.asarray(scan.image.depth)[cell])))
-        return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
-                           scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, scan.square_px,
-                           sample_of(scan, number))
+        return self.of(number, lambda scan: _summary(scan, number))
 
     def _read(self, number: int) -> PreparedScan:
         folder = self._folder / str(number)
@@ -122,3 +132,11 @@ class PreparedScans:
             raise RequestError(f"{where}: has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours show the same surface: its "
                                "pixels are too far apart or too noisy to be fused")
         return prepared
+
+
+def _summary(scan: PreparedScan, number: int) -> ScanSummary:
+    cell = np.asarray(scan.image.cell)
+    pitch = scan.image.pixel_m(float(np.median(np.asarray(scan.image.depth)[cell])))
+    return ScanSummary(scan.name, scan.names, pitch, float(np.median(np.asarray(scan.image.sigma)[cell])), centre_of(scan),
+                       scan.photometric, scan.normal_sigma, scan.camera, scan.image.camera_from_world, scan.square_px,
+                       sample_of(scan, number))

@@ -1,6 +1,7 @@
 """Scans as the range images that fusion takes: cells of pixels on one surface, what was seen to be empty, and layers to blend."""
 
 from functools import partial
+from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,6 +54,12 @@ class PreparedScan(NamedTuple):
     """Median standard error of the normals of solved maps, radians; NaN: there are none, or their maps do not say it."""
     square_px: int = 1
     """Side, in pixels of the scan, of the squares that are the pixels here."""
+
+    def release(self) -> None:
+        """Give the memory of the mapped arrays back; what is asked for again comes from the files. Other threads may read meanwhile."""
+        for array in (self.image.depth, self.image.sigma, self.image.normal, self.image.cell, self.image.clear, self.layers, self.feather):
+            if isinstance(array, np.memmap) and isinstance(array.base, mmap):
+                array.base.madvise(MADV_DONTNEED)
 
 
 def channels(names: tuple[str, ...]) -> dict[str, slice]:

@@ -132,9 +132,14 @@ def fuse_brick(places: np.ndarray, outlines: list[PreparedScan], scan: Callable[
     Convention:
         The surface lies at the mean of the measured distances weighted by the inverse of their variances.
     """
-    parts = (_fuse_box(box, [each._replace(scan=scan(each.number)) for each in box.watching], names, voxel, origin, device)
-             for box in boxes(places, outlines, voxel, origin))
-    return _welded(chain([_nothing(names)], parts), LEAST_VOXELS)
+    def fused(box: Box) -> BrickSurface:
+        watching = [each._replace(scan=scan(each.number)) for each in box.watching]
+        found = _fuse_box(box, watching, names, voxel, origin, device)
+        for each in watching:
+            each.scan.release()
+        return found
+
+    return _welded(chain([_nothing(names)], map(fused, boxes(places, outlines, voxel, origin))), LEAST_VOXELS)
 
 
 def _nothing(names: tuple[str, ...]) -> BrickSurface:

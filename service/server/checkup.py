@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from importlib.metadata import version
 from typing import NamedTuple
 
@@ -42,10 +43,10 @@ def look(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", f"{settings.sqlite_file} is not there yet: relit serve makes it")
         return
     try:
-        database = connect(settings.sqlalchemy_url, connections=1)
-        require_current(database)
-        yield Finding("database", f"{settings.sqlite_file if settings.is_sqlite else 'PostgreSQL'} answers")
-        yield from _database(settings, database)
+        with closing(connect(settings.sqlalchemy_url, connections=1)) as database:
+            require_current(database)
+            yield Finding("database", f"{settings.sqlite_file if settings.is_sqlite else 'PostgreSQL'} answers")
+            yield from _database(settings, database)
     except DatabaseError as error:
         yield Finding("database", str(error), True)
     except DBAPIError as error:

@@ -10,10 +10,12 @@ import logging
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Hashable
 from typing import TextIO
 
 import structlog
+from pydantic.warnings import UnsupportedFieldAttributeWarning
 
 logger = structlog.stdlib.get_logger("relit")
 REPEATS = 20
@@ -27,6 +29,9 @@ REFUSED = (401, 429, 503)
 
 def configure(level: str, form: str) -> None:
     """Log to standard error, the warnings of libraries too.
+
+    One of pydantic is left out: FastAPI gives a body its parameter's name as an alias, and leaves the warning out itself only where the
+    schema is built at once, not at the first request.
 
     Args:
         level: debug, info, warning or error.
@@ -51,6 +56,7 @@ def configure(level: str, form: str) -> None:
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)  # of libraries
     logging.captureWarnings(True)
+    warnings.filterwarnings("ignore", "The 'alias' attribute", UnsupportedFieldAttributeWarning)
     logging.getLogger("relit").setLevel(level.upper())
     structlog.configure(processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
                         logger_factory=structlog.stdlib.LoggerFactory(), wrapper_class=structlog.stdlib.BoundLogger,

@@ -76,13 +76,14 @@ class _Opened(NamedTuple):
     """How the distance of the surface was found, where the manifest does not say it."""
 
 
-def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: SharedSolve | None = None,
-          over_time: "LightsOverTime | None" = None) -> SolveResult:
+def solve(request: SolveRequest, progress: Progress | None = None, *, capture: Capture | None = None,
+          sharing: SharedSolve | None = None, over_time: "LightsOverTime | None" = None) -> SolveResult:
     """Solve a capture, and write its maps and a report.
 
     Args:
         request: the capture, the method and the folder of the results.
         progress: told how far the work is.
+        capture: that of the request, opened with its pixels; None: it is opened here.
         sharing: the part of this process where several share the solve; the others call `help_solve`.
         over_time: what the captures of a sequence share; None: the capture is no step of one.
 
@@ -91,7 +92,7 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, sharing: S
         StorageError: the results cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, timings, sharing, over_time)
+    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, capture, timings, sharing, over_time)
     stack, mask = given.stack, given.mask
     solution = solver(given, lights)
     solution.facts = facts | solution.facts
@@ -169,15 +170,16 @@ def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, 
         StageError, KernelError: the input is wrong.
         DivergedError: this process finds something else than the other.
     """
-    opened = _open(request, Timings(progress), sharing, over_time)
+    opened = _open(request, None, Timings(progress), sharing, over_time)
     opened.solver(opened.given, opened.lights)
 
 
-def _open(request: SolveRequest, timings: Timings, sharing: SharedSolve | None, over_time: "LightsOverTime | None" = None) -> _Opened:
-    """Open the capture of a request and read its images into a stack."""
+def _open(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
+          over_time: "LightsOverTime | None" = None) -> _Opened:
+    """Open the capture of a request, if it is not open, and read its images into a stack."""
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
-    capture = Capture.open(request.capture, request.pixels)
+    capture = capture or Capture.open(request.capture, request.pixels)
     unknown = request.lights is LightsKnown.UNKNOWN
     method = request.method or (_method_of_unknown(capture) if unknown else
                                 next(method for method, entry in METHODS.items() if entry.is_default(capture)))

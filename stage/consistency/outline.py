@@ -70,6 +70,7 @@ def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, direc
     row, col = np.divmod(pixels, cols)
     start = height.reshape(-1)[pixels]
     surface = np.where(mask, height, -np.inf)
+    framed = np.pad(surface, 1, constant_values=-np.inf).reshape(-1)  # nothing stands outside the map
     most = surface.max() - start.min() - LIFT  # a ray that has risen by more is above all of the surface
     far = float(np.hypot(rows, cols))
     steps = np.unique(np.round(np.concatenate([
@@ -81,10 +82,9 @@ def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, direc
             continue
         rise = z / across + LIFT_SLOPE
         near = steps[steps[:, 0] * rise <= most]
-        at_col = np.round(col + near * x / across).astype(int)
-        at_row = np.round(row - near * y / across).astype(int)
-        seen = (at_col >= 0) & (at_col < cols) & (at_row >= 0) & (at_row < rows)
-        met = np.where(seen, surface[np.clip(at_row, 0, rows - 1), np.clip(at_col, 0, cols - 1)], -np.inf)
+        at_col = np.clip(np.round(col + near * x / across), -1, cols)
+        at_row = np.clip(np.round(row - near * y / across), -1, rows)
+        met = framed.take(((at_row + 1) * (cols + 2) + at_col + 1).astype(int))
         hidden[light] = (met > start + near * rise + LIFT).any(axis=0)
     return hidden
 

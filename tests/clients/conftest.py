@@ -1,8 +1,10 @@
 """Programs that open assets."""
 
+from collections.abc import Iterator
+
 import pytest
 
-from benchmarks.clients.render import Client
+from benchmarks.clients.render import Client, Programs
 from tests.clients.programs import require
 
 
@@ -10,3 +12,10 @@ from tests.clients.programs import require
 def client(request: pytest.FixtureRequest) -> Client:
     """Each program in turn."""
     return require(request.param)
+
+
+@pytest.fixture(scope="session")
+def programs() -> Iterator[Programs]:
+    """All of them, each started once."""
+    with Programs() as made:
+        yield made

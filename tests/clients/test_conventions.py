@@ -6,7 +6,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 from benchmarks.clients.by_hand import write_by_hand
 from benchmarks.clients.comparison import compare
-from benchmarks.clients.render import Environment, Sun, render
+from benchmarks.clients.render import Environment, Sun
 from stage.camera import Camera
 from stage.maps import SurfaceMaps
 from tests.clients.scenes import directions, uneven
@@ -54,7 +54,7 @@ CAMERAS = {
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("kind", ["environment", "sun"])
-def test_a_rough_ball_has_its_closed_form(client, camera, kind, tmp_path):
+def test_a_rough_ball_has_its_closed_form(client, camera, kind, programs, tmp_path):
     view, radius, centre_z = CAMERAS[camera]
     maps = ball(view, radius, centre_z)
     asset = write_by_hand(maps, tmp_path, "ball", metal=np.zeros(maps.mask.shape))
@@ -68,7 +68,7 @@ def test_a_rough_ball_has_its_closed_form(client, camera, kind, tmp_path):
         light = Sun((0.48, 0.6, 0.64), (3.0, 2.0, 1.0))
         irradiance = np.maximum(normal @ np.array(light.direction), 0)[..., None] * np.array(light.irradiance)
     truth = ALBEDO_MAP / np.pi * irradiance
-    picture = render(client, asset, view, light, samples=256)
+    picture = programs.render(client, asset, view, light, samples=256)
     shown = binary_erosion(maps.mask, np.ones((3, 3)))  # a vertex lies on a pixel's centre, so the mesh fills the outermost ones in part
     np.testing.assert_allclose(picture[shown][:, 3], 1, atol=1e-3)
     assert picture[~binary_dilation(maps.mask), 3].max() < 0.01

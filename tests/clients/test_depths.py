@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.clients.render import Client, Environment, render
+from benchmarks.clients.render import Client, Environment
 from service.export.export import export
 from service.requests.export import ExportRequest
 from stage.camera import Camera
@@ -21,7 +21,7 @@ WHITE = Environment(np.ones((16, 32, 3), np.float32))
 
 @pytest.mark.parametrize("suffix", [".usdz", ".glb"])
 @pytest.mark.parametrize("client", [Client.BLENDER, Client.THREE])
-def test_a_depth_looks_like_its_photograph(client, suffix, tmp_path):
+def test_a_depth_looks_like_its_photograph(client, suffix, programs, tmp_path):
     require(client)
     mask = (ROWS > 2) & ~((abs(ROWS - 20) < 4) & (abs(COLS - 12) < 5))  # a rim, and a hole
     depth = np.where(mask, 2 + 0.004 * COLS, 0).astype(np.float32)
@@ -29,7 +29,7 @@ def test_a_depth_looks_like_its_photograph(client, suffix, tmp_path):
     write_ply(PointCloud(CAMERA.points(-depth)[mask], CODES[mask]), tmp_path / POINTS_FILE)
     found = export(ExportRequest(maps=tmp_path, out=tmp_path / f"wall{suffix}", name="Wall"))
     assert not any("grey" in sentence for sentence in found.warnings)
-    picture = render(client, found.path, CAMERA, WHITE, samples=64)
+    picture = programs.render(client, found.path, CAMERA, WHITE, samples=64)
     level = CODES / 255
     linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     inner = mask & (picture[..., 3] > 0.999)

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.clients.by_hand import write_by_hand
 from benchmarks.clients.comparison import Comparison, compare
-from benchmarks.clients.render import Client, Environment, render, trace
+from benchmarks.clients.render import Client, Environment, Programs
 from service.export.export import export
 from service.requests.export import ExportRequest, TextureFormat
 from stage.camera import Camera
@@ -33,18 +33,18 @@ def maps():
 
 
 @pytest.fixture(scope="module")
-def truth():
+def truth(programs):
     require(Client.MITSUBA)
-    return trace(ball_arrays((PAINT, GOLD)), CAMERA, LIGHT, samples=256)[..., :3]
+    return programs.trace(ball_arrays((PAINT, GOLD)), CAMERA, LIGHT, samples=256)[..., :3]
 
 
-def figures(client, asset, truth, maps) -> Comparison:
-    picture = render(client, asset, CAMERA, LIGHT, samples=64)
+def figures(programs: Programs, client, asset, truth, maps) -> Comparison:
+    picture = programs.render(client, asset, CAMERA, LIGHT, samples=64)
     return compare(picture, truth, maps[0].mask, maps[1])
 
 
-def test_maps_written_by_hand_come_near_the_path_tracer(client, maps, truth, tmp_path):
-    found = figures(client, write_by_hand(maps[0], tmp_path, "hand", metal=maps[1]), truth, maps)
+def test_maps_written_by_hand_come_near_the_path_tracer(client, programs, maps, truth, tmp_path):
+    found = figures(programs, client, write_by_hand(maps[0], tmp_path, "hand", metal=maps[1]), truth, maps)
     assert 0.9 < found.metal < 1.1
     assert 0.9 < found.dielectric < 1.1
     assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
@@ -65,7 +65,7 @@ WAYS = {
 
 @pytest.mark.parametrize(("client", "way"), [(client, way) for way, (*_, clients) in WAYS.items() for client in clients],
                          indirect=["client"])
-def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, maps, truth, tmp_path):
+def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, programs, maps, truth, tmp_path):
     """Whatever the file, the textures, and the colour space of the capture."""
     options, space, _ = WAYS[way]
     true = replace(maps[0], color_space=space, diffuse_albedo=convert(maps[0].diffuse_albedo, "lin_rec709_scene", space),
@@ -74,7 +74,7 @@ def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, maps
     true.write(tmp_path / "maps" / MAPS_FILE)
     asset = tmp_path / f"balls.{way[:4].strip()}"
     export(ExportRequest(maps=tmp_path / "maps", out=asset, **options))
-    found = figures(client, asset, truth, maps)
+    found = figures(programs, client, asset, truth, maps)
     assert 0.9 < found.metal < 1.1
     assert 0.9 < found.dielectric < 1.1
     assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
@@ -83,21 +83,21 @@ def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, maps
 
 @pytest.mark.parametrize(("client", "other"), [(client, other) for client in (Client.BLENDER, Client.THREE)
                                                for other in (seen_in_perspective, without_scale)], indirect=["client"])
-def test_other_cameras_show_what_maps_written_by_hand_show(client, other, maps, tmp_path):
+def test_other_cameras_show_what_maps_written_by_hand_show(client, other, programs, maps, tmp_path):
     """A turned perspective camera, and a capture without a scale, whose pixel is a millimetre in the asset."""
     seen = other(maps[0])
     (tmp_path / "maps").mkdir()
     seen.write(tmp_path / "maps" / MAPS_FILE)
     export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / "balls.usdz"))
-    pictures = [render(client, asset, seen.camera, LIGHT, samples=64)
+    pictures = [programs.render(client, asset, seen.camera, LIGHT, samples=64)
                 for asset in (tmp_path / "balls.usdz", write_by_hand(seen, tmp_path, "hand", metal=maps[1]))]
     found = compare(pictures[0], pictures[1][..., :3], seen.mask, maps[1])
     assert found.rmse < 0.1, "rims and normals in 16 bits; .03 to .07 were measured"
     assert 0.95 < found.scale < 1.05 and 0.95 < found.metal < 1.05
 
 
-def test_a_black_metal_is_seen(maps, truth, tmp_path):
+def test_a_black_metal_is_seen(programs, maps, truth, tmp_path):
     """What the specular workflow gave: F0 is lost, and what is left is the reflection of a dielectric."""
     black = replace(maps[0], specular=np.full_like(maps[0].specular, DIELECTRIC_F0))
-    found = figures(Client.MITSUBA, write_by_hand(black, tmp_path, "black", metal=np.zeros_like(maps[1])), truth, maps)
+    found = figures(programs, Client.MITSUBA, write_by_hand(black, tmp_path, "black", metal=np.zeros_like(maps[1])), truth, maps)
     assert found.metal < 0.5

@@ -15,6 +15,12 @@ from typing import Any
 import httpx2
 
 START_S = 60.0
+FIRST_LOOK_S, LAST_LOOK_S = 0.05, 0.5
+"""Seconds between two looks at something, at first and after some seconds: a look takes five thousandths of a second of a core, here and
+in the server."""
+HERE = Path(__file__).resolve().parent
+SABOTAGE = os.pathsep.join([str(HERE / "server" / "jobs" / "sabotage"), str(HERE.parents[1])])
+"""PYTHONPATH of processes whose workers do with frames what the variable SABOTAGE says; it has this checkout's `service` too."""
 
 
 class Server:
@@ -40,25 +46,29 @@ class Server:
 
     def wait(self, client: httpx2.Client, path: str, until: tuple[str, ...], timeout_s: float = 120.0) -> dict:
         """Look at something until its state is one of these."""
-        deadline = time.monotonic() + timeout_s
+        began = time.monotonic()
+        deadline = began + timeout_s
         while True:
             found = client.get(path).raise_for_status().json()
             if found["state"] in until:
                 return found
             assert time.monotonic() < deadline, f"{path} is still {found['state']}: {self.log.read_text()[-4000:]}"
-            time.sleep(0.1)
+            time.sleep(min(FIRST_LOOK_S + (time.monotonic() - began) / 8, LAST_LOOK_S))
 
 
 @contextmanager
-def serving(folder: Path, *options: str, descriptors: int | None = None, **settings: str) -> Iterator[Server]:
+def serving(folder: Path, *options: str, descriptors: int | None = None, sabotage: str | None = None, **settings: str) -> Iterator[Server]:
     """Start a server, and end it.
 
-    `settings` without RELIT_, as text; options of `relit serve` beside --data and --port; files that it may have open at most.
+    `settings` without RELIT_, as text; options of `relit serve` beside --data and --port; files that it may have open at most; what its
+    workers do with frames, as jobs/sabotage tells.
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
     environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
     environment |= {f"RELIT_{name.upper()}": value for name, value in settings.items()}
+    if sabotage is not None:
+        environment |= {"PYTHONPATH": SABOTAGE, "SABOTAGE": sabotage}
     with open(log, "a") as errors:
         process = subprocess.Popen(
             [*([] if descriptors is None else ["prlimit", f"--nofile={descriptors}:{descriptors}"]),

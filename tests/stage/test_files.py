@@ -32,6 +32,15 @@ def test_an_error_keeps_the_old_file_and_leaves_nothing(tmp_path, error):
     assert files_in(tmp_path) == {"a.txt"}
 
 
+@pytest.mark.parametrize("flush", [True, False])
+def test_only_what_can_be_made_again_does_not_wait_for_the_disk(tmp_path, monkeypatch, flush):
+    waited = []
+    monkeypatch.setattr(os, "fsync", waited.append)
+    with replacing(tmp_path / "a.txt", flush=flush) as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "a.txt").read_text() == "whole" and len(waited) == flush
+
+
 def test_permissions_follow_the_umask(tmp_path):
     before = os.umask(0o027)
     try:

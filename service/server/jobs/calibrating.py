@@ -112,7 +112,7 @@ def _response(request: ResponseJob, given: Measurement) -> None:
 
 def _tof(request: TofCalibrationJob, given: Measurement) -> None:
     from service.calibrate.tof import calibrate_tof
-    from service.light.sequence import time_steps
+    from service.light.time_steps import time_steps
     from service.requests.calibrate import TofCalibrationRequest
 
     folder = given.intake(request.capture)

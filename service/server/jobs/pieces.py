@@ -15,6 +15,7 @@ from service.server.jobs.progress import Stopped
 from service.server.log import logger
 from service.server.storage import layout
 from service.views.states import RUNNING
+from stage.errors import StorageError
 from stage.files import replacing
 
 STEPS = "steps"
@@ -49,9 +50,13 @@ class JobPieces:
             StorageError: the storage cannot be written.
         """
         file = self._context.storage.workspace(self._prefix) / f".{secrets.token_hex(8)}"
-        with replacing(file) as temporary:
-            temporary.write_bytes(content)
-        self._context.storage.put(file, self._prefix, name)
+        try:
+            with replacing(file) as temporary:
+                temporary.write_bytes(content)
+            self._context.storage.put(file, self._prefix, name)
+        except StorageError:  # the job may have ended, and its folder been deleted, between two of these lines
+            if is_running(self._context, self._job):
+                raise
         if not is_running(self._context, self._job):
             self.remove()
             raise Stopped

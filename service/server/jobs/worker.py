@@ -23,7 +23,7 @@ from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage.open import open_storage
 
-POLL_S = 0.25
+POLL_S = 0.5
 """Seconds between two looks into a queue."""
 APPLICATION = "relit"
 LOCK_LOST = 3

@@ -70,6 +70,20 @@ def test_without_noise_only_the_chords_between_pixels_are_left(device):
     assert np.abs(sphere(points)).max() < 2.1e-4  # (2.5 mm / cos 78°)² / 8 R = 0.18 mm at the most grazing pixels, and voxels
 
 
+@pytest.mark.parametrize("voxels", [2.0, 4.0, 8.0])
+def test_a_small_ball_before_a_wall_is_whole(device, voxels):
+    """Views that see the wall past the ball see the voxels beside it to be empty, and they are: the surface lies behind them."""
+    voxel = 0.03 / voxels
+    shots = around(lambda points: np.minimum(np.linalg.norm(points, axis=-1) - 0.03, 1.2 - np.linalg.norm(points, axis=-1)))
+    points, _, _ = fuse([range_image(shot, SIGMA) for shot in shots], voxel, (-0.05,) * 3, (0.05,) * 3, blocks=4, device=device)
+    points = points[np.linalg.norm(points, axis=1) < 0.1]
+    direction = np.random.default_rng(5).normal(size=(1000, 3))
+    ball = 0.03 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    nearest = np.linalg.norm(ball[:, None] - points, axis=-1).min(axis=1, initial=1.0)
+    assert (nearest < voxel).mean() > 0.98  # a cell that is crossed has such vertices; noise opens one cell at four voxels
+    assert np.median(np.abs(np.linalg.norm(points, axis=1) - 0.03)) < 0.15 * voxel
+
+
 def test_bricks_meet_without_seams_and_crops_change_nothing(device, sphere_shots):
     """A surface over eight bricks is the surface of one, moved: every vertex lies on an edge that two bricks compute alike."""
     voxel = 2.5e-3

@@ -196,6 +196,32 @@ def test_as_a_program_of_its_own(tmp_path):
     assert done.stderr == f"relit: {tmp_path}/cap/capture.json: colour: is not a known key\n"
 
 
+ENDING = """
+import atexit, sys
+from service.cli import main as program
+class Held:
+    def __del__(self): print("taken apart")
+held = Held()
+def main():
+    atexit.register(print, "handler")
+    print("work")
+    sys.exit(3)
+program.main = main
+program.run()
+"""
+
+
+def test_a_process_ends_after_its_exit_handlers_and_is_not_taken_apart():
+    done = subprocess.run([sys.executable, "-c", ENDING], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "work\nhandler\n", "")
+
+
+def test_a_defect_of_ours_ends_the_process_as_python_does():
+    code = ENDING.replace("sys.exit(3)", "raise ZeroDivisionError")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (1, "work\nhandler\ntaken apart\n") and "ZeroDivisionError" in done.stderr
+
+
 def test_a_reader_that_goes_away_is_no_traceback():
     reader, writer = os.pipe()
     os.close(reader)

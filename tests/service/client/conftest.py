@@ -54,8 +54,8 @@ class Cut(httpx2.SyncByteStream):
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("server"), "--device", "cpu", roots=str(OWL.parent), requests_per_second="10000",
-                 request_burst="10000", min_free_bytes="0") as running:
+    with serving(tmp_path_factory.mktemp("server"), "--device", "cpu", sabotage="long", roots=str(OWL.parent),
+                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
         yield running
 
 

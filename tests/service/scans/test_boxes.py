@@ -4,12 +4,16 @@ import numpy as np
 import pytest
 
 from kernels.fusion.bricks import BLOCK, BRICK_VOXELS
+from kernels.fusion.views import RangeImage
 from service.reporting.progress import Timings
 from service.requests.fuse import FuseRequest
 from service.scans import boxes
 from service.scans.fuse import fuse
 from service.scans.fused_bricks import fused_bricks
+from service.scans.range_images import PreparedScan, focal_of
+from stage.camera import Camera, Distortion
 from stage.scans.ply_points import read_ply_points
+from stage.scans.rigid import exponential
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -59,3 +63,57 @@ def test_no_box_is_seen_by_more_pixels_than_allowed_unless_it_is_the_smallest(fi
     assert len(np.unique(chosen)) == len(chosen)
     seen = [bool(boxes.watching_views(list(enumerate(scans)), place * VOXEL, (place + 1) * VOXEL)) for place in places]
     assert set(np.flatnonzero(seen)) <= set(chosen.tolist())
+
+
+SIZE = 80, 60
+CAMERAS = {
+    "pinhole": Camera(projection="perspective", resolution=SIZE, focal_px=(70.0, 72.0), principal_px=(37.0, 31.0)),
+    "barrel": Camera(projection="perspective", resolution=SIZE, focal_px=(70.0, 72.0),
+                     distortion=Distortion(model="brown_conrady", k=(-0.15, 0.0, 0.0), p=(0.004, 0.0))),
+    "parallel": Camera(projection="orthographic", resolution=SIZE, pixel_size_m=0.02),
+}
+
+
+def outline(camera, pose):
+    """A scan of a camera that stands at a pose, with nothing measured."""
+    nothing = np.zeros((camera.height, camera.width), dtype=np.float32)
+    image = RangeImage(nothing, nothing, nothing, nothing, nothing, np.linalg.inv(pose), focal_of(camera), camera.principal_point,
+                       orthographic=camera.projection == "orthographic")
+    return PreparedScan("scan", image, camera, (), nothing, nothing, False)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_a_window_holds_all_that_its_camera_sees_of_a_box_and_little_else(camera):
+    rng = np.random.default_rng(3)
+    seen_pixels = window_pixels = 0
+    for _ in range(200):
+        pose = np.eye(4)
+        pose[:3, :3] = exponential(rng.normal(size=3))
+        pose[:3, 3] = rng.normal(size=3)
+        scan = outline(camera, pose)
+        low = rng.uniform(-1.5, 1.0, 3)
+        high = low + rng.uniform(0.2, 1.0, 3)
+        points = rng.uniform(low, high, (20_000, 3))
+        there = (points - pose[:3, 3]) @ pose[:3, :3]
+        if camera.projection == "perspective":
+            there = there[there[:, 2] < -1e-3]
+            there = there[np.hypot(there[:, 0], there[:, 1]) < -1.2 * there[:, 2]]  # where the distortion is one to one
+        u, v = camera.image_coordinates(there)
+        inside = (u >= 0) & (u < SIZE[0]) & (v >= 0) & (v < SIZE[1])
+        window = [each.window for each in boxes.watching_views([(0, scan)], low, high)]
+        if not inside.any():
+            window_pixels += sum((bottom - top) * (right - left) for top, bottom, left, right in window)
+            continue
+        (top, bottom, left, right), = window
+        assert top <= v[inside].min() and v[inside].max() <= bottom and left <= u[inside].min() and u[inside].max() <= right
+        seen_pixels += (np.ptp(u[inside]) + 1) * (np.ptp(v[inside]) + 1)
+        window_pixels += (bottom - top) * (right - left)
+    # a margin of WINDOW_PIXELS around a window of some 40 pixels adds half, and the box has corners that no ray of the image meets
+    assert window_pixels < 2 * seen_pixels, window_pixels / seen_pixels
+
+
+def test_a_box_beside_a_camera_is_not_seen():
+    scan = outline(CAMERAS["pinhole"], np.eye(4))
+    assert boxes.watching_views([(0, scan)], np.array([4.0, -1.0, -0.5]), np.array([5.0, 1.0, 0.5])) == []
+    (_, _, window), = boxes.watching_views([(0, scan)], np.array([-0.5, -0.5, -0.5]), np.array([0.5, 0.5, 0.5]))
+    assert window == (0, SIZE[1], 0, SIZE[0])

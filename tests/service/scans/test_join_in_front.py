@@ -62,7 +62,7 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     assert resolved.mean() > 0.75
     found = degrees(face_normals(after.points, faces), unit(gradient(scene, after.points[faces].mean(axis=1))))[resolved]
     given = degrees(before.normals[faces[:, 0]].astype(float), unit(gradient(scene, before.points[faces[:, 0]])))[resolved]
-    assert rms(found) < 1.1 * rms(given)  # the reach of issue 18; docs/joining.md has at most 0.98 for such scenes
+    assert rms(found) < 1.1 * rms(given)  # docs/joining.md has at most 0.99 for such scenes
     assert np.median(found) < 0.6 * np.median(given)  # without most of the drift
     assert 0.005 < joined.facts["joined_normals"]["contradicted_vertices"] / len(before.points) < 0.2
     assert not [warning for warning in joined.warnings if warning.startswith("normals:")]

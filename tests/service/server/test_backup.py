@@ -11,7 +11,7 @@ from service.server.database import jobs
 from service.server.settings import Settings
 from tests.service.server.jobs.conftest import database_url, undisturbed  # noqa: F401  (fixtures)
 from tests.service.server.jobs.harness import digests, harness
-from tests.service.server.jobs.test_faults import SABOTAGE
+from tests.service.server_process import SABOTAGE
 
 
 @pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)

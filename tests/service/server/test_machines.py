@@ -20,10 +20,9 @@ from service.server.database.engine import connect
 from service.server.settings import Settings
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import digests, relit_relight
-from tests.service.server.jobs.test_faults import SABOTAGE
 from tests.service.server.storage.conftest import s3, s3_server  # noqa: F401  (fixtures)
 from tests.service.server.tcp_proxy import tcp_proxy
-from tests.service.server_process import serving
+from tests.service.server_process import SABOTAGE, serving
 
 FRAMES, SIZE = 24, 128
 

@@ -46,7 +46,8 @@ class Store:
         return Part(self, worker)
 
     def done_by(self, worker: str) -> list[str]:
-        return [name for name, holder in self.claims.items() if holder == worker]
+        with self._lock:
+            return [name for name, holder in self.claims.items() if holder == worker]
 
 
 class Part:

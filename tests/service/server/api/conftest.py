@@ -19,8 +19,9 @@ PEAK_BYTES = 1 << 30
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("server")
-    with serving(folder, "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")]),
-                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
+    with serving(folder, "--anonymous", "--device", "cpu", sabotage="long",
+                 roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")]), requests_per_second="10000", request_burst="10000",
+                 min_free_bytes="0") as running:
         yield running
 
 

@@ -19,7 +19,7 @@ from tests.service.server_process import Server
 PROJECT = "fuzz"
 SEED = "7"
 CONFIG = """
-request-timeout = 2.0
+request-timeout = 20.0
 max-stream-events = 1
 suppress-health-check = ["all"]
 

@@ -116,7 +116,7 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
 
 
 def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
-    steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 4))]
+    steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate((1.0, 8.0))]
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
     calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
     job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))

@@ -89,7 +89,7 @@ def test_a_job_that_is_cancelled_and_deleted_while_it_runs_is_no_error_in_the_lo
     server.wait(client, f"/v1/jobs/{job}", ("running",))
     client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
     assert client.delete(f"/v1/jobs/{job}").status_code == 204
-    finish(server, client, submit(client, kind="solve", capture=dome))
+    finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
     assert any(line["event"] == "step stopped" and line["job"] == job for line in server.lines())
     assert [line for line in server.lines() if line["level"] == "error" and line.get("logger") == "dbos"] == []
 

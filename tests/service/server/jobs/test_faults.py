@@ -12,10 +12,7 @@ import pytest
 from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
 from tests.service.server.jobs.harness import PROJECT, digests, harness
-
-HERE = Path(__file__).resolve().parent
-SABOTAGE = os.pathsep.join([str(HERE / "sabotage"), str(HERE.parents[3])])
-"""PYTHONPATH of a worker whose frames go wrong; it has this checkout's `service` too."""
+from tests.service.server_process import SABOTAGE
 
 
 def begin(made, undisturbed, *, frames=None, chunk_frames=8):

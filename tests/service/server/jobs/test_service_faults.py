@@ -11,7 +11,7 @@ from service.server.database import jobs, workers
 from service.server.database.engine import connect
 from service.server.settings import Settings
 from tests.service.server.jobs.harness import WAIT_S, digests
-from tests.service.server.jobs.test_faults import SABOTAGE, fill, small_disk  # noqa: F401  (a fixture)
+from tests.service.server.jobs.test_faults import fill, small_disk  # noqa: F401  (a fixture)
 from tests.service.server_process import Server, serving
 
 OPTIONS = ("--anonymous", "--device", "cpu")
@@ -62,11 +62,9 @@ def assert_workers_are_spawned(server: Server) -> None:
 
 
 @pytest.mark.long
-def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed, monkeypatch):
+def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
-    monkeypatch.setenv("PYTHONPATH", SABOTAGE)
-    monkeypatch.setenv("SABOTAGE", "slow")
-    with serving(tmp_path, *OPTIONS, **settings) as server, server.client() as client:
+    with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         job = begin(server, client, undisturbed)
         frames_there(server, job, 8)
         os.kill(server.process.pid, signal.SIGKILL)
@@ -76,17 +74,16 @@ def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed, monkeypatch)
         row = jobs.find(database, job)
         database.close()
         assert (row["state"], row["lost"], row["finished_steps"]) == (jobs.QUEUED, 0, ["frames 1-6", "frames 7-12"])
-    with serving(tmp_path, *OPTIONS, **settings) as server, server.client() as client:
+    with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
         assert digests(results(server, job)) == undisturbed.digests
         assert_workers_are_spawned(server)
 
 
 @pytest.mark.long
-def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", SABOTAGE)
-    monkeypatch.setenv("SABOTAGE", "slow")
-    with serving(tmp_path, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client:
+def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed):
+    settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
+    with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         job = begin(server, client, undisturbed)
         frames_there(server, job, 8)
         server.process.send_signal(signal.SIGTERM)

@@ -22,8 +22,8 @@ from stage.depth_maps import DepthMaps
 from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from tests.scenes.turntable import View, figure
 from tests.service.server.jobs.harness import PROJECT, Harness, harness
-from tests.service.server.jobs.test_faults import SABOTAGE
 from tests.service.server.jobs.test_sharing import WORKERS, begun, both_at_work, pieces_folder
+from tests.service.server_process import SABOTAGE
 from tests.stage.scans.test_registration import seen
 
 

@@ -20,7 +20,7 @@ from service.solve.solve import solve
 from stage import stack
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import PROJECT, digests, harness, relit_relight
-from tests.service.server.jobs.test_faults import SABOTAGE
+from tests.service.server_process import SABOTAGE
 
 WORKERS = 2
 FRAMES = 12

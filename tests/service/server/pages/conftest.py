@@ -18,10 +18,12 @@ from tests.service.server_process import Server, serving
 SAMPLES = Path(__file__).resolve().parents[4] / "samples"
 REQUIRED = os.environ.get("RELIT_TEST_PAGES") == "required"
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-sync",
-             "--disable-component-update", "--no-first-run", "--disable-quic"]
+             "--disable-component-update", "--no-first-run", "--disable-quic", "--disable-gpu-compositing"]
 """WebGL is rendered by the processor; without the others, Chromium asks servers of its maker."""
 CONTENT_MS = 60_000
 """Time for the content of a page on a loaded machine."""
+PATIENCE_MS = 120_000
+"""Time for what a page does at once where the processor has time, as long as WebGL is not rendered on it meanwhile."""
 PAGE_BYTES = 3_000_000
 """Largest page without data, as the issue asks."""
 MAX_SIGMA = 0.3
@@ -55,7 +57,7 @@ def solved_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(solved_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     folder = tmp_path_factory.mktemp("pages_of_process")
     shutil.copytree(solved_data / "data", folder / "data")
-    with serving(folder, *OPTIONS, **SETTINGS) as running:
+    with serving(folder, *OPTIONS, sabotage="long", **SETTINGS) as running:
         yield running
 
 
@@ -74,11 +76,18 @@ def browser():
         running.close()
 
 
+def new_context(browser, **options):
+    """A context of the browser whose pages wait long enough on a loaded machine."""
+    made = browser.new_context(**options)
+    made.set_default_timeout(PATIENCE_MS)
+    return made
+
+
 @pytest.fixture
 def page(browser, server: Server):
     """A page of 1280 × 900 px; an error of a script, a breach of the content security policy or a request to another server fails
     the test."""
-    context = browser.new_context(base_url=server.url, viewport={"width": 1280, "height": 900})
+    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 900})
     opened, errors = context.new_page(), []
     own = (f"{server.url}/", "blob:", "data:")
     opened.on("request", lambda request: None if request.url.startswith(own) else errors.append(f"asks {request.url}"))

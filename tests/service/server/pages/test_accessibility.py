@@ -3,14 +3,14 @@
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes
+from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, new_context
 
 PAGES = {"captures": "/captures", "jobs": "/jobs"}
 
 
 @pytest.mark.parametrize("name", [*PAGES, "capture", "job", "light", "maps"])
 def test_a_page_is_small_fits_and_has_no_serious_violation(browser, server, solved, name):
-    page = browser.new_page(base_url=server.url, bypass_csp=True)  # axe is injected
+    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
     loaded = count_bytes(page)
     page.goto((PAGES | solved.pages)[name])
     solved.wait_for_content(page, name)

@@ -8,7 +8,7 @@ import OpenImageIO as oiio
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes
+from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, new_context
 from tests.service.server.pages.frames import pixels
 
 LOADED_MS = 120_000
@@ -38,7 +38,7 @@ def exported(server, solved) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def opened(browser, server, exported):
     """A page with the asset as glTF, which is opened once; an error of a script fails the module. axe is injected into it."""
-    page, errors = browser.new_page(base_url=server.url, viewport={"width": 640, "height": 480}, bypass_csp=True), []
+    page, errors = new_context(browser, base_url=server.url, viewport={"width": 640, "height": 480}, bypass_csp=True).new_page(), []
     page.on("pageerror", lambda error: errors.append(str(error)))
     loaded = count_bytes(page)
     open_asset(page, exported["glb"])

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.pages.cuttable import cuttable
 
 JOB_MS = 120_000
@@ -157,7 +157,7 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
     with server.client() as client, cuttable(server.url) as way:
         job = slow_job(client, capture, sky)
-        page = browser.new_page(base_url=way.url)
+        page = new_context(browser, base_url=way.url).new_page()
         page.goto(f"/jobs/{job}")
         page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
         way.cut()

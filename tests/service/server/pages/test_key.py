@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server_process import Server, serving
 
 
@@ -23,7 +23,7 @@ def key_of(server: Server, scope: str) -> str:
 
 
 def test_the_page_asks_for_a_key_and_keeps_it_in_the_tab(browser, locked):
-    context = browser.new_context(base_url=locked.url)
+    context = new_context(browser, base_url=locked.url)
     page = context.new_page()
     page.goto("/captures")
     page.get_by_label("Key", exact=True).last.fill("wrong")

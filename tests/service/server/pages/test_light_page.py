@@ -11,7 +11,7 @@ from service.client import Client
 from stage import exr
 from stage.colour import rgb_matrix
 from tests.scenes.captures import edit_manifest
-from tests.service.server.pages.conftest import SAMPLES, Solved, done
+from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
 from tests.service.server.pages.frames import assert_same, encoded, picture, rendered
 
 CAPTURED = 7
@@ -123,7 +123,7 @@ def test_light_from_beyond_the_captured_is_said(opened):
 
 
 def test_without_webgl_it_is_said(browser, solved):
-    context = browser.new_context(base_url=solved.server.url)
+    context = new_context(browser, base_url=solved.server.url)
     context.add_init_script("HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, "
                             "{ apply: (target, self, given) => given[0] === 'webgl2' ? null : Reflect.apply(target, self, given) });")
     page = context.new_page()

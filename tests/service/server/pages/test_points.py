@@ -7,7 +7,7 @@ import pytest
 
 from stage import exr
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.pages.frames import pixels
 
 LOADED_MS = 120_000
@@ -97,7 +97,7 @@ def test_without_webgl_the_maps_remain(page, depth):
 
 
 def test_no_serious_violation(browser, server, depth):
-    page = browser.new_page(base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844})
+    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
     page.goto(f"/maps/{depth[0]}")
     page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.server.pages.conftest import PICTURES
+from tests.service.server.pages.conftest import PICTURES, new_context
 from tests.service.server.pages.frames import assert_same, picture, rendered
 
 
@@ -13,7 +13,7 @@ from tests.service.server.pages.frames import assert_same, picture, rendered
 @pytest.mark.parametrize("name", ["light", "maps", "capture"])
 def test_a_page_shows_the_sample(browser, owl, material, sky, tmp_path, name):
     sample = material if name == "maps" else owl
-    page = browser.new_page(base_url=sample.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark")
+    page = new_context(browser, base_url=sample.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark").new_page()
     page.goto(sample.pages[name])
     sample.wait_for_content(page, name)
     if name == "light":

@@ -5,7 +5,7 @@ import pytest
 from tests.scenes.sequence import write_sequence
 from tests.service.server.api.test_measuring import upload
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import CONTENT_MS, done
+from tests.service.server.pages.conftest import CONTENT_MS, done, new_context
 
 STEPS = 3
 
@@ -38,7 +38,7 @@ def test_the_maps_of_each_step_are_looked_at(page, walk):
 
 
 def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
-    page = browser.new_page(base_url=server.url, bypass_csp=True)  # axe is injected
+    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
     page.goto(f"/jobs/{walk[1]}")
     page.get_by_role("link", name="Look at the maps").click()
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)

@@ -14,7 +14,7 @@ from service.server.storage.bucket import Bucket
 from stage.errors import StorageError
 from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
 from tests.service.server.jobs.harness import PROJECT, digests, harness
-from tests.service.server.jobs.test_faults import SABOTAGE
+from tests.service.server_process import SABOTAGE
 
 MAPS, FRAME = (f"projects/larch/jobs/job_{'0' * 20}/{name}" for name in ("maps.exr", "frame.0001.exr"))
 PIECE = "uploads/up_x/0"

@@ -1,6 +1,7 @@
 """Found by Python at its start where this folder is on PYTHONPATH: makes the frames of a worker's jobs do what SABOTAGE says.
 
 kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
+long  the same in jobs of more than 400 frames alone: a worker is then busy without keeping the other tests from the processor
 
 With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
 has begun one: TOGETHER is the folder in which each leaves a file.
@@ -9,7 +10,6 @@ Only the process of a worker is changed: the others that begin with it, which wa
 """
 
 import os
-import random
 import signal
 import sys
 import threading
@@ -40,15 +40,22 @@ def slow(job, request, only, context, progress):
     relight(job, request, only, context, Slow(progress))
 
 
+def slow_if_long(job, request, only, context, progress):
+    is_long = len(frame_numbers(request.options.frames, 1)) > 400
+    relight(job, request, only, context, Slow(progress) if is_long else progress)
+
+
 is_worker = "--multiprocessing-fork" in sys.orig_argv  # as Python calls a process that multiprocessing starts
 
 if is_worker and "SABOTAGE" in os.environ:
     import service.server.jobs.steps as steps
+    from service.server.jobs.steps import frame_numbers
 
     relight = steps._relight
-    steps._relight = {"kill": kill, "hang": hang, "slow": slow}[os.environ["SABOTAGE"]]
+    steps._relight = {"kill": kill, "hang": hang, "slow": slow, "long": slow_if_long}[os.environ["SABOTAGE"]]
 
 if is_worker and "PIECES" in os.environ:
+    import random
     from pathlib import Path
 
     import service.solve.batches as batches
