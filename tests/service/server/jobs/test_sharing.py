@@ -60,14 +60,19 @@ def pair(capture, tmp_path_factory):
 def both(pair):
     """The two workers at the beginning of a test; the first piece will wait for both."""
     pair.until(lambda: sum(pair.is_alive(row["id"]) for row in workers.seen_lately(pair.database)) == WORKERS, "two workers there")
-    shutil.rmtree(pair.folder / "together", ignore_errors=True)
+    shutil.rmtree(together(pair), ignore_errors=True)
     return pair
 
 
 def start(made) -> None:
     for _ in range(WORKERS):
-        made.start(PYTHONPATH=SABOTAGE, PIECES=str(PIECE_S), TOGETHER=str(made.folder / "together"))
+        made.start(PYTHONPATH=SABOTAGE, PIECES=str(PIECE_S), TOGETHER=str(together(made)))
     made.ready(WORKERS)
+
+
+def together(made) -> Path:
+    """The folder in which each worker leaves a file when it has begun a piece: the first piece waits for both."""
+    return made.folder / "together"
 
 
 def begin(made, capture: Path, method: str) -> str:
@@ -88,8 +93,8 @@ def begun(made, job: str) -> dict[str, list[str]]:
 
 
 def both_at_work(made, job: str) -> tuple[str, str]:
-    """The worker that has the job, and the one that helps, when each has begun a piece."""
-    made.until(lambda: len(begun(made, job)) == WORKERS, "shared")
+    """The worker that has the job, and the one that helps, when each has begun a piece and neither waits for the other any more."""
+    made.until(lambda: len(begun(made, job)) == WORKERS == len(list(together(made).glob("*"))), "shared")
     holder = made.holder(job)
     return holder, next(worker for worker in begun(made, job) if worker != holder)
 
@@ -150,7 +155,7 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture
     both.until(lambda: {"step stopped", "help stopped"} <= set(events_of(both, job, "step stopped", "help stopped")), "stopped")
     both.until(lambda: not pieces_folder(both, job).exists(), "removed")
     assert both.row(job)["state"] == jobs.CANCELLED
-    shutil.rmtree(both.folder / "together")  # the first piece waits for both once more
+    shutil.rmtree(together(both))  # the first piece waits for both once more
     other = begin(both, capture, "lambert")  # both are free again
     assert both.ended(other)["state"] == jobs.SUCCEEDED
     both.until(lambda: len(begun(both, other)) == WORKERS, "shared")
