@@ -1,4 +1,4 @@
-"""Fixtures of every test, and the order of test files."""
+"""Fixtures of every test, and which process of a test run runs which files, in which order."""
 
 import atexit
 import gc
@@ -6,6 +6,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from kernels import device as devices
 
@@ -28,20 +29,40 @@ def pytest_collection() -> Generator[None, object, object]:
         atexit.register(gc.unfreeze)  # some libraries look for leaks as the interpreter ends; pytest's last search comes before
 
 
+ONE_SERVER = ("tests/service/server/api", "tests/service/server/pages", "tests/service/client")
+"""Folders whose tests share a server, which takes processor time as long as it runs: one process of the run has all of them."""
 PROGRAMS = ("clients", "server")
 """Folders of tests that start servers, browsers and other programs."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Spread the files that start other programs evenly over the run: side by side they would wait for each other's processor time.
+def together(file: str) -> str:
+    """Return what one process of the run has all of: the folder of a test file, or the file."""
+    return next((folder for folder in ONE_SERVER if file.startswith(f"{folder}/")), file)
 
-    Files with more long tests come first, so that at the end no worker of the run is left with one of them.
+
+class TogetherScheduling(LoadFileScheduling):
+    """Gives each process of the run what belongs together."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return together(super()._split_scope(nodeid))
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> TogetherScheduling:
+    return TogetherScheduling(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the folders of which one process has all, and spread the files that start other programs evenly over the run.
+
+    Side by side these would wait for each other's processor time. Files with more long tests come first, so that at the end no process of
+    the run is left with one of them.
     """
-    files: dict[Path, list[pytest.Item]] = {}
+    groups: dict[str, list[pytest.Item]] = {}
     for item in items:
-        files.setdefault(item.path, []).append(item)
-    in_order = sorted(files, key=lambda path: -sum(item.get_closest_marker("long") is not None for item in files[path]))
-    starts = [path for path in in_order if set(PROGRAMS) & set(path.parts)]
-    others = [path for path in in_order if path not in set(starts)]
-    place = {path: (number + 0.5) / len(some) for some in (starts, others) for number, path in enumerate(some)}
-    items[:] = [item for path in sorted(files, key=lambda path: place[path]) for item in files[path]]
+        groups.setdefault(together(item.nodeid.partition("::")[0]), []).append(item)
+    in_order = sorted(groups, key=lambda group: -sum(item.get_closest_marker("long") is not None for item in groups[group]))
+    folders = [group for group in ONE_SERVER if group in groups]
+    starts = [group for group in in_order if group not in folders and set(PROGRAMS) & set(Path(group).parts)]
+    others = [group for group in in_order if group not in folders and group not in starts]
+    place = {group: (number + 0.5) / len(some) for some in (starts, others) for number, group in enumerate(some)}
+    items[:] = [item for group in folders + sorted(place, key=lambda group: place[group]) for item in groups[group]]

@@ -3,10 +3,7 @@
 Chromium is Debian's. Without it these tests are skipped, unless RELIT_TEST_PAGES is `required`, as .ci/run sets it.
 """
 
-import fcntl
-import json
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,32 +29,12 @@ MAX_SIGMA = 0.3
 
 PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
 """The folder for the pictures of the documentation; without it they are made and dropped."""
-SETTINGS = {"roots": str(SAMPLES), "requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
-OPTIONS = ("--anonymous", "--device", "cpu")
 
 
 @pytest.fixture(scope="session")
-def solved_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that is made once for all processes of a test run: the data of a server that has solved the small sample and stopped."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
-    made = folder / "pages"
-    with open(folder / "pages.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (made / "solved.json").exists():
-            shutil.rmtree(made, ignore_errors=True)  # of a process that was stopped
-            with serving(made, *OPTIONS, **SETTINGS) as running:
-                found = prepared(running, "lambert", {"method": "lambert", "max_sigma": MAX_SIGMA})
-            (made / "solved.json").write_text(json.dumps({"capture": found.capture, "solve": found.solve}))
-    return made
-
-
-@pytest.fixture(scope="session")
-def server(solved_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    folder = tmp_path_factory.mktemp("pages_of_process")
-    shutil.copytree(solved_data / "data", folder / "data")
-    with serving(folder, *OPTIONS, sabotage="long", **SETTINGS) as running:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("pages"), "--anonymous", "--device", "cpu", sabotage="long", roots=str(SAMPLES),
+                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
         yield running
 
 
@@ -160,8 +137,8 @@ def solved_maps(server: Server, client, capture: str, options: dict) -> str:
 
 
 @pytest.fixture(scope="session")
-def solved(server: Server, solved_data: Path) -> Solved:
-    return Solved(server, **json.loads((solved_data / "solved.json").read_text()))
+def solved(server: Server) -> Solved:
+    return prepared(server, "lambert", {"method": "lambert", "max_sigma": MAX_SIGMA})
 
 
 @pytest.fixture(scope="session")
