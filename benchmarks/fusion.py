@@ -3,6 +3,7 @@
     python -m benchmarks.fusion --rows 480 --voxel-mm 1
     python -m benchmarks.fusion --rows 480 --voxel-mm 1 --depths shots.npz            # the same scans for fusion_open3d.py
     python -m benchmarks.fusion --rows 480 --voxel-mm 1 --other mesh.npz              # and its `points`, measured alike
+    python -m benchmarks.fusion --rows 480 --voxel-mm 1 --points                      # scans as PLY files, rays in random directions
 """
 
 import argparse
@@ -16,6 +17,7 @@ import numpy as np
 from service.requests.fuse import FuseRequest
 from service.scans.fuse import fuse
 from stage.scans.ply_points import read_ply_points
+from tests.scenes.clouds import all_around, entry, write_set
 from tests.scenes.statue import PARTS, SIGMA, distance, nearest_part, turntable, write_scans
 
 PRINTED = ("head", "body", "foot", "blade", "left plate", "bracket")
@@ -52,6 +54,7 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--depths", type=Path, help="write the depth images, poses and focal lengths here")
     parser.add_argument("--other", type=Path, help="an .npz with the points of another program's mesh of the same scans")
+    parser.add_argument("--points", action="store_true", help="sets of points in place of range images")
     given = parser.parse_args()
     assert set(PRINTED) <= set(PARTS)
     shots = turntable(given.views, (given.rows, given.rows * 3 // 4))
@@ -60,7 +63,12 @@ def main() -> None:
         np.savez(given.depths, depth=np.stack([shot.depth for shot in shots]).astype(np.float32),
                  pose=np.stack([shot.world_from_camera for shot in shots]), focal=np.array([shot.focal for shot in shots]))
     with tempfile.TemporaryDirectory() as folder:
-        file = write_scans(Path(folder), shots)
+        if given.points:
+            clouds = all_around(given.views, given.rows * given.rows * 3 // 4)
+            file = write_set(Path(folder), [entry(cloud, Path(folder), number) for number, cloud in enumerate(clouds)])
+            print(f"as {sum(len(cloud.points) for cloud in clouds)} points, beside {sum(shot.mask.sum() for shot in shots)} pixels")
+        else:
+            file = write_scans(Path(folder), shots)
         before = peak_gib()
         start = time.perf_counter(), time.process_time()
         result = fuse(FuseRequest(scan_set=file, out=Path(folder) / "out", voxel_m=1e-3 * given.voxel_mm, texture=False,

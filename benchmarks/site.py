@@ -4,7 +4,7 @@ Usage: python -m benchmarks.site [--scans 200] [--megapixels 0.05] [--voxel-mm 1
 
 The courtyard (24 m × 16 m) is walls, columns, blocks and statues of balls in closed form, so that every ray and every distance is exact.
 Three of five scans are seen from afar (85° across, σ of 0.5 mm and 0.1 ‰ of the depth), the others from 1.3 m before a statue (32° across,
-σ of 0.1 mm, nothing beyond 2.2 m); one in ten is a PLY cloud in millimetres, which is registered and not fused. Poses start 20 mm and 0.2°
+σ of 0.1 mm, nothing beyond 2.2 m); one in ten is a PLY cloud in millimetres. Poses start 20 mm and 0.2°
 off from afar, and 4 mm and 0.2° from near. `relit register` and `relit fuse --tiles` run as processes of their own, of which the memory and
 the time are told. A run that was stopped goes on where it was when it is begun again with the same folder.
 """
@@ -101,7 +101,7 @@ def write_scan(scene: Scene, folder: Path, name: str, number: int, count: int, s
     more = {}
     if number % CLOUD_EVERY == CLOUD_EVERY - 1:
         write_ply(PointCloud((1000 * own).astype(np.float32), np.zeros((len(own), 3), dtype=np.uint8)), folder / f"{name}.ply")
-        more = {"unit": "mm", "sigma_m": float(np.median(sigma[mask]))}
+        more = {"unit": "mm", "sigma_m": float(np.median(sigma[mask])), "viewpoint_m": (0.0, 0.0, 0.0)}
     else:
         DepthMaps(camera=camera, mask=mask, depth=noisy, sigma=sigma).write(folder / name / "depth.exr")
     entry = ScanEntry(name=name, path=f"{name}.ply" if more else name, **more, scan_to_world=tuple(tuple(map(float, row)) for row in start))
@@ -244,11 +244,11 @@ def main() -> None:
     if given.until == "registration":
         return
     file, listed = read_scan_set(work / "registered")
-    images = [entry for entry in listed.scans if entry.scan_to_world is not None and not entry.path.endswith(".ply")]
+    placed = [entry for entry in listed.scans if entry.scan_to_world is not None]
     write_scan_set(listed.model_copy(update={"scans": tuple(entry.model_copy(update={"path": str((file.parent / entry.path).resolve())})
-                                                            for entry in images)}), work / "images" / "scan-set.json")
+                                                            for entry in placed)}), work / "placed" / "scan-set.json")
     voxel = given.voxel_mm or 1e3 * 0.5 * 6.0 * np.tan(np.radians(FAR_DEGREES) / 2) * 2 / np.sqrt(1.25e6 * given.megapixels)
-    fusing = run("fuse", work / "images", "--out", work / "fused", "--tiles", "--voxel-m", f"{1e-3 * voxel:.3g}", "--device", "cpu",
+    fusing = run("fuse", work / "placed", "--out", work / "fused", "--tiles", "--voxel-m", f"{1e-3 * voxel:.3g}", "--device", "cpu",
                  "--cache", work / "fuse", note=work / "fuse.json")
     fused = json.loads((work / "fused" / "report.json").read_text())
     off = surface_errors(scene, work / "fused" / "tiles", common_motion(work / "registered", truth))

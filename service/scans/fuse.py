@@ -58,7 +58,7 @@ def fuse(request: FuseRequest, progress: Progress | None = None, sharing: Shared
 
     Raises:
         AssetError: xatlas is not installed, and a texture is asked for.
-        RequestError: a scan has no pose or is no range image, too few scans remain, or their poses contradict each other.
+        RequestError: a scan has no pose or no lines of sight, too few scans remain, or their poses contradict each other.
         ManifestError, ResultError, ImageError: the scan set or a file of it cannot be used.
         StorageError: a file cannot be read or written.
     """

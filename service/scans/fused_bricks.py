@@ -61,7 +61,7 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
         sharing: the part of this worker in a fusion that others help with; None: there are no others.
 
     Raises:
-        RequestError: a scan has no pose or is no range image, too few scans remain, or their poses contradict each other.
+        RequestError: a scan has no pose or no lines of sight, too few scans remain, or their poses contradict each other.
         DivergedError: this worker does not lead, and finds something else than the worker that leads.
         StageError, StorageError: a file cannot be used, read or written.
     """
@@ -73,7 +73,8 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
         places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
         pieces.identify(scan_set.model_dump_json(), stamps(places, timed=sharing is None), kind_of_worker(device))
         (work / "scans").mkdir()
-        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m), pieces, timings, device)
+        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m, device=device),
+                      pieces, timings, device)
 
 
 def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:

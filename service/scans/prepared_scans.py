@@ -11,6 +11,7 @@ import numpy as np
 from kernels.fusion.views import RangeImage
 from service.errors import RequestError
 from service.scans.misplaced import Sample, sample_of
+from service.scans.point_sets import as_range_image
 from service.scans.range_images import PreparedScan, focal_of, prepare_scan, with_layers
 from service.scans.read import read_scan
 from service.scans.surface import centre_of
@@ -67,7 +68,7 @@ class ScanSummary(NamedTuple):
 class PreparedScans:
     """The scans of a set."""
 
-    def __init__(self, file: Path, scan_set: ScanSet, folder: Path, voxel_m: float | None) -> None:
+    def __init__(self, file: Path, scan_set: ScanSet, folder: Path, voxel_m: float | None, *, device: str) -> None:
         """Create the scans, of which none is read yet.
 
         Args:
@@ -75,8 +76,9 @@ class PreparedScans:
             scan_set: its content.
             folder: for the arrays of the scans; exists.
             voxel_m: metres, to which pixels that are far smaller are joined; None: they stay.
+            device: where sets of points are made range images.
         """
-        self._file, self._scan_set, self._folder, self._voxel_m = file, scan_set, folder, voxel_m
+        self._file, self._scan_set, self._folder, self._voxel_m, self._device = file, scan_set, folder, voxel_m, device
         self._prepared: dict[int, PreparedScan] = {}
         self._complete: dict[int, PreparedScan] = {}
         self._locks = [threading.Lock() for _ in scan_set.scans]
@@ -89,7 +91,7 @@ class PreparedScans:
         """Return a scan with the layers that it has.
 
         Raises:
-            RequestError: it has no pose, is no range image, or has too few pixels.
+            RequestError: it has no pose, is a set of points that nothing says or shows where it was seen from, or has too few pixels.
         """
         with self._locks[number]:
             if number not in self._prepared:
@@ -127,7 +129,12 @@ class PreparedScans:
         where = f"{self._file}: scans[{number}] ({scan.name})"
         if scan.pose is None:
             raise RequestError(f"{where}: scan_to_world is missing: run relit register first, and fuse the scan-set.json that it writes")
-        prepared = prepare_scan(scan, folder, where, self._voxel_m)
+        if scan.camera is None:
+            if self._scan_set.scans[number].viewpoint_m is None:
+                raise RequestError(f"{where}: viewpoint_m is missing: {scan.path.name} is a set of points, and only lines of sight say "
+                                   "what is empty; give the place of the scanner in the frame of the file, metres")
+            scan = as_range_image(scan, where, device=self._device)
+        prepared = prepare_scan(scan, folder, self._voxel_m)
         if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
             raise RequestError(f"{where}: has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours show the same surface: its "
                                "pixels are too far apart or too noisy to be fused")

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.fusion.views import RangeImage
-from service.errors import RequestError
 from stage.camera import Camera
 from stage.colour import convert
 from stage.depth_breaks import connected
@@ -71,25 +70,17 @@ def channels(names: tuple[str, ...]) -> dict[str, slice]:
     return places
 
 
-def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = None) -> PreparedScan:
+def prepare_scan(scan: Scan, folder: Path, voxel_m: float | None = None) -> PreparedScan:
     """Return a scan as a range image with the layers that it has, its arrays in files of a folder.
 
     Args:
-        scan: with a pose and the camera of a range image.
+        scan: a range image with a pose.
         folder: exists.
-        where: what messages begin with.
         voxel_m: metres, to which pixels that are far smaller are joined in squares, unless the scan has maps or an orthographic camera;
             None: they stay.
-
-    Raises:
-        RequestError: the scan is no range image.
     """
-    pose = scan.pose
-    assert pose is not None
-    if scan.camera is None or scan.pixels is None:
-        raise RequestError(f"{where}: is a set of points: fusion needs range images (depth results), whose lines of sight say what "
-                           "is empty")
-    camera = scan.camera
+    pose, camera = scan.pose, scan.camera
+    assert pose is not None and camera is not None
     parallel = camera.projection == "orthographic"
     side = 1 if voxel_m is None or scan.maps is not None or parallel else _square_side(scan, camera, voxel_m)
     if side > 1:
@@ -103,8 +94,7 @@ def prepare_scan(scan: Scan, folder: Path, where: str, voxel_m: float | None = N
     if maps is not None and maps.height is not None and maps.height_sigma is not None:  # depth and normals have been joined
         joined = mask & maps.mask & (maps.height_sigma > 0) & (parallel | (maps.height < 0))
         depth, sigma = np.where(joined, -maps.height, depth), np.where(joined, maps.height_sigma, sigma)
-    estimated = scan.normals is None or scan.normals_source == "photometric"
-    normal = depth_normals(depth, mask, camera, sigma=sigma, radius=NORMAL_RADIUS_PX) if estimated else scan.image(_given(scan))
+    normal = depth_normals(depth, mask, camera, sigma=sigma, radius=NORMAL_RADIUS_PX)
     usable = mask & (np.abs(normal).sum(axis=-1) > 0)
     cell = surface_cells(depth, usable, camera, sigma)
     camera_from_world = np.linalg.inv(pose)
@@ -189,11 +179,6 @@ def surface_cells(depth: np.ndarray, mask: np.ndarray, camera: Camera, sigma: np
     gentle = np.ptp(corners, axis=0) <= STEEPEST * nearest / min(focal_of(camera)) + STEP_SIGMAS * noise
     cell[:-1, :-1] = right[:-1, :-1] & right[1:, :-1] & down[:-1, :-1] & down[:-1, 1:] & across[:-1, :-1] & back[:-1, 1:] & gentle
     return cell
-
-
-def _given(scan: Scan) -> np.ndarray:
-    assert scan.normals is not None
-    return scan.normals
 
 
 def _layers(scan: Scan, maps: SurfaceMaps | None, normal: np.ndarray) -> dict[str, np.ndarray]:

@@ -80,6 +80,8 @@ def _range_image(path: Path, entry: ScanEntry, where: str, home: Path, pose: np.
                  estimate_normals: bool) -> Scan:
     if entry.unit != "m":
         raise ManifestError(f"{where}: unit: is {entry.unit}, but {path.name} is in metres: leave it out")
+    if entry.viewpoint_m is not None:
+        raise ManifestError(f"{where}: viewpoint_m: {path.name} has a camera, which says where it was seen from: leave it out")
     depth = DepthMaps.read(path)
     camera = depth.camera
     if pose is None and camera.world_from_camera is not None:
@@ -144,7 +146,7 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
     ply = _kept(read_ply_points(path))
     unit = UNITS_M[entry.unit]
     points = (ply.points * unit).astype(np.float32)
-    origin = np.zeros(3)
+    origin = np.zeros(3) if entry.viewpoint_m is None else np.array(entry.viewpoint_m, dtype=np.float64)
     planes = None
     if (ply.normals is None and estimate_normals) or (ply.sigma is None and entry.sigma_m is None):
         planes = local_planes(points, origin=origin)

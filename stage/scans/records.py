@@ -58,6 +58,9 @@ class ScanEntry(Strict):
     sigma_m: Positive | None = None
     """Standard deviation of every point along its line of sight, metres, where the scan does not hold it (a PLY file without the property
     sigma, a depth without sigma.Z). None: it is estimated by the scatter of the points around local planes."""
+    viewpoint_m: Vector | None = None
+    """Where the scanner stood, of a PLY file, metres, in the frame of the scan: each point was seen from there, with nothing in the way.
+    `relit fuse` needs it of PLY files. None: not known, and taken to be the origin where it only tells the side of a surface."""
     scan_to_world: Transform | None = None
     """The rows of world_from_scan: x_world = R x + t, in metres. None: `world_from_camera` of the depth result, or not known."""
     pose_covariance: Covariance | None = None

@@ -83,21 +83,26 @@ def shoot(pose: np.ndarray, side: tuple[int, int], focal: float, *, sigma: float
     u, v = np.meshgrid(np.arange(cols) + 0.5 - cols / 2, np.arange(rows) + 0.5 - rows / 2)
     ray = np.stack([u / focal, -v / focal, -np.ones(side)], axis=-1).reshape(-1, 3)
     length = np.linalg.norm(ray, axis=-1)
-    direction = (ray / length[:, None]) @ pose[:3, :3].T
-    along, alive = np.zeros(len(ray)), np.arange(len(ray))
-    hit = np.zeros(len(ray), dtype=bool)
+    along, hit = trace(pose[:3, 3], (ray / length[:, None]) @ pose[:3, :3].T, scene)
+    true = np.where(hit, along / length, 0).reshape(side)
+    noise = sigma * np.random.default_rng(seed).standard_normal(side)
+    mask = hit.reshape(side)
+    return Shot(np.where(mask, true + noise, 0), true, mask, pose, focal, side)
+
+
+def trace(start: np.ndarray, direction: np.ndarray, scene=distance) -> tuple[np.ndarray, np.ndarray]:
+    """How far rays [n, 3] from a point reach, metres, and whether they hit: sphere tracing."""
+    along, alive = np.zeros(len(direction)), np.arange(len(direction))
+    hit = np.zeros(len(direction), dtype=bool)
     for _ in range(200):
-        d = scene(pose[:3, 3] + along[alive, None] * direction[alive])
+        d = scene(start + along[alive, None] * direction[alive])
         along[alive] += d
         close = np.abs(d) < 1e-7
         hit[alive[close]] = True
         alive = alive[~close & (along[alive] < 10)]
         if len(alive) == 0:
             break
-    true = np.where(hit, along / length, 0).reshape(side)
-    noise = sigma * np.random.default_rng(seed).standard_normal(side)
-    mask = hit.reshape(side)
-    return Shot(np.where(mask, true + noise, 0), true, mask, pose, focal, side)
+    return along, hit
 
 
 def turntable(count: int = 18, side: tuple[int, int] = (240, 180), *, sigma: float = SIGMA, range_m: float = 2.0,

@@ -102,13 +102,6 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]
     refused("the poses contradict each other: run relit register first",
             scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))
-    points = tmp_path / "points"
-    points.mkdir()
-    data = json.loads(write_scans(points, shots[:1], coloured=True).read_text())
-    data["scans"][0]["path"] += "/points.ply"
-    data["scans"][0]["sigma_m"] = SIGMA
-    (points / "scan-set.json").write_text(json.dumps(data))
-    refused(r"scans\[0\] \(view 0\): is a set of points: fusion needs range images", scan_set=points)
     assert not (tmp_path / "out").exists()
 
 

@@ -24,7 +24,7 @@ def mapped_mib() -> float:
 def test_what_is_released_leaves_memory_and_can_be_read_again(tmp_path):
     file, listed = read_scan_set(write_scans(tmp_path / "scans", turntable(2, SHAPE[::-1])))
     (tmp_path / "arrays").mkdir()
-    scan = prepare_scan(read_scan(file, listed, 0), tmp_path / "arrays", "scan")
+    scan = prepare_scan(read_scan(file, listed, 0), tmp_path / "arrays")
     before = mapped_mib()
     sums = [float(np.sum(array, dtype=np.float64)) for array in (*scan.image[:5], scan.layers, scan.feather)]
     held = mapped_mib()
