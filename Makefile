@@ -7,7 +7,7 @@ WORKERS ?= 4
 # Python keeps what it compiled, also where an image says that it should not: else every start of a program compiles all of it again
 export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
-PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
 
 .PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed

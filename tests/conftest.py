@@ -47,6 +47,7 @@ class TogetherScheduling(LoadFileScheduling):
         return together(super()._split_scope(nodeid))
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> TogetherScheduling:
     return TogetherScheduling(config, log)
 

@@ -22,10 +22,10 @@ NEAREST = 1.25
 """Farthest that the nearest point may lie from the centre of a pixel, pixels."""
 WIDTH = 0.8
 """Standard deviation of the Gaussian function by which points count, pixels."""
-STEEPEST = 2.75
-"""Tangent of the largest angle, 70°, by which a surface is taken to lean against the line of sight, as the cells of fusion are."""
-STEP_SIGMAS = 5.66
-"""Difference of two depths that noise explains, in standard deviations of one: four of the difference."""
+STEEPEST = float(np.tan(np.radians(70.0)))
+"""Largest slope of a surface against the line of sight: what is steeper may be an edge beside what lies behind it."""
+STEP_SIGMAS = float(4.0 * np.sqrt(2.0))
+"""Difference of two depths, in standard deviations of one, that noise explains."""
 LEAST_SPREAD = 1.0e-3
 """Least determinant of the moments of the points, of which points all around have 4: below it they lie in a line or on a ring."""
 

@@ -19,6 +19,8 @@ ROUNDS = 300
 """Steps of the search for the middle of the lines of sight, which then is within some tenth of a degree."""
 POINTS_IN_SQUARE = 4.0
 """Mean number of points of an occupied square of two by two pixels: one for each pixel."""
+THINNEST = 1e-6
+"""Least width of the image for its length that their distance is told from: points in a line are no surface."""
 MOST_PIXELS_A_POINT = 16
 """Most pixels of the image for each point. More are a scan of separate parts, or points that belong to none."""
 MOST_AMISS = 0.1
@@ -68,6 +70,8 @@ def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
         raise RequestError(f"{where}: {behind:.0%} of its points lie before or behind others as seen from viewpoint_m: they are no scan "
                            "from there. Give the right viewpoint_m, or each scan in a file of its own")
     pixels = np.flatnonzero(image.nearest >= 0)
+    if len(pixels) == 0:
+        raise RequestError(f"{where}: its {len(scan.points)} points show no surface as seen from viewpoint_m: they are too few, or lie in a line")
     points = camera.points_at(pixels, -image.depth.reshape(-1)[pixels])
     of_point = image.nearest.reshape(-1)[pixels]
     stretch = np.linalg.norm(points, axis=1) / -points[:, 2]
@@ -95,7 +99,9 @@ def _middle(direction: np.ndarray) -> np.ndarray:
 
 def _spacing(places: np.ndarray) -> float:
     """Return the distance of neighbouring points of [n, 2], so that where there are any there is one in each square of it."""
-    side = 2 * float(np.sqrt(max(np.prod(np.ptp(places, axis=0)), np.finfo(np.float64).tiny) / len(places)))
+    extent = np.ptp(places, axis=0)
+    least = max(THINNEST * float(extent.max()), np.finfo(np.float64).eps)
+    side = 2 * float(np.sqrt(np.prod(np.maximum(extent, least)) / len(places)))
     for _ in range(6):
         column, row = np.floor((places - places.min(axis=0)) / side).astype(np.int64).T
         squares = np.sort(row * (column.max() + 1) + column)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.fusion.resample import STEEPEST, STEP_SIGMAS
 from kernels.fusion.views import RangeImage
 from stage.camera import Camera
 from stage.colour import convert
@@ -17,10 +18,6 @@ from stage.mask_border import distance
 from stage.scans.scan import Scan
 from stage.scans.squares import coarser
 
-STEEPEST = float(np.tan(np.radians(70.0)))
-"""Largest slope of a cell of four pixels against the line of sight: what is steeper may be an edge beside what lies behind it."""
-STEP_SIGMAS = 4.0 * np.sqrt(2.0)
-"""Difference of two depths, in standard deviations of one, that noise explains."""
 CLEAR_PIXELS = 2
 """Pixels around a pixel that must all lie behind a point before the point counts as seen to be empty: edges are blurred that far."""
 FEATHER_PIXELS = 12.0

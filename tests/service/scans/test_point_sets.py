@@ -93,6 +93,9 @@ def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
     apart = np.vstack([one.points[near], one.viewpoint + (one.points[:5] - one.viewpoint) @ _turned(0.8)])
     refused(r"points are spread over \d+ x \d+ pixels as seen from viewpoint_m",
             entry(one._replace(points=apart, colours=one.colours[:len(apart)]), tmp_path, 0))
+    for points in (one.points[:1].repeat(500, axis=0), one.points[0] + np.linspace(0, 0.3, 500)[:, None] * [1, 0, 0]):
+        refused(r"\(cloud 0\): its 500 points (show no surface|are spread over)",
+                entry(one._replace(points=points, colours=one.colours[:500]), tmp_path, 0))
     shots = write_scans(tmp_path / "images", turntable(1, (80, 60)))
     listed = json.loads(shots.read_text())["scans"]
     refused(r"viewpoint_m: depth.exr has a camera", {**listed[0], "path": "images/scan0", "viewpoint_m": [0, 0, 0]}, error=ManifestError)
