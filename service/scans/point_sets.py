@@ -71,7 +71,8 @@ def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
                            "from there. Give the right viewpoint_m, or each scan in a file of its own")
     pixels = np.flatnonzero(image.nearest >= 0)
     if len(pixels) == 0:
-        raise RequestError(f"{where}: its {len(scan.points)} points show no surface as seen from viewpoint_m: they are too few, or lie in a line")
+        raise RequestError(f"{where}: its {len(scan.points)} points show no surface as seen from viewpoint_m: they are too few, "
+                           "or lie in a line")
     points = camera.points_at(pixels, -image.depth.reshape(-1)[pixels])
     of_point = image.nearest.reshape(-1)[pixels]
     stretch = np.linalg.norm(points, axis=1) / -points[:, 2]
