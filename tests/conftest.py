@@ -6,7 +6,6 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from xdist.scheduler import LoadFileScheduling
 
 from kernels import device as devices
 
@@ -40,16 +39,16 @@ def together(file: str) -> str:
     return next((folder for folder in ONE_SERVER if file.startswith(f"{folder}/")), file)
 
 
-class TogetherScheduling(LoadFileScheduling):
-    """Gives each process of the run what belongs together."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        return together(super()._split_scope(nodeid))
-
-
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> TogetherScheduling:
-    return TogetherScheduling(config, log)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """Give each process of the run what belongs together; without xdist, as beside Warp and NumPy alone, there is one process."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Together(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return together(super()._split_scope(nodeid))
+
+    return Together(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

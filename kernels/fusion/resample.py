@@ -1,12 +1,18 @@
 """A range image from points at any image coordinates: at the centre of each pixel, the depth of the surface that the nearest point lies on.
 
 Along the lines of sight of a perspective camera the inverse depth of a plane is linear in the image. Each pixel takes the value at its
-centre of the function that fits the points around it (moving least squares), by weights that fall with the distance, and of the points
-only those that lie on one surface with the nearest. The function is linear but for one term, the squared distance from the centre:
-without it the pixels would lie inside of each bent surface, as means do. The variance follows from the same weights; where it is larger
-than that of the nearest point, as beside the edge of the points, the pixel has no depth.
+centre of the function that fits the points around it (moving least squares), by weights that fall with the distance. The function is
+linear but for one term, the squared distance from the centre: without it the pixels would lie inside of each bent surface, as means do.
 
-Source: Levin, "The approximation power of moving least-squares", Mathematics of Computation 67, 1998 (equations 1.1 to 1.5).
+Points that are farther before or behind the nearest than a surface of 70° leads to do not count. Where noise does not explain what the
+fit leaves, as beside lower steps and at creases, it is made again with weights that fall with the residual, which leads to the side with
+most of the weight, that of the nearest points. The variance follows from the weights, and what noise still does not explain is added to
+it. A pixel has no depth where the variance is larger than that of the nearest point alone, as beside the edge of the points, or where the
+fit leaves a large part of the width of a pixel.
+
+Source: Levin, "The approximation power of moving least-squares", Mathematics of Computation 67, 1998 (equations 1.1 to 1.5); Fleishman,
+Cohen-Or and Silva, "Robust moving least-squares fitting with sharp features", SIGGRAPH 2005; Geman and McClure, "Statistical methods for
+tomographic image reconstruction", 1987 (the weights).
 """
 
 from typing import Any, NamedTuple
@@ -16,11 +22,11 @@ import warp as wp
 
 from kernels import device as devices
 
-REACH = 2
+REACH = 3
 """Pixels to each side of a pixel whose points are looked at."""
-NEAREST = 1.25
+NEAREST = 1.75
 """Farthest that the nearest point may lie from the centre of a pixel, pixels."""
-WIDTH = 0.8
+WIDTH = 1.0
 """Standard deviation of the Gaussian function by which points count, pixels."""
 STEEPEST = float(np.tan(np.radians(70.0)))
 """Largest slope of a surface against the line of sight: what is steeper may be an edge beside what lies behind it."""
@@ -28,6 +34,18 @@ STEP_SIGMAS = float(4.0 * np.sqrt(2.0))
 """Difference of two depths, in standard deviations of one, that noise explains."""
 LEAST_SPREAD = 1.0e-3
 """Least determinant of the moments of the points, of which points all around have 4: below it they lie in a line or on a ring."""
+MOST_SURER = 16.0
+"""Largest ratio of the variances of two points by which one counts more than the other."""
+ROUNDS = 6
+"""Most fits of a pixel."""
+LEAST_FREE = 0.1
+"""Least part of the points that counts as left for the residual, of those that the four numbers of the fit leave."""
+EXPLAINED = 1.2
+"""Largest RMS residual that noise explains, in standard deviations of the points."""
+REDESCENDING = 3.0
+"""Least residual, in standard deviations, from which on the weight of a point falls fast."""
+MOST_LEFT = 0.3
+"""Largest RMS residual that noise does not explain, in widths of a pixel."""
 
 
 class Resampled(NamedTuple):
@@ -36,6 +54,32 @@ class Resampled(NamedTuple):
     depth: np.ndarray  # float32 metres; 0 where there is none
     sigma: np.ndarray  # float32 metres, standard deviation of the depth; 0 where there is none
     nearest: np.ndarray  # int32, number of the point that is nearest to the centre; −1 where the pixel has no depth
+
+
+@wp.func
+def _one_surface(there: wp.vec2, reference: wp.vec2, apart: float, focal: float) -> bool:
+    """Return whether a surface of at most STEEPEST leads from one depth and its standard deviation to another, `apart` pixels away."""
+    gentle = STEEPEST * wp.min(there[0], reference[0]) / focal * apart
+    return wp.abs(there[0] - reference[0]) <= gentle + STEP_SIGMAS * wp.max(there[1], reference[1])
+
+
+@wp.func
+def _terms(off: wp.vec2) -> wp.vec4:
+    """Return the terms of the fit at a place, pixels from the centre."""
+    return wp.vec4(1.0, off[0] / WIDTH, off[1] / WIDTH, wp.length_sq(off) / (WIDTH * WIDTH))
+
+
+@wp.func
+def _weight(off: wp.vec2, surer: float) -> float:
+    """Return the weight of a point at a place with a standard deviation that is so many times smaller than that of the nearest."""
+    return wp.exp(-0.5 * wp.length_sq(off) / (WIDTH * WIDTH)) * wp.clamp(surer * surer, 1.0 / MOST_SURER, MOST_SURER)
+
+
+@wp.func
+def _redescending(residual: float, scale: float) -> float:
+    """Return the part of its weight that a point with a residual keeps."""
+    part = scale * scale / (scale * scale + residual * residual)
+    return part * part
 
 
 @wp.kernel(enable_backward=False)
@@ -62,31 +106,65 @@ def _resample_kernel(first: int, rows: int, cols: int, focal: float, start: wp.a
     if closest >= 0:
         reference = measured[closest]
         inverse = 1.0 / reference[0]
-        # moments of the weights, of the values, and of the variance of the values
-        sums = wp.mat44()
-        spreads = wp.mat44()
-        values = wp.vec4()
-        for r in range(top, bottom + 1):
-            for k in range(start[r * cols + left], start[r * cols + right + 1]):
-                there = measured[k]
-                off = at[k] - centre
-                gentle = STEEPEST * wp.min(there[0], reference[0]) / focal * wp.length(at[k] - at[closest])
-                if wp.abs(there[0] - reference[0]) <= gentle + STEP_SIGMAS * wp.max(there[1], reference[1]):
-                    deviation = there[1] / (there[0] * there[0])
-                    w = wp.exp(-0.5 * wp.length_sq(off) / (WIDTH * WIDTH)) * wp.pow(reference[1] / there[1], 2.0)
-                    place = wp.vec4(1.0, off[0] / WIDTH, off[1] / WIDTH, wp.length_sq(off) / (WIDTH * WIDTH))
-                    products = wp.outer(place, place)
-                    sums += w * products
-                    spreads += (w * w * deviation * deviation) * products
-                    values += (w * (1.0 / there[0] - inverse)) * place
-        if wp.determinant(sums) > LEAST_SPREAD * wp.pow(sums[0, 0], 4.0):
-            weights = wp.inverse(sums)[0]
+        own = reference[1] * inverse * inverse
+        fit = wp.vec4()
+        misfit = float(0.0)
+        variance = float(-1.0)
+        scale = float(0.0)
+        for attempt in range(ROUNDS):
+            # moments of the weights, of the values, and of the variance of the values
+            sums = wp.mat44()
+            spreads = wp.mat44()
+            values = wp.vec4()
+            for r in range(top, bottom + 1):
+                for k in range(start[r * cols + left], start[r * cols + right + 1]):
+                    there = measured[k]
+                    if _one_surface(there, reference, wp.length(at[k] - at[closest]), focal):
+                        place = _terms(at[k] - centre)
+                        deviation = there[1] / (there[0] * there[0])
+                        value = 1.0 / there[0] - inverse
+                        w = _weight(at[k] - centre, own / deviation)
+                        if attempt > 0:
+                            w *= _redescending((value - wp.dot(fit, place)) / deviation, scale)
+                        products = wp.outer(place, place)
+                        sums += w * products
+                        spreads += (w * w * deviation * deviation) * products
+                        values += (w * value) * place
+            variance = float(-1.0)
+            if wp.determinant(sums) <= LEAST_SPREAD * wp.pow(sums[0, 0], 4.0):
+                break
+            solution = wp.inverse(sums)
+            weights = solution[0]
+            fit = solution * values
             variance = wp.dot(weights, spreads * weights)
-            own = reference[1] * inverse * inverse
-            found = inverse + wp.dot(weights, values)
-            if variance <= own * own and found > 0.0:
+            total = float(0.0)
+            doubled = float(0.0)
+            squares = float(0.0)
+            for r in range(top, bottom + 1):
+                for k in range(start[r * cols + left], start[r * cols + right + 1]):
+                    there = measured[k]
+                    if _one_surface(there, reference, wp.length(at[k] - at[closest]), focal):
+                        deviation = there[1] / (there[0] * there[0])
+                        residual = (1.0 / there[0] - inverse - wp.dot(fit, _terms(at[k] - centre))) / deviation
+                        w = _weight(at[k] - centre, 1.0)
+                        if attempt > 0:
+                            w *= _redescending(residual, scale)
+                        total += w
+                        doubled += w * w
+                        squares += w * residual * residual
+            free = wp.max(1.0 - 4.0 * doubled / (total * total), LEAST_FREE)
+            misfit = wp.sqrt(squares / (total * free))
+            if misfit <= EXPLAINED:
+                break
+            scale = wp.max(REDESCENDING, 0.5 * misfit)
+        if variance >= 0.0 and variance <= own * own:
+            found = inverse + fit[0]
+            unexplained = float(0.0)
+            if misfit > EXPLAINED:
+                unexplained = own * wp.sqrt(wp.max(misfit * misfit - EXPLAINED * EXPLAINED, 0.0))
+            if found > 0.0 and unexplained <= MOST_LEFT * found / focal:  # a pixel is depth / focal wide
                 depth[i] = 1.0 / found
-                sigma[i] = wp.sqrt(variance) / (found * found)
+                sigma[i] = wp.sqrt(variance + unexplained * unexplained) / (found * found)
                 nearest[i] = closest
 
 

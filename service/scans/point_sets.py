@@ -10,39 +10,46 @@ import numpy as np
 
 from kernels.fusion.resample import STEEPEST, STEP_SIGMAS, resample
 from service.errors import RequestError
+from service.scans.read import FLOAT_STEP
 from stage.camera import Camera
 from stage.scans.scan import Scan
 
 MOST_OFF_AXIS_DEGREES = 55.0
 """Largest angle of a line of sight beside the middle of a scan. The pixels of a flat image see too little beyond."""
 ROUNDS = 300
-"""Steps of the search for the middle of the lines of sight, which then is within some tenth of a degree."""
+"""Steps of the search for the middle of the lines of sight, which then is right to some tenths of a degree."""
 POINTS_IN_SQUARE = 4.0
 """Mean number of points of an occupied square of two by two pixels: one for each pixel."""
+PIXEL_VOXELS = 0.5
+"""Least width of a pixel in voxels: the points of a finer scan are joined in the fits."""
 THINNEST = 1e-6
 """Least width of the image for its length that their distance is told from: points in a line are no surface."""
-MOST_PIXELS_A_POINT = 16
+MOST_PIXELS_A_POINT = 8
 """Most pixels of the image for each point. More are a scan of separate parts, or points that belong to none."""
 MOST_AMISS = 0.1
 """Part of the points that may lie before or behind what their pixel shows, as some do at the edges of parts before others; and that may
 have a normal that points away from the viewpoint, as at grazing angles."""
 
 
-def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
+def as_range_image(scan: Scan, where: str, voxel_m: float | None = None, *, device: str) -> Scan:
     """Return a set of points as a range image from its viewpoint, in the frame of a camera that looks at the middle of the points.
 
     Args:
         scan: a set of points with a pose, whose `origin` is where the scanner stood.
         where: what messages begin with.
+        voxel_m: metres, to which points that are far closer together are joined; None: they stay.
         device: where to compute.
 
     Raises:
         RequestError: the points cannot have been seen from there, or are spread too far.
     """
     away = scan.points.astype(np.float64) - scan.origin
-    direction = away / np.maximum(np.linalg.norm(away, axis=1), np.finfo(np.float64).tiny)[:, None]
+    range_m = np.linalg.norm(away, axis=1)
+    direction = away / np.maximum(range_m, np.finfo(np.float64).tiny)[:, None]
     axis = _middle(direction)
     cosine = direction @ axis
+    sigma = np.maximum(scan.sigma, FLOAT_STEP * range_m) * cosine
+    del direction, range_m
     if (widest := float(np.degrees(np.arccos(np.clip(cosine.min(), -1, 1))))) > MOST_OFF_AXIS_DEGREES:
         raise RequestError(f"{where}: has points {widest:.0f}° beside the middle of what is seen from viewpoint_m; at most "
                            f"{MOST_OFF_AXIS_DEGREES:g}° can be: give another viewpoint_m, or the parts as scans of their own")
@@ -53,8 +60,11 @@ def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
                                "Give the right viewpoint_m, or each scan in a file of its own")
     camera_from_scan = _looking(axis)
     x, y, z = camera_from_scan @ away.T
-    across, up = -x / z, -y / z
+    depth, across, up = -z, -x / z, -y / z
+    del away, cosine, x, y, z
     pitch = _spacing(np.stack([across, up], axis=1))
+    if voxel_m is not None:
+        pitch = max(pitch, PIXEL_VOXELS * voxel_m / float(np.median(depth)))
     left, top = across.min() - pitch, up.max() + pitch
     cols, rows = (int(np.ceil(extent / pitch)) + 1 for extent in (across.max() - left, top - up.min()))
     if rows * cols > MOST_PIXELS_A_POINT * len(scan.points):
@@ -63,16 +73,16 @@ def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
     camera = Camera(projection="perspective", resolution=(cols, rows), focal_px=(1 / pitch, 1 / pitch),
                     principal_px=(-left / pitch, top / pitch))
     place = np.stack([(across - left) / pitch, (top - up) / pitch], axis=1)
-    sigma = scan.sigma * cosine
-    image = resample(place, -z, sigma, (rows, cols), 1 / pitch, device=device)
-    behind = _off_image(place, -z, sigma, image.depth, pitch)
+    del across, up
+    image = resample(place, depth, sigma, (rows, cols), 1 / pitch, device=device)
+    behind = _off_image(place, depth, sigma, image.depth, pitch)
     if behind > MOST_AMISS:
         raise RequestError(f"{where}: {behind:.0%} of its points lie before or behind others as seen from viewpoint_m: they are no scan "
                            "from there. Give the right viewpoint_m, or each scan in a file of its own")
     pixels = np.flatnonzero(image.nearest >= 0)
     if len(pixels) == 0:
         raise RequestError(f"{where}: its {len(scan.points)} points show no surface as seen from viewpoint_m: they are too few, "
-                           "or lie in a line")
+                           "or lie in lines that are too far apart")
     points = camera.points_at(pixels, -image.depth.reshape(-1)[pixels])
     of_point = image.nearest.reshape(-1)[pixels]
     stretch = np.linalg.norm(points, axis=1) / -points[:, 2]
@@ -82,7 +92,7 @@ def as_range_image(scan: Scan, where: str, *, device: str) -> Scan:
     return replace(scan, points=points, sigma=(image.sigma.reshape(-1)[pixels] * stretch).astype(np.float32), normals=None,
                    normals_source="unknown", colours=None if scan.colours is None else scan.colours[of_point],
                    confidence=None if scan.confidence is None else scan.confidence[of_point], origin=np.zeros(3), camera=camera,
-                   pixels=pixels, pose=scan.pose @ scan_from_camera)
+                   pixels=pixels, pose=scan.pose @ scan_from_camera, pose_covariance=None, targets=())  # these are of the frame before
 
 
 def _middle(direction: np.ndarray) -> np.ndarray:

@@ -81,6 +81,7 @@ class PreparedScans:
         self._file, self._scan_set, self._folder, self._voxel_m, self._device = file, scan_set, folder, voxel_m, device
         self._prepared: dict[int, PreparedScan] = {}
         self._complete: dict[int, PreparedScan] = {}
+        self._one_set = threading.Lock()  # sets of points are made range images one by one, which bounds the memory
         self._locks = [threading.Lock() for _ in scan_set.scans]
 
     def __len__(self) -> int:
@@ -133,8 +134,11 @@ class PreparedScans:
             if self._scan_set.scans[number].viewpoint_m is None:
                 raise RequestError(f"{where}: viewpoint_m is missing: {scan.path.name} is a set of points, and only lines of sight say "
                                    "what is empty; give the place of the scanner in the frame of the file, metres")
-            scan = as_range_image(scan, where, device=self._device)
-        prepared = prepare_scan(scan, folder, self._voxel_m)
+            with self._one_set:
+                scan = as_range_image(scan, where, self._voxel_m, device=self._device)
+            prepared = prepare_scan(scan, folder)
+        else:
+            prepared = prepare_scan(scan, folder, self._voxel_m)
         if np.count_nonzero(prepared.image.cell) < LEAST_PIXELS:
             raise RequestError(f"{where}: has {np.count_nonzero(prepared.image.cell)} pixels whose neighbours show the same surface: its "
                                "pixels are too far apart or too noisy to be fused")

@@ -143,10 +143,13 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
                estimate_normals: bool) -> Scan:
     if entry.maps is not None:
         raise ManifestError(f"{where}: maps: {path.name} is a set of points: solved maps belong to a range image")
-    ply = _kept(read_ply_points(path))
     unit = UNITS_M[entry.unit]
-    points = (ply.points * unit).astype(np.float32)
     origin = np.zeros(3) if entry.viewpoint_m is None else np.array(entry.viewpoint_m, dtype=np.float64)
+    ply = _kept(read_ply_points(path), None if entry.viewpoint_m is None else origin / unit)
+    if len(ply.points) == 0:
+        beside = "" if entry.viewpoint_m is None else " that is not at viewpoint_m"
+        raise ManifestError(f"{where}: has no point with a σ above 0{beside}")
+    points = (ply.points * unit).astype(np.float32)
     planes = None
     if (ply.normals is None and estimate_normals) or (ply.sigma is None and entry.sigma_m is None):
         planes = local_planes(points, origin=origin)
@@ -165,11 +168,11 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
                 pose_covariance=covariance, maps=None, targets=targets_of(entry))
 
 
-def _kept(ply: PlyPoints) -> PlyPoints:
-    """Return the points without those whose σ says that they are none."""
-    if ply.sigma is None:
-        return ply
-    there = np.isfinite(ply.sigma) & (ply.sigma > 0)
+def _kept(ply: PlyPoints, viewpoint: np.ndarray | None) -> PlyPoints:
+    """Return the points without those whose σ says that they are none, and those at the scanner [3], which are its way to say the same."""
+    there = np.ones(len(ply.points), dtype=bool) if ply.sigma is None else np.isfinite(ply.sigma) & (ply.sigma > 0)
+    if viewpoint is not None:
+        there &= np.abs(ply.points - viewpoint).max(axis=1) > FLOAT_STEP * np.abs(viewpoint).max()
     return ply._replace(**{name: values[there] for name, values in ply._asdict().items() if values is not None})
 
 
@@ -179,8 +182,6 @@ def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, pl
     Raises:
         ManifestError: there is none in the files, and too few points lie together to estimate it.
     """
-    if len(points) == 0:
-        raise ManifestError(f"{where}: has no point with a σ above 0")
     least = FLOAT_STEP * float(np.abs(points).max())
     if measured is not None:
         return _Sigma(np.maximum(measured, least).astype(np.float32), "measured")

@@ -18,6 +18,8 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
 SYMMETRIC = 1e-6
 """The largest asymmetry of a covariance, and the largest negative eigenvalue, as a part of its largest number."""
 
+Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
+"""Metres: beyond ten thousand kilometres single precision leaves nothing of a scan."""
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
@@ -58,7 +60,7 @@ class ScanEntry(Strict):
     sigma_m: Positive | None = None
     """Standard deviation of every point along its line of sight, metres, where the scan does not hold it (a PLY file without the property
     sigma, a depth without sigma.Z). None: it is estimated by the scatter of the points around local planes."""
-    viewpoint_m: Vector | None = None
+    viewpoint_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Where the scanner stood, of a PLY file, metres, in the frame of the scan: each point was seen from there, with nothing in the way.
     `relit fuse` needs it of PLY files. None: not known, and taken to be the origin where it only tells the side of a surface."""
     scan_to_world: Transform | None = None

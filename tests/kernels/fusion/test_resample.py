@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kernels.fusion.resample import NEAREST, REACH, WIDTH, resample
+from kernels.fusion.resample import EXPLAINED, LEAST_FREE, NEAREST, REACH, WIDTH, resample
 
 ROWS, COLS, FOCAL = 40, 50, 400.0
 SIGMA = 2e-4
@@ -28,8 +28,7 @@ def test_a_plane_is_exact(device):
     places = scattered(1)
     found = resample(places, plane(*places.T), np.full(len(places), SIGMA), (ROWS, COLS), FOCAL, device=device)
     known = found.nearest >= 0
-    # of pixels .7 % have no point within NEAREST, and some have points to one side alone
-    assert known[1:-1, 1:-1].mean() > 0.97 and ((found.depth > 0) == known).all() and ((found.sigma > 0) == known).all()
+    assert known[1:-1, 1:-1].mean() > 0.995 and ((found.depth > 0) == known).all() and ((found.sigma > 0) == known).all()
     # 24 bits of a coordinate of 50 pixels, times the slope, and of the sums
     assert np.abs(found.depth - plane(*centres()))[known].max() < 2e-6 * 2
     near = np.hypot(*(places[found.nearest[known]] - np.stack(centres(), axis=-1)[known]).T)
@@ -46,7 +45,8 @@ def test_the_errors_are_what_sigma_says(device):
     ratio = ((found.depth - plane(*centres())) / np.where(known, found.sigma, 1))[known]
     # some 300 independent groups of pixels: their RMS is 1 with a standard deviation of .04
     assert np.sqrt((ratio**2).mean()) == pytest.approx(1, abs=0.16) and abs(ratio.mean()) < 0.25
-    assert (found.sigma[known] <= sigma[found.nearest[known]] * (1 + 1e-5)).all()  # never less sure than the nearest point alone
+    # less sure than the nearest point alone is only what leaves more than EXPLAINED by chance
+    assert (found.sigma[known] <= sigma[found.nearest[known]] * (1 + 1e-5)).mean() > 0.95
 
 
 def test_a_ball_is_not_cut_short(device):
@@ -96,7 +96,7 @@ def test_it_is_the_weighted_fit_of_least_squares(device):
     found = resample(places, depths, sigma, (ROWS, COLS), FOCAL, device=device)
     inside = ((places >= 0) & (places < (COLS, ROWS))).all(axis=1)
     checked = 0
-    for row, col in rng.integers((0, 0), (ROWS, COLS), (40, 2)):
+    for row, col in rng.integers((0, 0), (ROWS, COLS), (60, 2)):
         nearest = found.nearest[row, col]
         if nearest < 0:
             continue
@@ -106,8 +106,37 @@ def test_it_is_the_weighted_fit_of_least_squares(device):
         terms = np.stack([np.ones(around.sum()), *off[around].T, (off[around] ** 2).sum(axis=1)], axis=1)
         kernel = np.linalg.solve(terms.T @ (weight[:, None] * terms), (weight[:, None] * terms).T)[0]
         inverse = kernel @ (1 / depths[around])
+        gauss = np.exp(-0.5 * (off[around] ** 2).sum(axis=1) / WIDTH**2)
+        numbers = np.linalg.solve(terms.T @ (weight[:, None] * terms), terms.T @ (weight / depths[around]))
+        residual = (1 / depths[around] - terms @ numbers) * depths[around] ** 2 / sigma[around]
+        free = max(1 - 4 * (gauss**2).sum() / gauss.sum() ** 2, LEAST_FREE)
+        if gauss @ residual**2 / (gauss.sum() * free) > (EXPLAINED - 0.05) ** 2:
+            continue  # the fit is made again
         deviation = np.sqrt(((kernel * sigma[around] / depths[around] ** 2) ** 2).sum())
         assert found.depth[row, col] == pytest.approx(1 / inverse, abs=5e-6)  # single precision of the normal equations
         assert found.sigma[row, col] == pytest.approx(deviation / inverse**2, rel=1e-2)
         checked += 1
     assert checked > 30
+
+
+@pytest.mark.parametrize("pixels", [0.6, 1.0, 2.4, 4.0])
+def test_beside_steps_and_creases_sigma_says_what_is_not_known(device, pixels):
+    """Steps of so many widths of a pixel, and a ridge as steep, which noise does not explain: little is more than 4 σ off both sides."""
+    places = scattered(9)
+    turn = 0.2
+    width = 2.0 / FOCAL
+
+    def beside(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return (u - COLS / 2) * np.cos(turn) + (v - ROWS / 2) * np.sin(turn)
+
+    noise = SIGMA * np.random.default_rng(10).standard_normal(len(places))
+    along = beside(*places.T)
+    near = np.abs(beside(*centres())) < 2.5
+    step = np.where(along < 0, 2, 2 + pixels * width), [np.full((ROWS, COLS), each) for each in (2.0, 2 + pixels * width)]
+    ridge = 2 + pixels / 2 * width * np.abs(along), [2 + pixels / 2 * width * np.abs(beside(*centres()))]
+    for truth, sides in (step, ridge):
+        found = resample(places, truth + noise, np.full(len(places), SIGMA), (ROWS, COLS), FOCAL, device=device)
+        known = found.nearest >= 0
+        off = np.min([np.abs(found.depth - side) for side in sides], axis=0) / np.where(known, found.sigma, 1)
+        assert known[near].mean() > 0.8
+        assert (off[near & known] > 4).mean() < 0.13 and (off[near & known] > 10).mean() < 0.03  # 18 to 36 % with one fit for each
