@@ -128,6 +128,8 @@ def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
     for points in (one.points[:1].repeat(500, axis=0), one.points[0] + np.linspace(0, 0.3, 500)[:, None] * [1, 0, 0]):
         refused(r"\(cloud 0\): its 500 points (show no surface|are spread over)",
                 entry(one._replace(points=points, colours=one.colours[:500]), tmp_path, 0))
+    refused(r"viewpoint_m\[0\]: is 1e\+200: input should be less than or equal to 10000000",
+            entry(one, tmp_path, 0, viewpoint_m=[1e200, 0, 0]), error=ManifestError)
     shots = write_scans(tmp_path / "images", turntable(1, (80, 60)))
     listed = json.loads(shots.read_text())["scans"]
     refused(r"viewpoint_m: depth.exr has a camera", {**listed[0], "path": "images/scan0", "viewpoint_m": [0, 0, 0]}, error=ManifestError)
