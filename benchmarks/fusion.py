@@ -17,8 +17,8 @@ import numpy as np
 from service.requests.fuse import FuseRequest
 from service.scans.fuse import fuse
 from stage.scans.ply_points import read_ply_points
-from tests.scenes.clouds import all_around, entry, write_set
-from tests.scenes.statue import PARTS, SIGMA, distance, nearest_part, turntable, write_scans
+from tests.scenes.clouds import all_around, entry
+from tests.scenes.statue import PARTS, SIGMA, distance, nearest_part, turntable, write_scans, write_set
 
 PRINTED = ("head", "body", "foot", "blade", "left plate", "bracket")
 

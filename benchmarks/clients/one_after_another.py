@@ -14,7 +14,7 @@ for line in sys.stdin:
     try:
         main(line.rstrip("\n"))
         said = "DONE"
-    except Exception:
+    except Exception:  # of any kind: whoever asked raises it, with what is printed here
         traceback.print_exc()
         said = "FAILED"
     sys.stderr.flush()

@@ -159,9 +159,7 @@ def _resample_kernel(first: int, rows: int, cols: int, focal: float, start: wp.a
             scale = wp.max(REDESCENDING, 0.5 * misfit)
         if variance >= 0.0 and variance <= own * own:
             found = inverse + fit[0]
-            unexplained = float(0.0)
-            if misfit > EXPLAINED:
-                unexplained = own * wp.sqrt(wp.max(misfit * misfit - EXPLAINED * EXPLAINED, 0.0))
+            unexplained = own * wp.sqrt(wp.max(misfit * misfit - EXPLAINED * EXPLAINED, 0.0))
             if found > 0.0 and unexplained <= MOST_LEFT * found / focal:  # a pixel is depth / focal wide
                 depth[i] = 1.0 / found
                 sigma[i] = wp.sqrt(variance + unexplained * unexplained) / (found * found)

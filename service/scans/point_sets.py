@@ -10,6 +10,7 @@ import numpy as np
 
 from kernels.fusion.resample import STEEPEST, STEP_SIGMAS, resample
 from service.errors import RequestError
+from service.scans.range_images import SQUARE_VOXELS
 from service.scans.read import FLOAT_STEP
 from stage.camera import Camera
 from stage.scans.scan import Scan
@@ -20,8 +21,6 @@ ROUNDS = 300
 """Steps of the search for the middle of the lines of sight, which then is right to some tenths of a degree."""
 POINTS_IN_SQUARE = 4.0
 """Mean number of points of an occupied square of two by two pixels: one for each pixel."""
-PIXEL_VOXELS = 0.5
-"""Least width of a pixel in voxels: the points of a finer scan are joined in the fits."""
 THINNEST = 1e-6
 """Least width of the image for its length that their distance is told from: points in a line are no surface."""
 MOST_PIXELS_A_POINT = 8
@@ -64,7 +63,7 @@ def as_range_image(scan: Scan, where: str, voxel_m: float | None = None, *, devi
     del away, cosine, x, y, z
     pitch = _spacing(np.stack([across, up], axis=1))
     if voxel_m is not None:
-        pitch = max(pitch, PIXEL_VOXELS * voxel_m / float(np.median(depth)))
+        pitch = max(pitch, SQUARE_VOXELS * voxel_m / float(np.median(depth)))
     left, top = across.min() - pitch, up.max() + pitch
     cols, rows = (int(np.ceil(extent / pitch)) + 1 for extent in (across.max() - left, top - up.min()))
     if rows * cols > MOST_PIXELS_A_POINT * len(scan.points):

@@ -23,8 +23,8 @@ CLEAR_PIXELS = 2
 FEATHER_PIXELS = 12.0
 """Distance from the edge of the valid pixels over which the weight of a view in blended colours rises to its full value."""
 SQUARE_VOXELS, LEAST_SIDE, LEAST_SQUARES = 0.5, 3, 32
-"""Largest side of the squares that pixels are joined in, in voxels; least in pixels, of which the bend of the surface can be told; and
-fewest squares across an image."""
+"""Largest side of the squares that pixels are joined in, and least side of the pixels that points become, in voxels; least side of a square
+in pixels, of which the bend of the surface can be told; and fewest squares across an image."""
 ESTIMATED_SHARE = 0.01
 """Weight of a normal that was fitted to depths beside one of solved maps: where any view has maps, these decide."""
 PARALLEL_START_M = 1e-3

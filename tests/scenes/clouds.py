@@ -1,6 +1,5 @@
 """Scans of the statue as sets of points: rays in random directions, in a frame of a file that is not that of the scanner."""
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,11 +49,3 @@ def entry(cloud: Cloud, folder: Path, number: int, *, sigma: float = SIGMA, **ch
     made = {"name": f"cloud {number}", "path": f"cloud{number}.ply", "unit": "mm", "sigma_m": sigma,
             "viewpoint_m": cloud.viewpoint.tolist(), "scan_to_world": cloud.world_from_file.tolist()} | changes
     return {name: value for name, value in made.items() if value is not None}
-
-
-def write_set(folder: Path, entries: list[dict]) -> Path:
-    """Write a scan-set.json of entries."""
-    folder.mkdir(exist_ok=True)
-    file = folder / "scan-set.json"
-    file.write_text(json.dumps({"schema": "relit.scan-set/1", "name": "statue", "scans": entries}))
-    return file

@@ -137,8 +137,13 @@ def write_scans(folder: Path, shots: list[Shot], *, sigma: float = SIGMA, poses:
         if pose is not None:
             entry["scan_to_world"] = pose.tolist()
         entries.append(entry)
+    return write_set(folder, entries)
+
+
+def write_set(folder: Path, entries: list[dict]) -> Path:
+    """Write a scan-set.json of entries."""
+    folder.mkdir(exist_ok=True)
     file = folder / "scan-set.json"
-    file.parent.mkdir(exist_ok=True)
     file.write_text(json.dumps({"schema": "relit.scan-set/1", "name": "statue", "scans": entries}))
     return file
 

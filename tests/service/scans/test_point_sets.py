@@ -17,8 +17,8 @@ from stage.ply import PointCloud, write_ply
 from stage.scans.planes import local_planes
 from stage.scans.ply_points import read_ply_points
 from stage.scans.records import read_scan_set
-from tests.scenes.clouds import MM, Cloud, all_around, entry, scatter, write_set
-from tests.scenes.statue import SIGMA, colour_of, distance, place, turntable, write_scans
+from tests.scenes.clouds import MM, Cloud, all_around, entry, scatter
+from tests.scenes.statue import SIGMA, colour_of, distance, place, turntable, write_scans, write_set
 
 VOXEL = 4e-3
 RAYS = 160 * 120
