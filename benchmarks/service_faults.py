@@ -235,6 +235,8 @@ def processor() -> str:
 def document(faults: list[Fault], seed: int, seconds: float, load: float) -> str:
     return f"""# Faults of the service, measured
 
+*After reading this page you can say which faults the service survives, and after how long.*
+
 Measured on {datetime.now(UTC):%Y-%m-%d} on {os.cpu_count()} cores ({processor()}; load average before it began
 {load:.1f}) in {seconds / 60:.0f} minutes, seed {seed}, by
 

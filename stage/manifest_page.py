@@ -44,6 +44,8 @@ HEADINGS = {"camera": "The camera", "projector": "The projector", "light": "Ligh
 """The sections of the objects, by the key that leads to them."""
 HEAD = """# Every field of capture.json
 
+*After reading this page you can look up any field of a manifest: its range, its default and an example.*
+
 *This page is made from the program by `python -m stage.manifest_page`. [capture.md](capture.md) explains what the fields mean together.*
 
 The camera frame has x to the right, y up and z towards the viewer. A text has one line and is not blank. A key that is not listed is
