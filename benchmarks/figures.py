@@ -205,7 +205,8 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
 }
-INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\nWritten by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "
+INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\n"
+                "Written by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "
                 "measured. The times are from a machine that other work shared: ratios hold on other machines, seconds do not.\n")
 
 
