@@ -5,10 +5,9 @@ from typing import Annotated
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import counted, print_warnings
+from service.cli.printing import check_single, counted, print_sequence, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
-from service.cli.sequences import check_single, print_sequence
 from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest

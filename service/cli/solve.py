@@ -1,13 +1,10 @@
 """relit solve: maps of a capture."""
 
-from contextlib import nullcontext
-
 import typer
 
-from service.cli.printing import counted, print_warnings
+from service.cli.printing import check_single, counted, print_sequence, print_warnings
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import local_command
-from service.cli.sequences import check_single, print_sequence
 from service.requests.solve import SolveRequest
 
 
@@ -25,15 +22,11 @@ def _solve(request: SolveRequest) -> None:
         with ProgressBar() as bar:
             print_sequence(solve_sequence(request, bar))
         return
-    from service.cli.ahead import reading_ahead
-    from stage.capture import Capture
+    from service.solve.solve import solve
 
     check_single(request)
-    capture = Capture.open(request.capture, request.pixels)
-    with nullcontext() if request.aligned else reading_ahead(capture, request.cache):
-        from service.solve.solve import solve
-    with ProgressBar() as bar:  # which starts a thread
-        result = solve(request, bar, capture=capture)
+    with ProgressBar() as bar:
+        result = solve(request, bar)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")
