@@ -88,7 +88,6 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     finally:
         asked.put(0)  # if the server ended without a signal
         ending.join()
-        app.state.service.leases.close()
         database.close()
         telemetry.close(tracing)
         logger.info("service ended")

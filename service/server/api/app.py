@@ -8,16 +8,12 @@ from opentelemetry.trace import TracerProvider
 
 from service import __version__
 from service.server.api import document, environment_files, events, intakes, jobs, middleware, operations, problems, results, tus, uploads
-from service.server.api.access import RateLimiter, RunningRequests
 from service.server.api.context import Service
+from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
-from service.server.api.request_leases import RequestLeases
-from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import TokenReader
 from service.server.api.watch import MAX_STREAMS, Watcher
 from service.server.database.engine import Database
-from service.server.database.rates import Rate
-from service.server.database.streams import Limits
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
 from service.server.settings import Settings
@@ -43,10 +39,11 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     storage = open_storage(settings)
     app.state.service = Service(
         settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
-        RateLimiter(settings.requests_per_second, settings.request_burst), RunningRequests(settings.max_requests),
+        RateLimiter(settings.requests_per_second, settings.request_burst),
+        running=AtOnce(settings.max_requests, "requests of this key are under way"),
+        key_streams=AtOnce(settings.max_streams, "event streams of this key are open"),
+        project_streams=AtOnce(settings.max_project_streams, "event streams of this project are open"),
         draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, most=min(max_streams, MAX_STREAMS)),
-        leases=StreamLeases(database, Limits(settings.max_project_streams, settings.max_streams)),
-        rates=RequestLeases(database, Rate(settings.requests_per_second, settings.request_burst)),
         tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)

@@ -6,13 +6,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Response
+from fastapi import APIRouter, Depends, Response
 
 from service.requests.identifiers import EnvironmentId
 from service.server.api.context import Reader, ServiceDep
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
-from service.server.api.results import DOWNLOAD, Opened, Tags, download_result
+from service.server.api.results import DOWNLOAD, IfRange, Opened, Tags, Wanted, download_result
 from service.server.storage import layout
 from service.views.states import READY
 from stage import inputs
@@ -58,8 +58,6 @@ def opened(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> I
 
 @router.get("/{environment}/file", responses=DOWNLOAD, response_class=Response, summary="Download the image of an environment")
 async def download_environment(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
-                               wanted: Annotated[str | None, Header(alias="Range", description="bytes=0-99, for one, or several.")] = None,
-                               if_range: Annotated[str | None, Header(description="The entity tag that Range is meant for.")] = None,
-                               ) -> Response:
-    """Send the image of an environment that is ready, or parts of it."""
+                               wanted: Wanted = None, if_range: IfRange = None) -> Response:
+    """Send the image of an environment that is ready, or a part of it."""
     return await download_result(file, if_match, if_none_match, wanted, if_range)

@@ -23,6 +23,7 @@ from service.server.api.context import (
     require_space,
 )
 from service.server.api.json_body import JsonRoute
+from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
@@ -159,6 +160,7 @@ def _registered(service: Service, caller: Caller, field: str, given: str) -> Pat
 
 def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
             response: Response) -> IntakeView:
+    service.limiter.take(caller.key, CREATION_COST - 1)  # as a request it has taken one token already
     require_space(service, FOR_WORK)
 
     def make(connection: sa.Connection) -> str:

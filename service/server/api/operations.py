@@ -9,8 +9,7 @@ from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
 from service.requests.keys import Scope
-from service.server.api.access import require_local
-from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space
+from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space, require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import workers

@@ -5,11 +5,12 @@ import hashlib
 import hmac
 import time
 
-from service.server.api.context import FOR_UPLOAD, Service, require_space
+from service.server.api.context import FOR_UPLOAD, Service, require_space, require_valid
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
 from service.server.api.upload_body import PartFileWriter, RunningHashes
 from service.server.database import intakes, uploads
+from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.safe_names import shown
@@ -29,17 +30,19 @@ class UploadPatch:
     The methods wait for the disk or the database: call them from a thread.
     """
 
-    def __init__(self, service: Service, hashes: RunningHashes, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
+    def __init__(self, service: Service, caller: Caller, hashes: RunningHashes, upload: Row, *, offset: int,
+                 checksum: Checksum | None) -> None:
         """Create the patch; `begin` locks the part file.
 
         Args:
-            service: of the request.
+            service, caller: of the request.
             hashes: of the uploads that are not complete.
             upload: row of the upload, which is read again under the lock.
             offset: from which the client continues.
             checksum: of the body; None: the client gave none.
         """
-        self._service, self._hashes, self._row, self._offset, self._checksum = service, hashes, upload, offset, checksum
+        self._service, self._caller, self._hashes = service, caller, hashes
+        self._row, self._offset, self._checksum = upload, offset, checksum
         self._part: PartFile | None = None
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
         self._saved = 0
@@ -70,7 +73,7 @@ class UploadPatch:
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
                              save=self._save if self._checksum is None and self._service.parts.saves_while_writing else None,
-                             guard=lambda: require_space(self._service, FOR_UPLOAD))
+                             guard=self._guard)
 
     def end(self, broken: str | None) -> Row:
         """Verify and count the bytes that came.
@@ -82,12 +85,17 @@ class UploadPatch:
             The row of the upload as it is now.
 
         Raises:
-            ApiError: a checksum is wrong, or the body did not come to its end.
+            ApiError: a checksum is wrong, the body did not come to its end, or the key was revoked meanwhile.
         """
         assert self._part is not None
         if self._row["done"]:
             return self._row
         self.writer.settle()
+        try:
+            require_valid(self._service, self._caller)
+        except ApiError:
+            self.give_up()
+            raise
         if self._checksum is not None and self._digest is not None:
             right = hmac.compare_digest(self._digest.digest(), self._checksum.digest)
             if broken is not None or not right:
@@ -118,7 +126,10 @@ class UploadPatch:
         if self._part is not None:
             self._part.close()
             being_written.discard(self._row["id"])
-        vars(self).pop("writer", None)  # it refers to this patch by `_save`: both would wait for the garbage collector
+
+    def _guard(self) -> None:
+        require_space(self._service, FOR_UPLOAD)
+        require_valid(self._service, self._caller)
 
     def _save(self, at: int) -> None:
         self._saved = at

@@ -121,7 +121,7 @@ async def patch_upload(
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = UploadPatch(service, hashes, row, offset=offset, checksum=expected)
+    patch = UploadPatch(service, caller, hashes, row, offset=offset, checksum=expected)
     try:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
@@ -220,7 +220,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
     if length == 0 and not row["done"]:
-        return _answer(service, _complete_empty(service, row), response)
+        return _answer(service, _complete_empty(service, caller, row), response)
     return _answer(service, row, response)
 
 
@@ -236,8 +236,8 @@ def _answer(service: Service, row: Row, response: Response) -> FileView:
     return view
 
 
-def _complete_empty(service: Service, row: Row) -> Row:
-    patch = UploadPatch(service, hashes, row, offset=0, checksum=None)
+def _complete_empty(service: Service, caller: Caller, row: Row) -> Row:
+    patch = UploadPatch(service, caller, hashes, row, offset=0, checksum=None)
     try:
         patch.begin()
         return patch.end(None)

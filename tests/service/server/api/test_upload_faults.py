@@ -245,3 +245,28 @@ def test_a_part_is_locked_once(tmp_path):
         PartFile.open(tmp_path, "up_1")
     with PartFile.open(tmp_path, "up_1") as again:
         assert again.size == 4
+
+
+@pytest.mark.parametrize("checked", [False, True], ids=["plain", "with a checksum"])
+def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(server, checked):
+    content = random.Random(1).randbytes(MIB)
+    database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
+    key, other = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.WRITE)) for _ in range(2))
+    with server.client(key) as client:
+        tus = {"Tus-Resumable": "1.0.0"}
+        capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
+        place = client.post(f"/v1/captures/{capture}/files", headers={
+            **tus, "Upload-Length": str(MIB), "Upload-Metadata": encoded(path="a.bin")}).headers["Location"]
+
+        def pieces():
+            yield content[: MIB // 2]
+            keys.revoke(database, key.partition(".")[0])
+            yield content[MIB // 2 :]
+
+        response = client.patch(place, content=pieces(), headers={
+            **tus, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream",
+            **({"Upload-Checksum": checksum("sha256", content)} if checked else {})})
+        assert response.status_code == 401 and "revoked" in response.json()["detail"]
+    with server.client(other) as client:
+        assert client.head(place, headers=tus).headers["Upload-Offset"] == "0"
+    database.close()
