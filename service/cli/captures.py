@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.captures import InfoRequest
 from service.requests.view import ViewRequest
@@ -19,8 +19,7 @@ def _info(request: InfoRequest) -> None:
     from service.captures.inspect import inspect
     from stage.errors import StageError
 
-    with ProgressBar() as bar:
-        found = inspect(request, bar)
+    found = with_bar(inspect, request)
     for name, value in found.facts:
         print(f"{name:<12} {value}")
     for finding in found.findings:
@@ -35,8 +34,7 @@ def _info(request: InfoRequest) -> None:
 def _view(request: ViewRequest) -> None:
     from service.viewing.view import view
 
-    with ProgressBar() as bar:
-        result = view(request, bar)
+    result = with_bar(view, request)
     print(f"view     {result.path}")
     print(f"frames   {result.frames}")
     if result.layers:

@@ -44,13 +44,13 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "restore": ("server", "Make a service from a backup, in a new data folder (--data) and an empty database; jobs that ran go "
                           "on when it starts."),
     "audit": ("keys", "Show who did what to which object, the newest first."),
+    "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
+    "keys": ("keys", "Make, list and revoke the keys of the service."),
     "import": ("imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
     "calibrate": ("calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "
                                "residuals."),
-    "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
     "submit": ("submit", "Submit work to a service, with the options of the commands that do it on this machine."),
     "jobs": ("jobs", "List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results."),
-    "keys": ("keys", "Make, list and revoke the keys of the service."),
     "farm": ("farm", "Jobs for render farms; docs/farm.md."),
 }
 """The commands in the order of the help: the module of service.cli that registers each, and the sentence that the list of commands shows.

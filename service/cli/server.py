@@ -44,7 +44,7 @@ def worker(
     config: ConfigOption = None,
 ) -> None:
     """Run one more worker, on any machine that reaches the database and the storage."""
-    from service.server.work import work as run
+    from service.server.processes import work as run
 
     run(settings_of(config, data=data), device)
 

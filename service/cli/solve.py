@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import check_single, counted, print_sequence, print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.solve import SolveRequest
 
@@ -19,14 +19,12 @@ def _solve(request: SolveRequest) -> None:
     if is_sequence(request.capture):
         from service.sequences.run import solve_sequence
 
-        with ProgressBar() as bar:
-            print_sequence(solve_sequence(request, bar))
+        print_sequence(with_bar(solve_sequence, request))
         return
     from service.solve.solve import solve
 
     check_single(request)
-    with ProgressBar() as bar:
-        result = solve(request, bar)
+    result = with_bar(solve, request)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")

@@ -160,9 +160,9 @@ class Settings(BaseSettings):
     project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
     """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
-    """Requests of one key a second, on average, over all API processes."""
+    """Requests of one key a second, on average, in each API process; a new capture or environment counts as ten."""
     request_burst: Count = 200
-    """Requests of one key that may come at once, over all API processes."""
+    """Requests of one key that may come at once, in each API process."""
     max_connections: Count | None = None
     """Connections of clients at most; without it 8192, or as many as the open files that the system allows leave room for."""
     max_address_connections: Count | None = None
@@ -170,9 +170,9 @@ class Settings(BaseSettings):
     max_requests: Count = 256
     """Requests of one key that may be under way at one time, event streams among them, in each API process."""
     max_streams: Count = 128
-    """Event streams of one key at most, over all API processes."""
+    """Event streams of one key at most, in each API process."""
     max_project_streams: Count = 512
-    """Event streams of one project at most, over all API processes."""
+    """Event streams of one project at most, in each API process."""
     trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3

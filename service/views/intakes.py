@@ -3,7 +3,7 @@
 from typing import Any
 
 from service.requests.identifiers import UploadId
-from service.views.base import Time, View
+from service.views import Time, View
 from service.views.states import IntakeState
 
 

@@ -2,7 +2,7 @@
 
 from service.requests.identifiers import JobId
 from service.requests.jobs import AnyJob
-from service.views.base import Time, View
+from service.views import Time, View
 from service.views.states import JobState
 
 

@@ -1,4 +1,4 @@
-"""Routes of results: the list of a job's files, and downloads, whole or in part (RFC 9110: ETag, preconditions, one range).
+"""Routes of results, and downloads of them and of environments, whole or in part (RFC 9110: ETag, preconditions, one range).
 
 A file is opened once, so that its ETag, its size and its bytes are those of one file, whatever replaces it meanwhile. Starlette's
 FileResponse does not keep that: it opens the path again to send it, and takes a Last-Modified of the same second for the same file. It
@@ -8,7 +8,9 @@ also has no preconditions, answers an unreadable Range with 400 instead of the f
 import os
 import re
 from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack
 from email.utils import formatdate
+from pathlib import Path as FilePath
 from pathlib import PurePosixPath
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -17,15 +19,21 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from service.requests.identifiers import EnvironmentId
 from service.server.api.context import Reader, ServiceDep
+from service.server.api.intakes import row_of
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
 from service.server.api.views import result_view
 from service.server.safe_names import NameFault, check_path
 from service.server.storage import layout
 from service.views.jobs import ResultPage
+from service.views.states import READY
+from stage import inputs
+from stage.errors import StageError
 
 router = APIRouter(prefix="/v1/jobs/{job}/results", tags=["results"], responses=responses(401, 403, 404, 422, 429, 503))
+environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 404, 409, 422, 429, 503))
 
 MAX_PAGE = 1000
 PIECE_BYTES = 1 << 20
@@ -82,6 +90,41 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         os.close(file.descriptor)
 
 
+def opened_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> Iterator[Opened]:
+    """Open the image of an environment until the answer has been sent.
+
+    Raises:
+        ApiError: the project has no such environment, it is not ready, or its file is not there any more.
+    """
+    row = row_of(service, caller, environment)
+    if row["state"] != READY:
+        raise ApiError("conflict", f"{environment} is {row['state']}, not ready")
+    gone = ApiError("not-found", f"the file of {environment} is not there any more")
+    with ExitStack() as held:
+        if row["folder"] is None:
+            prefix = layout.intake(caller.project, environment)
+            found = [service.storage.open(prefix, file.name) for file in service.storage.files(prefix)]
+            if len(found) != 1 or found[0] is None:
+                raise gone
+            path = found[0]
+        else:
+            path = FilePath(row["folder"])
+            root = next((root for root in service.settings.roots_of(caller.project) if path.is_relative_to(root)), None)
+            if root is None:
+                raise gone
+            try:
+                held.enter_context(inputs.confined(path.parent, root))
+            except StageError:
+                raise gone from None
+        try:
+            file = held.enter_context(inputs.opened(path)).file
+        except StageError:
+            raise gone from None
+        status = os.fstat(file.fileno())
+        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
+        yield Opened(path.name, file.fileno(), status.st_size, etag, status.st_mtime)
+
+
 @router.get("", summary="List the results of a job")
 def list_results(service: ServiceDep, caller: Reader, job: JobName,
                  limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
@@ -116,6 +159,13 @@ async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags =
     if _unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
     return Response(headers=headers | {"Content-Length": str(file.size)}, media_type=_media_type(file))
+
+
+@environments.get("/{environment}/file", responses=DOWNLOAD, response_class=Response, summary="Download the image of an environment")
+async def download_environment(file: Annotated[Opened, Depends(opened_environment)], if_match: Tags = None, if_none_match: Tags = None,
+                               wanted: Wanted = None, if_range: IfRange = None) -> Response:
+    """Send the image of an environment that is ready, or a part of it."""
+    return await download_result(file, if_match, if_none_match, wanted, if_range)
 
 
 def _unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.farm.template import Job, write_job
+from service.farm.jobs import Job, write_job
 from service.requests.base import Role
 from service.requests.options import options_of
 from service.requests.relight import RelightRequest
