@@ -40,12 +40,9 @@ def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = make_group("calibrate",
                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
-    for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
-                           ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
-                           ("white-balance", _white_balance),
-                           ("procam", _procam), ("stereo", _stereo), ("laser-planes", _laser_planes),
-                           ("response", _response), ("tof", _tof)):
-        local_command(kinds, name, function)
+    for function in (_mirror_ball, _light_positions, _grey_ball, _intensity, _dark, _flat_field, _saturation, _white_balance, _procam,
+                     _stereo, _laser_planes, _response, _tof):
+        local_command(kinds, function.__name__[1:].replace("_", "-"), function)
     app.add_typer(kinds)
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from service.client.connection import Connection
 from service.client.errors import Conflict, IntakeRefused, NotFound
 from service.client.local_files import files_of, hash_files, hash_of_all
-from service.client.transfer import TransferProgress
-from service.client.uploads import upload_files
+from service.client.transfer import TransferProgress, transfer_all
+from service.client.uploads import Upload
 from service.reporting.progress import Progress
 from service.views.intakes import IntakePage, IntakeView
 from service.views.states import CHECKING, READY, RECEIVING, REFUSED
@@ -62,8 +62,8 @@ class Intakes:
             return intake
         if intake.state in (RECEIVING, REFUSED):
             if intake.state == RECEIVING:
-                upload_files(self._connection, self._at(intake.id), files, parallel=self._parallel,
-                             progress=TransferProgress(progress, "upload", sum(file.size for file in files)))
+                told = TransferProgress(progress, "upload", sum(file.size for file in files))
+                transfer_all((Upload(self._connection, self._at(intake.id), file, told).run for file in files), parallel=self._parallel)
             self.validate(intake.id)
         return self.wait(intake.id)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import httpx2
 
 from service.client.connection import Connection
-from service.client.downloads import download_files
+from service.client.downloads import Download
 from service.client.errors import FileError, JobEnded
-from service.client.transfer import TransferProgress
+from service.client.transfer import TransferProgress, transfer_all
 from service.reporting.progress import Progress
 from service.requests.job import JobRequest
 from service.views.jobs import JobPage, JobView, ResultPage, ResultView
@@ -136,8 +136,9 @@ class Jobs:
             if missing := sorted(set(names) - {file.name for file in found}):
                 raise FileError(f"{job} has no result {missing[0]}")
             found = [file for file in found if file.name in names]
-        return download_files(self._connection, f"{self._at(job)}/results", [file.name for file in found], folder,
-                              parallel=self._parallel, progress=TransferProgress(progress, "download", sum(file.size for file in found)))
+        told = TransferProgress(progress, "download", sum(file.size for file in found))
+        return transfer_all((Download(self._connection, f"{self._at(job)}/results", file.name, folder, told).run for file in found),
+                            parallel=self._parallel)
 
     def _act(self, job: str, action: str) -> JobView:
         return JobView.model_validate_json(self._connection.send("POST", f"{self._at(job)}/{action}", repeatable=False).content)

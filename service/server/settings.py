@@ -42,17 +42,7 @@ class ProjectRoot(NamedTuple):
     """A folder below which one project may register captures and environments."""
 
     project: str
-    folder: Path
-
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what PROJECT=/folder stands for."""
-        if not isinstance(given, str):
-            return given
-        project, mark, folder = given.partition("=")
-        if not mark or not folder or not re.fullmatch(PROJECT_PATTERN, project):
-            raise ValueError(f"is {given}: give PROJECT=/folder")
-        return cls(project, _absolute(Path(folder)))
+    folder: Folder
 
 
 class Grant(NamedTuple):
@@ -62,20 +52,6 @@ class Grant(NamedTuple):
     project: str
     scope: Scope
 
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what VALUE=PROJECT:SCOPE stands for."""
-        if not isinstance(given, str):
-            return given
-        value, _, granted = given.rpartition("=")
-        project, _, scope = granted.partition(":")
-        if not value or not re.fullmatch(PROJECT_PATTERN, project) or scope not in list(Scope):
-            raise ValueError(f"is {given}: give VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")
-        return cls(value, project, Scope(scope))
-
-
-QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
-
 
 class ProjectQuota(NamedTuple):
     """A quota of one project in place of that of all."""
@@ -84,21 +60,33 @@ class ProjectQuota(NamedTuple):
     quota: str
     limit: int
 
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what PROJECT:QUOTA=NUMBER stands for."""
+
+QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
+
+
+def _reader(pattern: str, form: str) -> BeforeValidator:
+    """Return a validator that takes a text apart.
+
+    Args:
+        pattern: regular expression with a group for each field; <project> in it stands for the name of a project.
+        form: how the text is written, for the error.
+    """
+    whole = re.compile(pattern.replace("<project>", f"({PROJECT_PATTERN.strip('^$')})"))
+
+    def read(given: object) -> object:
         if not isinstance(given, str):
             return given
-        project, _, rest = given.partition(":")
-        quota, _, limit = rest.partition("=")
-        if not re.fullmatch(PROJECT_PATTERN, project) or quota not in QUOTAS or not re.fullmatch(r"[0-9]{1,18}", limit):
-            raise ValueError(f"is {given}: give PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")
-        return cls(project, quota, int(limit))
+        if (found := whole.fullmatch(given)) is None:
+            raise ValueError(f"is {given}: give {form}")
+        return found.groups()
+
+    return BeforeValidator(read)
 
 
-Quoted = Annotated[ProjectQuota, BeforeValidator(ProjectQuota.read)]
-Granted = Annotated[Grant, BeforeValidator(Grant.read)]
-ProjectFolder = Annotated[ProjectRoot, BeforeValidator(ProjectRoot.read)]
+Quoted = Annotated[ProjectQuota, _reader(rf"<project>:({'|'.join(QUOTAS)})=([0-9]{{1,18}})",
+                                         f"PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")]
+Granted = Annotated[Grant, _reader(rf"(.+)=<project>:({'|'.join(Scope)})", f"VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")]
+ProjectFolder = Annotated[ProjectRoot, _reader("<project>=(.+)", "PROJECT=/folder")]
 
 
 class Settings(BaseSettings):

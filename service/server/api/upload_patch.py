@@ -8,7 +8,7 @@ import time
 from service.server.api.context import FOR_UPLOAD, Service, require_space, require_valid
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
-from service.server.api.upload_body import PartFileWriter, RunningHashes
+from service.server.api.upload_body import PartFileWriter
 from service.server.database import intakes, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
@@ -30,18 +30,16 @@ class UploadPatch:
     The methods wait for the disk or the database: call them from a thread.
     """
 
-    def __init__(self, service: Service, caller: Caller, hashes: RunningHashes, upload: Row, *, offset: int,
-                 checksum: Checksum | None) -> None:
+    def __init__(self, service: Service, caller: Caller, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
         """Create the patch; `begin` locks the part file.
 
         Args:
             service, caller: of the request.
-            hashes: of the uploads that are not complete.
             upload: row of the upload, which is read again under the lock.
             offset: from which the client continues.
             checksum: of the body; None: the client gave none.
         """
-        self._service, self._caller, self._hashes = service, caller, hashes
+        self._service, self._caller = service, caller
         self._row, self._offset, self._checksum = upload, offset, checksum
         self._part: PartFile | None = None
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
@@ -67,9 +65,8 @@ class UploadPatch:
         if not row["done"]:
             require_space(self._service, FOR_UPLOAD)
             self._part.cut(start)
-        # another process may have added other bytes since this one kept a hash of what were then the first
-        known = row["sha256"] is not None and not row["done"] and (start == 0 or self._service.parts.saves_while_writing)
-        self._whole = self._hashes.take(row["id"], start) if known else None
+        # a file that comes in one request is hashed meanwhile, one that comes in several is read when it is complete
+        self._whole = hashlib.sha256() if row["sha256"] is not None and not row["done"] and start == 0 else None
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
                              save=self._save if self._checksum is None and self._service.parts.saves_while_writing else None,
@@ -106,8 +103,6 @@ class UploadPatch:
         if self.writer.at == self._row["length"]:
             self._complete()
         else:
-            if self._whole is not None:
-                self._hashes.keep(self._row["id"], self.writer.at, self._whole)
             self._save(self.writer.at)
             if broken is not None:
                 raise ApiError("bad-request", broken)

@@ -36,7 +36,7 @@ from service.server.api.tus import (
     metadata_header,
     state_headers,
 )
-from service.server.api.upload_body import BodyBroken, RunningHashes, TooLong, write_body
+from service.server.api.upload_body import BodyBroken, TooLong, write_body
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
 from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
@@ -49,7 +49,6 @@ from service.views.intakes import FilePage, FileView
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
 options = APIRouter(prefix="/v1", tags=["uploads"])
-hashes = RunningHashes()
 BREAK_S, LOOK_S = 2.0, 0.02
 """Seconds for which HEAD waits for a PATCH to end, and between two looks: a client may ask before its broken connection is noticed here."""
 
@@ -121,7 +120,7 @@ async def patch_upload(
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = UploadPatch(service, caller, hashes, row, offset=offset, checksum=expected)
+    patch = UploadPatch(service, caller, row, offset=offset, checksum=expected)
     try:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
@@ -237,7 +236,7 @@ def _answer(service: Service, row: Row, response: Response) -> FileView:
 
 
 def _complete_empty(service: Service, caller: Caller, row: Row) -> Row:
-    patch = UploadPatch(service, caller, hashes, row, offset=0, checksum=None)
+    patch = UploadPatch(service, caller, row, offset=0, checksum=None)
     try:
         patch.begin()
         return patch.end(None)
