@@ -52,9 +52,8 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                    jobs.router, events.router, results.router, operations.router):
         app.include_router(router)
     pages.install(app)
-    app.add_middleware(middleware.JsonBodies)
+    app.add_middleware(middleware.Bodies)
     app.add_middleware(tus.TusHeaders)
-    app.add_middleware(middleware.OneLength)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)
     return app
 

@@ -1,13 +1,12 @@
-"""What routes depend on: the service, the caller and its scope, the space that is left, and requests that may be sent twice."""
+"""What routes depend on: the service, the caller and its scope, and the space that is left."""
 
 import os
 import threading
 import time
 from collections.abc import Awaitable, Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 from urllib.parse import urlsplit
 
-import sqlalchemy as sa
 from fastapi import Depends, Header, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.security.utils import get_authorization_scheme_param
@@ -19,7 +18,7 @@ from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.problems import ApiError
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
-from service.server.database import idempotency, keys, quotas
+from service.server.database import keys
 from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
@@ -28,7 +27,7 @@ from service.server.storage.folder import Storage
 from service.server.storage.upload_parts import UploadParts
 
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
-SPACE_RETRY_S = QUOTA_RETRY_S = 600
+SPACE_RETRY_S = 600
 FOR_WORK, FOR_UPLOAD = "new work", "this upload"
 """Purposes of space, as the sentence names them."""
 MIN_FREE_FILES = 1000
@@ -169,26 +168,6 @@ def require_valid(service: Service, caller: Caller) -> None:
         raise ApiError("unauthenticated", "the key was revoked or has expired", headers={"WWW-Authenticate": "Bearer"})
 
 
-def created_before(service: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
-    """Return what the same request has created before; None: nothing. Whether it could be created now does not matter then."""
-    try:
-        return None if token is None else idempotency.created_by(service.database, caller.project, token, asked)
-    except idempotency.TokenReused:
-        raise _reused(token) from None
-
-
-def create_once(service: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something once for an Idempotency-Key; the arguments are those of `idempotency.create_once`."""
-    try:
-        return idempotency.create_once(service.database, caller.project, token, asked, make)
-    except idempotency.TokenReused:
-        raise _reused(token) from None
-
-
-def _reused(token: str | None) -> ApiError:
-    return ApiError("invalid", f"Idempotency-Key {token}: came with another request before: choose a new one")
-
-
 def has_space(settings: Settings, length: int = 0) -> bool:
     """Return whether `min_free_bytes` are left in the data folder after `length` more bytes, and names for further files."""
     found = os.statvfs(settings.data)
@@ -209,17 +188,3 @@ def require_space(service: Service, purpose: str, length: int = 0) -> None:
     """
     if not has_space(service.settings, length):
         raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(SPACE_RETRY_S)})
-
-
-def require_quota(service: Service, connection: sa.Connection, quota: str, project: str, more: int) -> None:
-    """Refuse, and so roll back the transaction, if a project would have more than it may; the arguments are those of `quotas.require`.
-
-    Raises:
-        ApiError: the quota is exceeded: too-large for bytes, else too-many.
-    """
-    try:
-        quotas.require(connection, service.settings, quota, project, more)
-    except quotas.QuotaExceeded as error:
-        if quota == quotas.BYTES:
-            raise ApiError("too-large", str(error)) from None
-        raise ApiError("too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)}) from None

@@ -9,17 +9,7 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.server.api.context import (
-    FOR_UPLOAD,
-    IdempotencyKey,
-    Reader,
-    Service,
-    ServiceDep,
-    Writer,
-    create_once,
-    require_quota,
-    require_space,
-)
+from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
 from service.server.api.tus import (
@@ -199,7 +189,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
         _require_room(service, connection, intake)
-        require_quota(service, connection, quotas.BYTES, caller.project, length)
+        quotas.require(connection, service.settings, quotas.BYTES, caller.project, length)
         identifier = new_id(UPLOAD)
         try:
             uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,
@@ -210,11 +200,11 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = create_once(service, caller, token, asked, make)
+    upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
     if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
-        upload, _ = create_once(service, caller, token, asked, make)
+        upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
