@@ -21,7 +21,7 @@ COUNTED = ("frames", "shade")
 
 
 class ProgressStyle(Choice):
-    """How progress is shown."""
+    """The ways in which progress is shown."""
 
     BAR = "bar", "on a terminal, else not at all"
     OPENJD = "openjd", "lines that a farm's worker reads (docs/farm.md)"

@@ -1,4 +1,4 @@
-"""What `relit submit` and `relit jobs` share: options, the client, waiting for a job, and fetching its results."""
+"""`relit submit` and `relit jobs` share these options, the client, waiting for a job, and fetching its results."""
 
 import sys
 from collections.abc import Iterator

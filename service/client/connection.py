@@ -3,7 +3,6 @@
 import random
 import secrets
 import time
-from collections.abc import Callable
 from email.utils import parsedate_to_datetime
 from typing import Any
 from urllib.parse import quote
@@ -94,17 +93,10 @@ class Connection:
             Refused: the service answers with an error.
             Unreachable: the service does not answer.
         """
-        return self._retry(lambda: self.send_once(method, path, **options), repeatable=repeatable)
-
-    def send_once(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        """Send a request once, and return the answer, also if it is an error."""
-        return self.http.request(method, path, **options)
-
-    def _retry(self, attempt: Callable[[], httpx2.Response], *, repeatable: bool) -> httpx2.Response:
         backoff = self.backoff()
         while True:
             try:
-                answer = attempt()
+                answer = self.http.request(method, path, **options)
             except httpx2.TransportError as error:
                 again = repeatable or isinstance(error, NOT_SENT)
                 if not again or not backoff.wait():

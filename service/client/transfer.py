@@ -1,4 +1,4 @@
-"""What uploads and downloads share: several files at once, and their bytes reported as one progress."""
+"""Uploads and downloads of several files at once, whose bytes are reported as one progress."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait

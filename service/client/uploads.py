@@ -42,7 +42,7 @@ class Upload:
             before = offset
             self._report(offset)
             try:
-                answer = self._connection.send_once("PATCH", upload, content=self._pieces(offset, stop), headers={
+                answer = self._connection.http.request("PATCH", upload, content=self._pieces(offset, stop), headers={
                     **TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream",
                     "Content-Length": str(file.size - offset)})
             except httpx2.TransportError as error:

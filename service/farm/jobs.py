@@ -39,7 +39,7 @@ class JobFiles(NamedTuple):
     template: Path
     values: Path
     is_bundle: bool
-    """Whether they lie in a folder as Deadline Cloud takes it."""
+    """True if they lie in a folder as Deadline Cloud takes it."""
 
 
 def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job:

@@ -1,4 +1,4 @@
-"""What the processes of the service have in common, their signals and how they begin; and a worker alone, without the API."""
+"""Signals and the start of the processes of the service; and a worker alone, without the API."""
 
 import os
 import signal

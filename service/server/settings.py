@@ -46,7 +46,7 @@ class ProjectRoot(NamedTuple):
 
 
 class Grant(NamedTuple):
-    """What a token with a value of the claim may do."""
+    """The rights of a token with a value of the claim."""
 
     value: str
     project: str
@@ -90,7 +90,7 @@ ProjectFolder = Annotated[ProjectRoot, _reader("<project>=(.+)", "PROJECT=/folde
 
 
 class Settings(BaseSettings):
-    """What an operator may choose.
+    """The settings that an operator may choose.
 
     Settings(config=FILE, name=value, …): arguments override the environment, which overrides the file.
     """
@@ -244,12 +244,12 @@ class Settings(BaseSettings):
 
     @cached_property
     def loopback(self) -> bool:
-        """Whether the API listens to this machine only."""
+        """True if the API listens to this machine only."""
         return is_loopback(self.host)
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether the database is a file in the data folder."""
+        """True if the database is a file in the data folder."""
         return self.database_url is None
 
     @property

@@ -1,4 +1,4 @@
-"""What the service answers with: one model an answer and the states in it, shared by the API and its client."""
+"""Views: the models of the answers of the service and the states in them, shared by the API and its client."""
 
 from datetime import datetime
 from typing import Annotated

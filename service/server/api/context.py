@@ -1,4 +1,4 @@
-"""What routes depend on: the service, the caller and its scope, and the space that is left."""
+"""Dependencies of routes: the service, the caller and its scope, and the space that is left."""
 
 import os
 import threading
@@ -169,10 +169,10 @@ def require_valid(service: Service, caller: Caller) -> None:
 
 
 def has_space(settings: Settings, length: int = 0) -> bool:
-    """Return whether `min_free_bytes` are left in the data folder after `length` more bytes, and names for further files."""
+    """Return whether the data folder has room for MIN_FREE_FILES files and, after `length` more bytes, for `min_free_bytes`."""
     found = os.statvfs(settings.data)
-    has_names = found.f_files == 0 or found.f_favail >= MIN_FREE_FILES  # some file systems have no bound of files, and say 0
-    return has_names and found.f_bavail * found.f_frsize - length >= settings.min_free_bytes
+    has_files = found.f_files == 0 or found.f_favail >= MIN_FREE_FILES  # some file systems have no bound of files, and say 0
+    return has_files and found.f_bavail * found.f_frsize - length >= settings.min_free_bytes
 
 
 def require_space(service: Service, purpose: str, length: int = 0) -> None:

@@ -58,7 +58,7 @@ def _faults(service: Service) -> list[str]:
     except StorageError:
         found.append("the storage cannot be written")
     if not has_space(service.settings):
-        found.append("there is less space left than min_free_bytes")
+        found.append("there is less space left than min_free_bytes, or no room for further files")
     return found
 
 

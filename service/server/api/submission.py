@@ -1,4 +1,4 @@
-"""Whether a job can be submitted: its captures and environments are ready, and it keeps within the limits."""
+"""Submission of jobs: the captures and environments must be ready, and the job within the limits."""
 
 from collections.abc import Sequence
 

@@ -50,7 +50,7 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "calibrate-tof": "Calibrate a time-of-flight camera",
           "calibrate-white-balance": "Calibrate colours: a grey card", "calibrate-laser-planes": "Calibrate the planes of a laser"}
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
-"""What the identifiers of a pattern name."""
+"""The kind of thing that the identifiers of a pattern name."""
 
 
 class Field(NamedTuple):
@@ -85,7 +85,7 @@ class Form(NamedTuple):
     title: str
     about: str
     main: tuple[Field, ...]
-    """What the job reads, and options without a default."""
+    """Inputs of the job, and options without a default."""
     more: tuple[Field, ...]
     """Options with a default."""
 
