@@ -43,13 +43,7 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
 
 
 def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrupt: bool) -> None:
-    """Wait until a job has ended, and fetch what it made.
-
-    Args:
-        client: of the service.
-        job: its identifier.
-        out: folder for what it made; None: it is not fetched.
-        cancel_on_interrupt: whether Ctrl-C ends the job too.
+    """Wait until a job has ended, and fetch what it made into the folder `out`, if there is one.
 
     Raises:
         typer.Exit: with code 1: it did not succeed.

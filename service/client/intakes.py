@@ -26,14 +26,7 @@ class Intakes:
     """The captures of a project, or its environments: the two kinds of files that jobs take in."""
 
     def __init__(self, connection: Connection, path: str, source: str, *, parallel: int) -> None:
-        """Prepare.
-
-        Args:
-            connection: to the service.
-            path: of the collection in the API.
-            source: name of the request's field for a path on the server.
-            parallel: number of files that are sent at once.
-        """
+        """Args: connection: to the service. path: in the API. source: field of a path on the server. parallel: files sent at once."""
         self._connection, self._path, self._source, self._parallel = connection, path, source, parallel
 
     def upload(self, source: Path, *, name: str | None = None, progress: Progress | None = None) -> IntakeView:

@@ -63,11 +63,7 @@ class Jobs:
         return follow(self._connection, self._at(job))
 
     def wait(self, job: str, *, progress: Progress | None = None) -> JobView:
-        """Wait until a job has succeeded.
-
-        Args:
-            job: its identifier.
-            progress: told of the job's stages.
+        """Wait until a job has succeeded, and tell `progress` of its stages.
 
         Raises:
             JobEnded: it failed or was cancelled.

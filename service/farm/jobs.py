@@ -43,12 +43,7 @@ class JobFiles(NamedTuple):
 
 
 def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job:
-    """Return a job whose tasks make parts of the frames.
-
-    Args:
-        request: of the whole range, which must be named; checked.
-        chunk_frames: frames of a task, as a default.
-        gpu: whether tasks need a worker with a GPU.
+    """Return a job whose tasks make parts of the frames, `chunk_frames` each unless who submits it says otherwise.
 
     Raises:
         RequestError: a text that no farm takes.
@@ -66,12 +61,7 @@ def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job
 
 
 def shade_job(request: ShadeRequest, *, turns: int | None, gpu: bool) -> Job:
-    """Return a job of one task, or of one for each turn.
-
-    Args:
-        request: of one picture, checked; its turn is the first.
-        turns: how many pictures the environment turns once around in; None: one picture.
-        gpu: whether tasks need a worker with a GPU.
+    """Return a job of one picture, or of `turns` pictures over which the environment turns once around; the request's turn is the first.
 
     Raises:
         RequestError: turns without an environment, too many, or no run of # in the picture's name for their number.
@@ -103,18 +93,7 @@ def _turned(request: ShadeRequest, turns: int) -> dict[str, Any]:
 
 def _job(command: str, subject: Path, words: list[str], request: Request, given: Parameters, *, gpu: bool,
         space: Mapping[str, Any] | None = None, extensions: tuple[str, ...] = ()) -> Job:
-    """Return a job whose tasks call this program.
-
-    Args:
-        command: that the tasks call; names the step too.
-        subject: the folder or file that the job is named after.
-        words: of the call, after the command.
-        request: says the device and the folder for caches.
-        given: parameters so far.
-        gpu: whether tasks need a worker with a GPU.
-        space: of the tasks; None: there is one.
-        extensions: of the specification that the job needs.
-    """
+    """Return a job named after `subject`, whose tasks call a command of this program with `words` and the request's device and cache."""
     program = given.text("Relit", "relit", "The program on the workers: a name on their PATH, or a path.")
     if request.cache is not None:
         words = [*words, "--cache", given.folder("Cache", request.cache, "NONE", "For image stacks, on each worker.")]
@@ -139,9 +118,6 @@ def write_job(made: Job, where: Path) -> JobFiles:
     Args:
         made: the job.
         where: NAME.yaml, and NAME.values.yaml beside it; any other name is a folder, with template.yaml and parameter_values.yaml.
-
-    Raises:
-        StorageError: it cannot be written.
     """
     if where.suffix.lower() in TEMPLATE_SUFFIXES:
         files = JobFiles(where, where.with_suffix(f".values{where.suffix}"), False)

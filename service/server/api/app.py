@@ -27,8 +27,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     """Create the app over a prepared database.
 
     Args:
-        settings: of the service.
-        database: of the service.
+        settings, database: of the service.
         tracing: makes the spans of requests; None: there are none.
         max_streams: event streams of this process at most.
     """

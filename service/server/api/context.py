@@ -176,12 +176,7 @@ def has_space(settings: Settings, length: int = 0) -> bool:
 
 
 def require_space(service: Service, purpose: str, length: int = 0) -> None:
-    """Refuse a request for which there is no space.
-
-    Args:
-        service: of the request.
-        purpose: FOR_WORK or FOR_UPLOAD.
-        length: bytes that will be written, if that is known.
+    """Refuse a request, for `purpose` (FOR_WORK or FOR_UPLOAD), for whose `length` bytes there is no space.
 
     Raises:
         ApiError: less than `min_free_bytes` would be left.

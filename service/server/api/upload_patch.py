@@ -173,12 +173,7 @@ def _locked(row: Row) -> ApiError:
 
 
 def safe_offset(row: Row, there: int) -> int:
-    """Return the number of bytes of an upload that the client need not send again.
-
-    Args:
-        row: of the upload, settled.
-        there: size of its part file, which is smaller than what was counted if somebody has removed it.
-    """
+    """Return the bytes of an upload that the client need not send again: none, if its part file, of `there` bytes, lacks some."""
     received = int(row["received"])
     return received if row["done"] or there >= received else 0
 
