@@ -2,7 +2,6 @@
 
 import atexit
 import gc
-import signal
 from collections.abc import Generator
 from pathlib import Path
 
@@ -15,12 +14,6 @@ from kernels import device as devices
 def device(request: pytest.FixtureRequest) -> str:
     """Each device of this machine: the CPU always, CUDA where present."""
     return request.param
-
-
-def pytest_configure() -> None:
-    """Let the programs that tests start meet SIGINT as usual, also where a shell has started the tests in the background, without it."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
