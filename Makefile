@@ -9,7 +9,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
 
-.PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page help-listing figures samples screenshots lock vendor colour-table clean
+.PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
 	$(BIN)/relit demo
 
@@ -44,10 +44,6 @@ gpu-bench: $(VENV)/installed
 # docs/manifest.md, every field of capture.json, from the models in stage/
 manifest-page: $(VENV)/installed-dev
 	$(BIN)/python -m stage.manifest_page
-
-# service/cli/listing.json, the list of commands that `relit --help` shows, from the commands
-help-listing: $(VENV)/installed-dev
-	$(BIN)/python -m service.cli.listing
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev

@@ -215,7 +215,7 @@ def test_the_client_starts_without_heavy_libraries():
 
 @pytest.mark.parametrize(("process", "heavy"), [
     ("service.server.serve", ("numpy", "warp", "alembic", "service.solve")),
-    ("service.server.work", ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
+    ("service.server.processes", ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
 ])
 def test_what_watches_workers_starts_without_what_they_need(process, heavy):
     code = f"import sys, {process}; print([name for name in {heavy!r} if name in sys.modules])"

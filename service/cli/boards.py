@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.gauge_board import GaugeBoardRequest
 from service.requests.inspect_board import InspectBoardRequest
@@ -21,8 +21,7 @@ def register(app: typer.Typer) -> None:
 def _inspect_board(request: InspectBoardRequest) -> None:
     from service.boards.inspect_board import inspect_board
 
-    with ProgressBar() as bar:
-        result = inspect_board(request, bar)
+    result = with_bar(inspect_board, request)
     print(f"height   {result.board_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")
@@ -49,8 +48,7 @@ def _inspect_board(request: InspectBoardRequest) -> None:
 def _gauge_board(request: GaugeBoardRequest) -> None:
     from service.boards.gauge_board import gauge_board
 
-    with ProgressBar() as bar:
-        result = gauge_board(request, bar)
+    result = with_bar(gauge_board, request)
     study = result.study
     print(f"table    {result.table_path}")
     print(f"report   {result.report_path}")

@@ -8,7 +8,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.printing import print_table
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.calibrate import (
     DarkRequest,
@@ -40,68 +40,52 @@ def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = make_group("calibrate",
                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
-    for name, function in (("mirror-ball", _mirror_ball), ("light-positions", _light_positions), ("grey-ball", _grey_ball),
-                           ("intensity", _intensity), ("dark", _dark), ("flat-field", _flat_field), ("saturation", _saturation),
-                           ("white-balance", _white_balance),
-                           ("procam", _procam), ("stereo", _stereo), ("laser-planes", _laser_planes),
-                           ("response", _response), ("tof", _tof)):
-        local_command(kinds, name, function)
+    for function in (_mirror_ball, _light_positions, _grey_ball, _intensity, _dark, _flat_field, _saturation, _white_balance, _procam,
+                     _stereo, _laser_planes, _response, _tof):
+        local_command(kinds, function.__name__[1:].replace("_", "-"), function)
     app.add_typer(kinds)
 
 
 def _mirror_ball(request: MirrorBallRequest) -> None:
     from service.calibrate.lights import mirror_ball
 
-    with ProgressBar() as bar:
-        result = mirror_ball(request, bar)
-    _print_lights(result)
+    _print_lights(with_bar(mirror_ball, request))
 
 
 def _light_positions(request: LightPositionsRequest) -> None:
     from service.calibrate.lights import light_positions
 
-    with ProgressBar() as bar:
-        result = light_positions(request, bar)
-    _print_lights(result)
+    _print_lights(with_bar(light_positions, request))
 
 
 def _grey_ball(request: GreyBallRequest) -> None:
     from service.calibrate.lights import grey_ball
 
-    with ProgressBar() as bar:
-        result = grey_ball(request, bar)
-    _print_lights(result)
+    _print_lights(with_bar(grey_ball, request))
 
 
 def _intensity(request: IntensityRequest) -> None:
     from service.calibrate.intensity import intensity
 
-    with ProgressBar() as bar:
-        result = intensity(request, bar)
-    _print_lights(result)
+    _print_lights(with_bar(intensity, request))
 
 
 def _dark(request: DarkRequest) -> None:
     from service.calibrate.images import dark
 
-    with ProgressBar() as bar:
-        result = dark(request, bar)
-    _print_image("dark", result)
+    _print_image("dark", with_bar(dark, request))
 
 
 def _flat_field(request: FlatFieldRequest) -> None:
     from service.calibrate.images import flat_field
 
-    with ProgressBar() as bar:
-        result = flat_field(request, bar)
-    _print_image("flat", result)
+    _print_image("flat", with_bar(flat_field, request))
 
 
 def _saturation(request: SaturationRequest) -> None:
     from service.calibrate.images import saturation
 
-    with ProgressBar() as bar:
-        result = saturation(request, bar)
+    result = with_bar(saturation, request)
     print(f"level    {result.level:g}")
     print("readings " + ", ".join(f"{count} {name}" for count, name in zip(result.counts, ("red", "green", "blue"), strict=True)))
     if result.manifest_path is not None and result.report_path is not None:
@@ -111,8 +95,7 @@ def _saturation(request: SaturationRequest) -> None:
 def _white_balance(request: WhiteBalanceRequest) -> None:
     from service.calibrate.white_balance import white_balance
 
-    with ProgressBar() as bar:
-        result = white_balance(request, bar)
+    result = with_bar(white_balance, request)
     _print_files((result.manifest_path,), result.report_path)
     print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
     for row in result.matrix:
@@ -122,8 +105,7 @@ def _white_balance(request: WhiteBalanceRequest) -> None:
 def _procam(request: ProcamRequest) -> None:
     from service.calibrate.procam import procam
 
-    with ProgressBar() as bar:
-        result = procam(request, bar)
+    result = with_bar(procam, request)
     _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.rms_px:.3f} px RMS, baseline {result.baseline_m:.4f} m")
     print_table([("view", "camera, px", "projector, px", "remark"), *result.rows[:VIEW_ROWS]])
@@ -132,8 +114,7 @@ def _procam(request: ProcamRequest) -> None:
 def _stereo(request: StereoRequest) -> None:
     from service.calibrate.stereo import stereo
 
-    with ProgressBar() as bar:
-        result = stereo(request, bar)
+    result = with_bar(stereo, request)
     _print_files(result.manifest_paths, result.report_path)
     print(f"error    {result.summary}")
     print_table([("frame", "other camera", "camera, px", "other, px", "remark"), *result.rows[:VIEW_ROWS]])
@@ -142,8 +123,7 @@ def _stereo(request: StereoRequest) -> None:
 def _laser_planes(request: LaserPlanesRequest) -> None:
     from service.calibrate.laser_planes import laser_planes
 
-    with ProgressBar() as bar:
-        result = laser_planes(request, bar)
+    result = with_bar(laser_planes, request)
     _print_files(result.manifest_paths, result.report_path)
     print_table([("frame", "tilt sure to", "residual", "from" if request.step_m is None else "sure to"), *result.rows[:LIGHT_ROWS]])
 
@@ -151,8 +131,7 @@ def _laser_planes(request: LaserPlanesRequest) -> None:
 def _response(request: ResponseRequest) -> None:
     from service.calibrate.response import response
 
-    with ProgressBar() as bar:
-        result = response(request, bar)
+    result = with_bar(response, request)
     print(f"capture  {result.manifest_path}")
     print(f"report   {result.report_path}")
     print(f"response nearest to level^{result.gamma:.2f}; pixels deviate by {100 * result.spread:.2g} % of full scale")
@@ -161,8 +140,7 @@ def _response(request: ResponseRequest) -> None:
 def _tof(request: TofCalibrationRequest) -> None:
     from service.calibrate.tof import calibrate_tof
 
-    with ProgressBar() as bar:
-        result = calibrate_tof(request, bar)
+    result = with_bar(calibrate_tof, request)
     print(f"file     {result.path}")
     drift = result.calibration.temperature
     found = [f"wiggling at {harmonics.modulation_hz / 1e6:g} MHz" for harmonics in result.calibration.harmonics]

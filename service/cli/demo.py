@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.progress import ProgressBar
+from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import local_command
 from service.requests.demo import BenchRequest, DemoRequest
 
@@ -30,8 +30,7 @@ def register(app: typer.Typer) -> None:
 def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
     from service.demo.demo import demo
 
-    with ProgressBar() as bar:
-        result = demo(request, bar)
+    result = with_bar(demo, request)
     print(f"maps     {result.solved.maps_path}")
     print(f"report   {result.solved.report_path}")
     print(f"asset    {result.asset}")
@@ -80,6 +79,5 @@ def _results(result: "DemoResult", device: str | None) -> "SampleResults":
 def _bench(request: BenchRequest) -> None:
     from service.demo.bench import bench
 
-    with ProgressBar() as bar:
-        lines = bench(request, bar)
+    lines = with_bar(bench, request)
     print("\n".join(lines))

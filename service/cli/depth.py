@@ -5,10 +5,9 @@ from typing import Annotated
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import counted, print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.printing import check_single, counted, print_sequence, print_warnings
+from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import Given, local_command
-from service.cli.sequences import check_single, print_sequence
 from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
@@ -37,14 +36,12 @@ def _depth(request: DepthRequest) -> None:
     if is_sequence(request.capture):
         from service.sequences.run import depth_sequence
 
-        with ProgressBar() as bar:
-            print_sequence(depth_sequence(request, bar))
+        print_sequence(with_bar(depth_sequence, request))
         return
     from service.depth.depth import depth
 
     check_single(request)
-    with ProgressBar() as bar:
-        result = depth(request, bar)
+    result = with_bar(depth, request)
     if result.points_path is None:
         print(f"decoded  {result.depth_path} (projector coordinates, no depth)")
         print(f"report   {result.report_path}")
@@ -63,8 +60,7 @@ def _depth(request: DepthRequest) -> None:
 def _separate(request: SeparateRequest) -> None:
     from service.depth.separate import separate
 
-    with ProgressBar() as bar:
-        result = separate(request, bar)
+    result = with_bar(separate, request)
     print(f"parts    {result.separation_path}")
     print(f"report   {result.report_path}")
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
@@ -74,8 +70,7 @@ def _separate(request: SeparateRequest) -> None:
 def _scan(request: ScanRequest) -> None:
     from service.depth.scan import scan
 
-    with ProgressBar() as bar:
-        result = scan(request, bar)
+    result = with_bar(scan, request)
     print(f"points   {result.points_path}")
     print(f"usd      {result.usd_path}")
     if result.las_path is not None:

@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest
@@ -20,8 +20,7 @@ def register(app: typer.Typer) -> None:
 def _export(request: ExportRequest) -> None:
     from service.export.export import export
 
-    with ProgressBar() as bar:
-        exported = export(request, bar)
+    exported = with_bar(export, request)
     print(f"asset    {exported.path}")
     for layer in exported.lights:
         print(f"lights   {layer}")
@@ -33,8 +32,7 @@ def _export(request: ExportRequest) -> None:
 def _join(request: JoinRequest) -> None:
     from service.joining.join import join
 
-    with ProgressBar() as bar:
-        result = join(request, bar)
+    result = with_bar(join, request)
     pixels, sigma = result.facts["pixels"], result.facts["sigma_m"]
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
@@ -46,8 +44,7 @@ def _join(request: JoinRequest) -> None:
 def _basis(request: BasisRequest) -> None:
     from service.basis.basis import make_basis
 
-    with ProgressBar() as bar:
-        result = make_basis(request, bar)
+    result = with_bar(make_basis, request)
     print(f"basis    {result.path}")
     print(f"facts    {result.facts_path}")
     shown = "" if result.levels_rms is None else f" of what is shown, {result.levels_rms:.1f} of 255"

@@ -13,7 +13,7 @@ from service.requests.relight import CHUNK_FRAMES, RelightRequest
 from service.requests.shade import ShadeRequest
 
 if TYPE_CHECKING:
-    from service.farm.template import Job
+    from service.farm.jobs import Job
 
 OF_ONE_RUN = frozenset({Role.PART, Role.RUN})
 """Roles of the options that a job has no use for: its tasks choose them."""
@@ -60,7 +60,7 @@ def shade(request: ShadeRequest, job: JobOption, turns: TurnsOption = None, gpu:
 
 
 def _write(made: "Job", where: Path) -> None:
-    from service.farm.template import write_job
+    from service.farm.jobs import write_job
 
     written = write_job(made, where)
     print(f"template {written.template}")

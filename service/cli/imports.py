@@ -46,11 +46,9 @@ FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of t
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
-    for name, function in (("diligent", _diligent), ("lp", _lp), ("relightlab", _relightlab), ("olat", _olat), ("photos", _photos),
-                           ("near-lights", _near_lights), ("opencv-gray", _opencv_gray), ("gray", _gray), ("phase", _phase),
-                           ("scanner", _scanner), ("tof", _tof), ("histogram", _histogram), ("kinect", _kinect),
-                           ("laser", _laser)):
-        local_command(layouts, name, function)
+    for function in (_diligent, _lp, _relightlab, _olat, _photos, _near_lights, _opencv_gray, _gray, _phase, _scanner, _tof, _histogram,
+                     _kinect, _laser):
+        local_command(layouts, function.__name__[1:].replace("_", "-"), function)
     layouts.command("guess")(_guess)
     app.add_typer(layouts)
 

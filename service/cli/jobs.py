@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.groups import make_group
-from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected
-from service.cli.waiting import download, wait_for
+from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected, download, wait_for
 from service.requests.address import DEFAULT_SERVER
 
 if TYPE_CHECKING:

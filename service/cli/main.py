@@ -1,7 +1,5 @@
 """The `relit` program: its commands, and one place that turns errors into a sentence and an exit code."""
 
-import atexit
-import gc
 import importlib
 import io
 import os
@@ -13,31 +11,50 @@ import typer
 from typer.exceptions import TyperException
 
 from service.cli.groups import make_group
-from service.cli.listing import listing_program
 
-COMMANDS: dict[str, tuple[str, ...]] = {
-    "demo": ("demo", "bench"),
-    "imports": ("import",),
-    "captures": ("info",),
-    "calibrate": ("calibrate",),
-    "solve": ("solve",),
-    "export": ("export", "basis", "join"),
-    "inspect": ("inspect",),
-    "depth": ("depth", "separate", "scan", "simulate", "patterns"),
-    "boards": ("inspect-board", "gauge-board"),
-    "scans": ("register", "fuse"),
-    "light": ("relight", "shade"),
-    "view": ("view",),
-    "doctor": ("doctor",),
-    "server": ("serve", "worker"),
-    "submit": ("submit",),
-    "jobs": ("jobs",),
-    "keys": ("keys", "audit"),
-    "backup": ("backup", "restore"),
-    "farm": ("farm",),
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("demo", "Solve, export and relight the shipped sample."),
+    "bench": ("demo", "Measure the speed of the kernels, and in the same run that of NumPy and of a plain copy."),
+    "info": ("captures", "Say what a capture holds, and what is wrong with it."),
+    "view": ("captures", "What a browser needs to show a capture, its maps, its object under new light, and its depth as points."),
+    "solve": ("solve", "Normals, albedo and height of a light-stage capture."),
+    "export": ("export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
+    "basis": ("export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
+    "join": ("export", "One surface from solved maps and a depth of the same view: the detail of the normals, and the shape "
+                       "and place of the depth."),
+    "inspect": ("inspect", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, "
+                           "textures, provenance, validators."),
+    "depth": ("depth", "Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."),
+    "separate": ("depth", "Direct and global light of a capture under fine, shifted phase patterns."),
+    "scan": ("depth", "Shots of a scanning laser, from a platform that may move, as one point cloud."),
+    "patterns": ("depth", "The images to project, and their manifest entries; or, with --plan, what each code costs."),
+    "inspect-board": ("boards", "Stitch the tiles of a board to one height map, compare it with a golden map or a design, and list "
+                                "what is wrong."),
+    "gauge-board": ("boards", "Repeatability and reproducibility of inspections of the same boards (gauge R&R)."),
+    "register": ("scans", "Find the poses of scans of one object by their surfaces, and say how sure each is and which scans "
+                          "could not be joined."),
+    "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),
+    "relight": ("light", "Frames under HDR environments and animated lights."),
+    "shade": ("light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
+    "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary "
+                         "folder; and the service here."),
+    "serve": ("server", "Run the service: the API, and a worker on each device."),
+    "worker": ("server", "Run one more worker, on any machine that reaches the database and the storage."),
+    "backup": ("server", "Save the database and the files of the service, which may run meanwhile, with their checksums."),
+    "restore": ("server", "Make a service from a backup, in a new data folder (--data) and an empty database; jobs that ran go "
+                          "on when it starts."),
+    "audit": ("keys", "Show who did what to which object, the newest first."),
+    "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
+    "keys": ("keys", "Make, list and revoke the keys of the service."),
+    "import": ("imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
+    "calibrate": ("calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "
+                               "residuals."),
+    "submit": ("submit", "Submit work to a service, with the options of the commands that do it on this machine."),
+    "jobs": ("jobs", "List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results."),
+    "farm": ("farm", "Jobs for render farms; docs/farm.md."),
 }
-"""The modules of service.cli in the order of the help, and the commands that each registers. A command that is missing here is found by
-loading all modules."""
+"""The commands in the order of the help: the module of service.cli that registers each, and the sentence that the list of commands shows.
+The program loads the modules that it needs: to import all of them takes longer than many runs."""
 
 ABOUT = "Active-illumination captures to normals, materials, depth, USD assets and relit frames."
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -45,24 +62,30 @@ BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 """The variables by which NumPy's linear algebra is told its number of threads. Without them it has one: kernels divide the large work among
 the cores, and matrices of some hundred rows cost more to divide than to solve."""
 
-NEW_OBJECTS = 200_000
-"""Python looks for unreachable cycles of objects after so many new ones, not after 700: imports and a short run make somewhat fewer, which
-stay, and to look through them time and again is a tenth of the run. No array of a solve is in a cycle: memory does not wait."""
-
 
 def program(wanted: str | None = None) -> typer.Typer:
-    """Return the program; where `wanted` is a command, only those of its module: to import the others takes as long as a short run."""
-    app = make_group("relit", help=ABOUT)
-    app.callback(invoke_without_command=True)(_root)
-    beside = [module for module, names in COMMANDS.items() if wanted in names]
-    for module in beside or COMMANDS:
+    """Return the program.
+
+    Args:
+        wanted: the command that will run: only its module is imported. None, or a name that is no command: all modules are.
+    """
+    app = _empty()
+    modules = [COMMANDS[wanted][0]] if wanted in COMMANDS else dict.fromkeys(module for module, _ in COMMANDS.values())
+    for module in modules:
         importlib.import_module(f"service.cli.{module}").register(app)
     return app
 
 
-def _lister() -> typer.Typer:
-    """Return a program that can show what `program` lists, without importing the commands."""
-    app = listing_program(help=ABOUT)
+def listing() -> typer.Typer:
+    """Return a program that shows the list of commands, without importing them, and can do nothing else."""
+    app = _empty()
+    for name, (_, words) in COMMANDS.items():
+        app.command(name, help=words)(lambda: None)
+    return app
+
+
+def _empty() -> typer.Typer:
+    app = make_group("relit", help=ABOUT)
     app.callback(invoke_without_command=True)(_root)
     return app
 
@@ -77,14 +100,14 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 def main() -> None:
     """Run the program; exit 2 with one sentence on bad input, 130 when interrupted."""
-    gc.set_threshold(NEW_OBJECTS)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # paths may hold bytes that are not text
     if not any(name in os.environ for name in BLAS_THREADS):  # numpy is not imported yet
         os.environ[BLAS_THREADS[0]] = "1"
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # whoever ends us gets the same tidy end as one who types Ctrl-C
+    for number in (signal.SIGINT, signal.SIGTERM):  # the same tidy end, also where a shell started us in the background, without SIGINT
+        signal.signal(number, signal.default_int_handler)
     try:
-        app = _lister() if sys.argv[1:] in ([], ["--help"]) else program(next(iter(sys.argv[1:]), None))
+        app = listing() if sys.argv[1:] in ([], ["--help"]) else program(next(iter(sys.argv[1:]), None))
         code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
             print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
@@ -109,33 +132,5 @@ def main() -> None:
         sys.exit(BAD_INPUT)
 
 
-def run() -> None:
-    """Run the program as a process, which ends without taking apart what it holds: the system frees the memory of a process at once.
-
-    Python would look through all objects for garbage several times, and free them one by one, which is a sixth of a short solve. All
-    threads and exit handlers end before, and an error that `main` does not name ends the process as Python does.
-    """
-    status: list[int] = []
-    atexit.register(_leave, status)  # the first handler that is registered is the last that is called
-    try:
-        main()
-    except SystemExit as ended:
-        if ended.code is None or isinstance(ended.code, int):
-            status.append(ended.code or 0)
-        raise
-
-
-def _leave(status: list[int]) -> None:
-    """End the process with its exit status, if it has one, once all that was printed is on its way."""
-    if not status:
-        return
-    try:
-        print(end="", flush=True)
-        print(end="", file=sys.stderr, flush=True)
-    except OSError:
-        return  # Python meets the same error at its own end, and says so
-    os._exit(status[0])
-
-
 if __name__ == "__main__":
-    run()
+    main()

@@ -1,6 +1,14 @@
-"""Lines that several commands print."""
+"""Lines that several commands print, and what the commands that take a sequence of captures check."""
 
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from service.requests.depth import DepthRequest
+    from service.requests.solve import SolveRequest
+    from service.sequences.run import SequenceResult
 
 
 def counted(counts: Mapping[str, int]) -> str:
@@ -19,3 +27,26 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def check_single(request: "SolveRequest | DepthRequest") -> None:
+    """Check that a capture that is no sequence has no option of sequences.
+
+    Raises:
+        RequestError: it has.
+    """
+    from service.errors import RequestError
+
+    for name, given in (("--no-temporal", not request.temporal), ("--frame-rate", request.frame_rate is not None)):
+        if given:
+            raise RequestError(f"{name}: {request.capture} is one capture, and the option is for a sequence of them")
+
+
+def print_sequence(result: "SequenceResult") -> None:
+    """Print what was made of a sequence, and end with the exit code 1 where no pixel is solved."""
+    print(f"steps    {result.sequence_path} ({len(result.names)} steps, {result.kept} done before)")
+    print(f"report   {result.report_path}")
+    print(f"joined   {100 * result.joined:.0f} % of the pixels of consecutive steps agree")
+    print_warnings(result.warnings)
+    if not result.solved:
+        raise typer.Exit(1)

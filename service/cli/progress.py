@@ -1,8 +1,9 @@
 """Progress of a command: a bar on a terminal, nothing where the output is none, or lines for the worker of a farm."""
 
 import sys
+from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self, TypeVar
 
 import typer
 
@@ -13,12 +14,14 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
 
+Given = TypeVar("Given")
+Result = TypeVar("Result")
 COUNTED = ("frames", "shade")
 """The stages that count for the percentage of a farm; the others are short."""
 
 
 class ProgressStyle(Choice):
-    """How progress is shown."""
+    """The ways in which progress is shown."""
 
     BAR = "bar", "on a terminal, else not at all"
     OPENJD = "openjd", "lines that a farm's worker reads (docs/farm.md)"
@@ -75,6 +78,12 @@ class ProgressBar:
         if self._bar is not None and self._task is not None:
             task = self._bar.tasks[self._task]
             self._bar.update(self._task, completed=task.total)
+
+
+def with_bar(work: Callable[[Given, ProgressBar], Result], request: Given) -> Result:
+    """Do the work of a request, and show its progress."""
+    with ProgressBar() as bar:
+        return work(request, bar)
 
 
 class OpenJdProgress:

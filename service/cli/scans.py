@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.fuse import FuseRequest
 from service.requests.register import RegisterRequest
@@ -18,8 +18,7 @@ def register(app: typer.Typer) -> None:
 def _register(request: RegisterRequest) -> None:
     from service.scans.register import register_scans
 
-    with ProgressBar() as bar:
-        result = register_scans(request, bar)
+    result = with_bar(register_scans, request)
     print(f"scans    {result.scan_set_path}")
     print(f"report   {result.report_path}")
     print(f"joined   {result.joined} of {result.scans} scans")
@@ -35,8 +34,7 @@ def _register(request: RegisterRequest) -> None:
 def _fuse(request: FuseRequest) -> None:
     from service.scans.fuse import fuse
 
-    with ProgressBar() as bar:
-        result = fuse(request, bar)
+    result = with_bar(fuse, request)
     facts = result.facts
     if result.mesh_path is not None:
         print(f"mesh     {result.mesh_path}")

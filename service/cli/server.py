@@ -1,11 +1,9 @@
-"""relit serve and relit worker: run the service, or a worker on another machine."""
+"""relit serve, worker, backup and restore: run the service or a worker, and save a service while it runs."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-
-from service.server.garbage import spared
 
 ConfigOption = Annotated[Path | None, typer.Option(
     "--config", metavar="FILE.toml", show_default=False,
@@ -18,6 +16,8 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     app.command("serve")(serve)
     app.command("worker")(worker)
+    app.command("backup")(backup)
+    app.command("restore")(restore)
 
 
 def serve(
@@ -32,11 +32,7 @@ def serve(
         show_default=False)] = None,
 ) -> None:
     """Run the service: the API, and a worker on each device."""
-    from service.server.malloc import restart_without_thread_caches
-
-    restart_without_thread_caches()  # before the service is imported, which takes a second
-    with spared():
-        from service.server.serve import serve as run
+    from service.server.serve import serve as run
 
     run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
 
@@ -48,10 +44,47 @@ def worker(
     config: ConfigOption = None,
 ) -> None:
     """Run one more worker, on any machine that reaches the database and the storage."""
-    with spared():
-        from service.server.work import work as run
+    from service.server.processes import work as run
 
     run(settings_of(config, data=data), device)
+
+
+def backup(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="New folder for the backup.")],
+    objects: Annotated[bool, typer.Option("--objects", help="Copy the objects of storage_url too; else the backup names them.")] = False,
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Save the database and the files of the service, which may run meanwhile, with their checksums."""
+    from service.server.backup import backup as run
+
+    settings = settings_of(config, data=data)
+    made = run(settings, out, copy_objects=objects)
+    print(f"backup   {made.folder}")
+    print(f"files    {made.files}, {made.size} bytes")
+    if settings.storage_url is not None:
+        print(f"objects  {made.objects} of {settings.storage_url}" + (", copied" if made.copied else
+              ", named and not copied: relit restore looks for them there; keep versions of them"))
+
+
+def restore(
+    folder: Annotated[Path, typer.Argument(metavar="BACKUP", help="Folder that relit backup made.")],
+    accept_differences: Annotated[bool, typer.Option(
+        "--accept-differences", help="Restore although objects of storage_url are missing or have changed since the backup.")] = False,
+    data: DataOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Make a service from a backup, in a new data folder (--data) and an empty database; jobs that ran go on when it starts."""
+    from service.server.backup import restore as run
+
+    settings = settings_of(config, data=data)
+    made = run(settings, folder, accept_differences=accept_differences)
+    print(f"data     {settings.data}")
+    print(f"files    {made.files}, {made.size} bytes, as their checksums say")
+    if made.objects:
+        others = "none missing or changed" if not made.differing else (
+            f"{made.differing} sent to the store" if made.copied else f"{made.differing} missing or changed")
+        print(f"objects  {made.objects} in {settings.storage_url}, {others}")
 
 
 def settings_of(config: Path | None, **given: Any) -> Any:

@@ -1,5 +1,6 @@
-"""The options of the commands that speak with a service, and the client that they use."""
+"""`relit submit` and `relit jobs` share these options, the client, waiting for a job, and fetching its results."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,6 +10,8 @@ import typer
 
 if TYPE_CHECKING:
     from service.client import Client
+
+UNSUCCESSFUL, INTERRUPTED = 1, 130
 
 ServerOption = Annotated[str, typer.Option(
     "--server", metavar="URL", envvar="RELIT_SERVER", help="Address of the service, as relit serve prints it.")]
@@ -37,3 +40,53 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
             yield client
     except ClientError as error:
         raise RequestError(str(error)) from error
+
+
+def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrupt: bool) -> None:
+    """Wait until a job has ended, and fetch what it made into the folder `out`, if there is one.
+
+    Raises:
+        typer.Exit: with code 1: it did not succeed.
+    """
+    from service.cli.progress import ProgressBar
+    from service.client import JobEnded
+
+    try:
+        with ProgressBar() as bar:
+            ended = client.jobs.wait(job, progress=bar)
+    except JobEnded as error:
+        print(f"relit: {error}", file=sys.stderr)
+        raise typer.Exit(UNSUCCESSFUL) from error
+    except KeyboardInterrupt:
+        if cancel_on_interrupt:
+            client.jobs.cancel(job)
+            print(f"relit: interrupted; {job} is cancelled", file=sys.stderr)
+        else:
+            print(f"relit: interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    if ended.started_at is not None and ended.finished_at is not None:
+        print(f"state       {ended.state}, {(ended.finished_at - ended.started_at).total_seconds():.1f} s")
+    if out is not None:
+        download(client, job, out)
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder for what a job makes.
+
+    Raises:
+        FileError: it cannot be made.
+    """
+    from service.client.local_files import file_errors
+
+    with file_errors(out, "make"):
+        out.mkdir(parents=True, exist_ok=True)
+
+
+def download(client: "Client", job: str, out: Path) -> None:
+    """Fetch what a job has made."""
+    from service.cli.progress import ProgressBar
+
+    with ProgressBar() as bar:
+        found = client.jobs.download(job, out, progress=bar)
+    last = f" … {found[-1].name}" if len(found) > 1 else ""
+    print(f"results     {found[0]}{last}" if found else "results     none")

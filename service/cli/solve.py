@@ -1,13 +1,10 @@
 """relit solve: maps of a capture."""
 
-from contextlib import nullcontext
-
 import typer
 
-from service.cli.printing import counted, print_warnings
-from service.cli.progress import ProgressBar
+from service.cli.printing import check_single, counted, print_sequence, print_warnings
+from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.cli.sequences import check_single, print_sequence
 from service.requests.solve import SolveRequest
 
 
@@ -22,18 +19,12 @@ def _solve(request: SolveRequest) -> None:
     if is_sequence(request.capture):
         from service.sequences.run import solve_sequence
 
-        with ProgressBar() as bar:
-            print_sequence(solve_sequence(request, bar))
+        print_sequence(with_bar(solve_sequence, request))
         return
-    from service.cli.ahead import reading_ahead
-    from stage.capture import Capture
+    from service.solve.solve import solve
 
     check_single(request)
-    capture = Capture.open(request.capture, request.pixels)
-    with nullcontext() if request.aligned else reading_ahead(capture, request.cache):
-        from service.solve.solve import solve
-    with ProgressBar() as bar:  # which starts a thread
-        result = solve(request, bar, capture=capture)
+    result = with_bar(solve, request)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")

@@ -11,8 +11,7 @@ import typer
 from service.cli.groups import make_group
 from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
-from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected
-from service.cli.waiting import make_folder, wait_for
+from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected, make_folder, wait_for
 from service.requests.address import DEFAULT_SERVER
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern

@@ -3,7 +3,6 @@
 import random
 import secrets
 import time
-from collections.abc import Callable
 from email.utils import parsedate_to_datetime
 from typing import Any
 from urllib.parse import quote
@@ -33,10 +32,7 @@ class Backoff:
         self._pause, self._deadline = FIRST_PAUSE_S, time.monotonic() + self._limit_s
 
     def wait(self, asked_s: float | None = None) -> bool:
-        """Sleep before the next try.
-
-        Args:
-            asked_s: the pause that the service asked for; None: it named none.
+        """Sleep before the next try: as long as the service asked for, or its own pause.
 
         Returns:
             Whether to try again; False, without sleeping, if the pause would exceed the time limit.
@@ -85,26 +81,18 @@ class Connection:
         """Send a request, and repeat it where that is safe, until the service answers.
 
         Args:
-            method, path: of the request.
+            method, path, options: of the request, as httpx2 takes them.
             repeatable: whether carrying the request out twice has the same effect as once; if not, it is repeated only where it is
                 certain that it was not carried out.
-            options: passed to httpx2: json, params, headers …
 
         Raises:
             Refused: the service answers with an error.
             Unreachable: the service does not answer.
         """
-        return self._retry(lambda: self.send_once(method, path, **options), repeatable=repeatable)
-
-    def send_once(self, method: str, path: str, **options: Any) -> httpx2.Response:
-        """Send a request once, and return the answer, also if it is an error."""
-        return self.http.request(method, path, **options)
-
-    def _retry(self, attempt: Callable[[], httpx2.Response], *, repeatable: bool) -> httpx2.Response:
         backoff = self.backoff()
         while True:
             try:
-                answer = attempt()
+                answer = self.http.request(method, path, **options)
             except httpx2.TransportError as error:
                 again = repeatable or isinstance(error, NOT_SENT)
                 if not again or not backoff.wait():
@@ -117,12 +105,7 @@ class Connection:
             raise refusal(answer)
 
     def unreachable(self, error: Exception, *, unknown: bool = False) -> Unreachable:
-        """Return the error for a service that does not answer.
-
-        Args:
-            error: of httpx2.
-            unknown: whether the request may have been carried out all the same.
-        """
+        """Return the error for a service that does not answer; `unknown`: the request may have been carried out all the same."""
         reason = " ".join(str(error).split()) or type(error).__name__
         return Unreachable(f"{self.server} does not answer{', and may have done what was asked' if unknown else ''}: {reason}")
 

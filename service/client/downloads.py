@@ -12,38 +12,18 @@ import httpx2
 from service.client.connection import LATER, PROXY, Connection, retry_after
 from service.client.errors import FileError, refusal
 from service.client.local_files import file_errors
-from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress, transfer_all
+from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress
 
 PARTIAL = 206
 PLAIN = {"Accept-Encoding": "identity"}
 """Ask for the bytes of the file without compression, so that ranges count them."""
 
 
-def download_files(connection: Connection, results: str, names: list[str], folder: Path, *, parallel: int,
-                   progress: TransferProgress) -> list[Path]:
-    """Download files of a job.
-
-    Args:
-        connection: to the service.
-        results: path of the job's results in the API.
-        names: of the files.
-        folder: to write them into; it is made if it does not exist.
-        parallel: number of files that are fetched at once.
-        progress: told of every byte.
-
-    Returns:
-        The paths of the files, in the order of `names`.
-
-    Raises:
-        ClientError: a file could not be fetched; the others were stopped, and the next call continues them.
-    """
-    return transfer_all((_Download(connection, results, name, folder, progress).run for name in names), parallel=parallel)
-
-
-class _Download:
+class Download:
     """The download of one file: into a hidden file named after its ETag, so that parts of two versions are never mixed."""
 
     def __init__(self, connection: Connection, results: str, name: str, folder: Path, progress: TransferProgress) -> None:
+        """Args: connection: to the service. results: path of the job's results in the API. name: of the file. folder, progress: of all."""
         self._connection, self._name, self._progress = connection, name, progress
         self._url, self._target = f"{results}/{quote(name)}", folder / _safe(name)
         self._etag, self._size, self._got = "", -1, 0

@@ -39,7 +39,7 @@ class Fault(NamedTuple):
     """One invalid value of a request."""
 
     field: str
-    """Where the value stands: body.options.frames, query.limit …"""
+    """The place of the value: body.options.frames, query.limit …"""
     message: str
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from service.client.connection import Connection
 from service.client.errors import Conflict, IntakeRefused, NotFound
 from service.client.local_files import files_of, hash_files, hash_of_all
-from service.client.transfer import TransferProgress
-from service.client.uploads import upload_files
+from service.client.transfer import TransferProgress, transfer_all
+from service.client.uploads import Upload
 from service.reporting.progress import Progress
 from service.views.intakes import IntakePage, IntakeView
 from service.views.states import CHECKING, READY, RECEIVING, REFUSED
@@ -26,14 +26,7 @@ class Intakes:
     """The captures of a project, or its environments: the two kinds of files that jobs take in."""
 
     def __init__(self, connection: Connection, path: str, source: str, *, parallel: int) -> None:
-        """Prepare.
-
-        Args:
-            connection: to the service.
-            path: of the collection in the API.
-            source: name of the request's field for a path on the server.
-            parallel: number of files that are sent at once.
-        """
+        """Args: connection: to the service. path: in the API. source: field of a path on the server. parallel: files sent at once."""
         self._connection, self._path, self._source, self._parallel = connection, path, source, parallel
 
     def upload(self, source: Path, *, name: str | None = None, progress: Progress | None = None) -> IntakeView:
@@ -62,8 +55,8 @@ class Intakes:
             return intake
         if intake.state in (RECEIVING, REFUSED):
             if intake.state == RECEIVING:
-                upload_files(self._connection, self._at(intake.id), files, parallel=self._parallel,
-                             progress=TransferProgress(progress, "upload", sum(file.size for file in files)))
+                told = TransferProgress(progress, "upload", sum(file.size for file in files))
+                transfer_all((Upload(self._connection, self._at(intake.id), file, told).run for file in files), parallel=self._parallel)
             self.validate(intake.id)
         return self.wait(intake.id)
 

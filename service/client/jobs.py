@@ -1,19 +1,26 @@
-"""Jobs: submitted, watched, controlled, and their results downloaded."""
+"""Jobs: submitted, followed by server-sent events, controlled, and their results downloaded."""
 
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import httpx2
+
 from service.client.connection import Connection
-from service.client.downloads import download_files
+from service.client.downloads import Download
 from service.client.errors import FileError, JobEnded
-from service.client.events import follow
-from service.client.transfer import TransferProgress
+from service.client.transfer import TransferProgress, transfer_all
 from service.reporting.progress import Progress
 from service.requests.job import JobRequest
 from service.views.jobs import JobPage, JobView, ResultPage, ResultView
-from service.views.states import SUCCEEDED, JobState
+from service.views.states import ENDED, SUCCEEDED, JobState
 
 PATH = "/v1/jobs"
+EVENT = "job"
+SILENCE_S = 45.0
+"""A stream without a byte for this long is given up: the service sends at least a comment every 15 s."""
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 2.0
+"""Between two plain requests, while events bring nothing."""
 
 
 class Jobs:
@@ -56,11 +63,7 @@ class Jobs:
         return follow(self._connection, self._at(job))
 
     def wait(self, job: str, *, progress: Progress | None = None) -> JobView:
-        """Wait until a job has succeeded.
-
-        Args:
-            job: its identifier.
-            progress: told of the job's stages.
+        """Wait until a job has succeeded, and tell `progress` of its stages.
 
         Raises:
             JobEnded: it failed or was cancelled.
@@ -129,11 +132,59 @@ class Jobs:
             if missing := sorted(set(names) - {file.name for file in found}):
                 raise FileError(f"{job} has no result {missing[0]}")
             found = [file for file in found if file.name in names]
-        return download_files(self._connection, f"{self._at(job)}/results", [file.name for file in found], folder,
-                              parallel=self._parallel, progress=TransferProgress(progress, "download", sum(file.size for file in found)))
+        told = TransferProgress(progress, "download", sum(file.size for file in found))
+        return transfer_all((Download(self._connection, f"{self._at(job)}/results", file.name, folder, told).run for file in found),
+                            parallel=self._parallel)
 
     def _act(self, job: str, action: str) -> JobView:
         return JobView.model_validate_json(self._connection.send("POST", f"{self._at(job)}/{action}", repeatable=False).content)
 
     def _at(self, job: str) -> str:
         return self._connection.path(PATH, job)
+
+
+def follow(connection: Connection, job: str) -> Iterator[JobView]:
+    """Yield a job as it is now, and again after every change, until it has ended.
+
+    Args:
+        connection: to the service.
+        job: path of the job in the API.
+
+    Raises:
+        Refused: there is no such job, or the key does not allow to read it.
+        Unreachable: the service does not answer.
+    """
+    last: JobView | None = None
+    pause = FIRST_PAUSE_S
+    while True:
+        before = last
+        try:
+            for view in _stream(connection, job, last):
+                if last is None or view.revision > last.revision:
+                    last = view
+                    yield view
+                    if view.state in ENDED:
+                        return
+        except httpx2.TransportError:
+            pass
+        if last is not before:
+            pause = FIRST_PAUSE_S
+            continue
+        view = JobView.model_validate_json(connection.send("GET", job).content)  # its error also says why there are no events
+        if last is None or view.revision > last.revision:
+            last = view
+            yield view
+        if view.state in ENDED:
+            return
+        time.sleep(pause)
+        pause = min(2 * pause, LONGEST_PAUSE_S)
+
+
+def _stream(connection: Connection, job: str, last: JobView | None) -> Iterator[JobView]:
+    """Yield the views of one stream of events after `last`; nothing if the service refuses the stream."""
+    headers = {} if last is None else {"Last-Event-ID": str(last.revision)}
+    with connection.http.sse(f"{job}/events", headers=headers, timeout=SILENCE_S) as events:
+        if events.response.is_success:
+            for event in events:
+                if event.event == EVENT:
+                    yield JobView.model_validate_json(event.data)

@@ -1,4 +1,4 @@
-"""What uploads and downloads share: several files at once, and their bytes reported as one progress."""
+"""Uploads and downloads of several files at once, whose bytes are reported as one progress."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
@@ -40,17 +40,9 @@ def _whole_mib(count: int) -> int:
 
 
 def transfer_all(transfers: Iterable[Callable[[Event], Result]], *, parallel: int) -> list[Result]:
-    """Run transfers in threads, and stop all of them when one fails.
+    """Run transfers in `parallel` threads, and return their results in their order; when one fails, stop all and raise its error.
 
-    Args:
-        transfers: one call for each file; it raises `Stopped` when the event that it is given is set.
-        parallel: number of threads.
-
-    Returns:
-        What each call returned, in the order of the calls.
-
-    Raises:
-        Exception: the first that a call raised.
+    A transfer raises `Stopped` when the event that it is given is set.
     """
     stop = Event()
     pool = ThreadPoolExecutor(parallel)

@@ -10,33 +10,18 @@ import httpx2
 from service.client.connection import LATER, PROXY, Connection, retry_after
 from service.client.errors import FileError, refusal
 from service.client.local_files import LocalFile, file_errors
-from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress, transfer_all
+from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress
 
 TUS = {"Tus-Resumable": "1.0.0"}
 OTHER_OFFSET = (409, 423)
 """Statuses of the server when it has another number of bytes than the client assumed, or still writes those of an earlier request."""
 
 
-def upload_files(connection: Connection, intake: str, files: list[LocalFile], *, parallel: int, progress: TransferProgress) -> None:
-    """Upload the files of a capture or environment; bytes that the server has already are not sent again.
-
-    Args:
-        connection: to the service.
-        intake: path of the capture or environment in the API.
-        files: to upload.
-        parallel: number of files that are sent at once.
-        progress: told of every byte.
-
-    Raises:
-        ClientError: a file could not be sent; the others were stopped, and the next call continues them.
-    """
-    transfer_all((_Upload(connection, intake, file, progress).run for file in files), parallel=parallel)
-
-
-class _Upload:
-    """The upload of one file."""
+class Upload:
+    """The upload of one file; bytes that the server has already are not sent again."""
 
     def __init__(self, connection: Connection, intake: str, file: LocalFile, progress: TransferProgress) -> None:
+        """Args: connection: to the service. intake: path of the capture or environment in the API. file: to send. progress: of all."""
         self._connection, self._intake, self._file, self._progress = connection, intake, file, progress
         self._sent = 0
 
@@ -57,7 +42,7 @@ class _Upload:
             before = offset
             self._report(offset)
             try:
-                answer = self._connection.send_once("PATCH", upload, content=self._pieces(offset, stop), headers={
+                answer = self._connection.http.request("PATCH", upload, content=self._pieces(offset, stop), headers={
                     **TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream",
                     "Content-Length": str(file.size - offset)})
             except httpx2.TransportError as error:

@@ -1,27 +1,49 @@
-"""The jobs that a farm can do: frames of `relit relight` in chunks, and pictures of `relit shade`."""
+"""The jobs that a farm can do: frames of `relit relight` in chunks, and pictures of `relit shade`; and the files of their templates.
+
+Source: Open Job Description, template schemas 2023-09, with the extension TASK_CHUNKING (RFC 0001).
+"""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import yaml
 
 from service.errors import RequestError
 from service.farm.parameters import Parameters
-from service.farm.template import Job, job
+from service.requests.base import Request
 from service.requests.frame_range import numbered
 from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
+from stage.files import write_text
 
 MOST_TURNS = 1024
 """The specification's limit on the values of a task's parameter."""
+NOTICE_S = 60
+"""Seconds between the signal that asks a task to end and the signal that kills it, in which frames that are being written are finished."""
+LONGEST_NAME = 128
+TEMPLATE_SUFFIXES = (".yaml", ".yml")
+
+
+class Job(NamedTuple):
+    """A template, with values for its parameters that have no default."""
+
+    template: Mapping[str, Any]
+    values: Mapping[str, str]
+
+
+class JobFiles(NamedTuple):
+    """The files of a job."""
+
+    template: Path
+    values: Path
+    is_bundle: bool
+    """True if they lie in a folder as Deadline Cloud takes it."""
 
 
 def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job:
-    """Return a job whose tasks make parts of the frames.
-
-    Args:
-        request: of the whole range, which must be named; checked.
-        chunk_frames: frames of a task, as a default.
-        gpu: whether tasks need a worker with a GPU.
+    """Return a job whose tasks make parts of the frames, `chunk_frames` each unless who submits it says otherwise.
 
     Raises:
         RequestError: a text that no farm takes.
@@ -34,17 +56,12 @@ def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job
     chunk = given.count("ChunkFrames", chunk_frames, "Frames of a task.")
     chunks = {"name": "Chunk", "type": "CHUNK[INT]", "range": "{{Param.Frames}}",
               "chunks": {"defaultTaskCount": chunk, "rangeConstraint": "CONTIGUOUS"}}
-    return job("relight", request.capture, words, request, given, gpu=gpu, space={"taskParameterDefinitions": [chunks]},
+    return _job("relight", request.capture, words, request, given, gpu=gpu, space={"taskParameterDefinitions": [chunks]},
                extensions=("TASK_CHUNKING",))
 
 
 def shade_job(request: ShadeRequest, *, turns: int | None, gpu: bool) -> Job:
-    """Return a job of one task, or of one for each turn.
-
-    Args:
-        request: of one picture, checked; its turn is the first.
-        turns: how many pictures the environment turns once around in; None: one picture.
-        gpu: whether tasks need a worker with a GPU.
+    """Return a job of one picture, or of `turns` pictures over which the environment turns once around; the request's turn is the first.
 
     Raises:
         RequestError: turns without an environment, too many, or no run of # in the picture's name for their number.
@@ -54,9 +71,9 @@ def shade_job(request: ShadeRequest, *, turns: int | None, gpu: bool) -> Job:
     folder = given.folder("OutputFolder", request.out.parent, "OUT", "Where the picture goes.")
     if turns is None:
         words += ["--out", f"{folder}/" + given.text("PictureName", request.out.name, "Name of the picture.")]
-        return job("shade", request.maps, words, request, given, gpu=gpu)
+        return _job("shade", request.maps, words, request, given, gpu=gpu)
     words += ["--out", f"{folder}/{{{{Task.Param.Picture}}}}", "--turn-degrees", "{{Task.Param.TurnDegrees}}"]
-    return job("shade", request.maps, words, request, given, gpu=gpu, space=_turned(request, turns))
+    return _job("shade", request.maps, words, request, given, gpu=gpu, space=_turned(request, turns))
 
 
 def _turned(request: ShadeRequest, turns: int) -> dict[str, Any]:
@@ -72,3 +89,53 @@ def _turned(request: ShadeRequest, turns: int) -> dict[str, Any]:
         {"name": "Picture", "type": "STRING", "range": [numbered(name, number) for number in range(1, turns + 1)]},
         {"name": "TurnDegrees", "type": "FLOAT", "range": [request.turn_degrees + 360 * turn / turns for turn in range(turns)]},
     ], "combination": "(Picture, TurnDegrees)"}
+
+
+def _job(command: str, subject: Path, words: list[str], request: Request, given: Parameters, *, gpu: bool,
+        space: Mapping[str, Any] | None = None, extensions: tuple[str, ...] = ()) -> Job:
+    """Return a job named after `subject`, whose tasks call a command of this program with `words` and the request's device and cache."""
+    program = given.text("Relit", "relit", "The program on the workers: a name on their PATH, or a path.")
+    if request.cache is not None:
+        words = [*words, "--cache", given.folder("Cache", request.cache, "NONE", "For image stacks, on each worker.")]
+    device = request.device or ("cuda:0" if gpu else None)
+    words = [command, *words, *(["--device", device] if device else []), "--progress", "openjd"]
+    run = {"command": program, "args": words, "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": NOTICE_S}}
+    step: dict[str, Any] = {"name": command}
+    if space is not None:
+        step["parameterSpace"] = space
+    step["script"] = {"actions": {"onRun": run}}
+    if gpu:
+        step["hostRequirements"] = {"amounts": [{"name": "amount.worker.gpu", "min": 1}]}
+    template: dict[str, Any] = {"specificationVersion": "jobtemplate-2023-09"}
+    if extensions:
+        template["extensions"] = list(extensions)
+    return Job(template | {"name": _title(command, subject), "parameterDefinitions": given.definitions, "steps": [step]}, given.values)
+
+
+def write_job(made: Job, where: Path) -> JobFiles:
+    """Write the template of a job and its values.
+
+    Args:
+        made: the job.
+        where: NAME.yaml, and NAME.values.yaml beside it; any other name is a folder, with template.yaml and parameter_values.yaml.
+    """
+    if where.suffix.lower() in TEMPLATE_SUFFIXES:
+        files = JobFiles(where, where.with_suffix(f".values{where.suffix}"), False)
+        values: Mapping[str, Any] = made.values
+    else:
+        files = JobFiles(where / "template.yaml", where / "parameter_values.yaml", True)
+        values = {"parameterValues": [{"name": name, "value": value} for name, value in made.values.items()]}
+    write_text(files.values, _yaml(values))
+    write_text(files.template, _yaml(made.template))
+    return files
+
+
+def _title(command: str, subject: Path) -> str:
+    """Return the name of a job; what a template would fill in is left out of it."""
+    subject = subject.parent if subject.is_file() else subject
+    shown = "".join(character for character in subject.absolute().name if character.isprintable() and character not in "{}")
+    return f"relit {command} {shown}"[:LONGEST_NAME].rstrip()
+
+
+def _yaml(data: Mapping[str, Any]) -> str:
+    return yaml.safe_dump(dict(data), sort_keys=False, allow_unicode=True, width=140)

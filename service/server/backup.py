@@ -17,6 +17,7 @@ import sqlite3
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -26,7 +27,7 @@ import sqlalchemy as sa
 from service import __version__
 from service.errors import RequestError
 from service.server.database import tables
-from service.server.database.engine import connect, usable
+from service.server.database.engine import Database, connect, usable
 from service.server.database.schema import require_current
 from service.server.settings import Settings
 from service.server.storage import layout, saved_objects
@@ -53,17 +54,17 @@ class Backup(NamedTuple):
     objects: int = 0
     """Objects of the store of `storage_url` that belong to it."""
     copied: bool = False
-    """Whether copies of the objects are among the files."""
+    """True if copies of the objects are among the files."""
     differing: int = 0
     """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
 
 
 class _Contents(NamedTuple):
-    """What backup.json says."""
+    """The contents of backup.json."""
 
     files: dict[str, dict[str, Any]]
     storage: dict[str, Any] | None
-    """What a service with storage_url keeps in its store: the URL, whether the objects are copied, and the objects; None without one."""
+    """The store of a service with storage_url: its URL, whether the objects are copied, and the objects; None without storage_url."""
 
 
 def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
@@ -89,10 +90,8 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
     bucket = None if settings.storage_url is None else Bucket(settings.storage_url)
     with storage("make", out):
         out.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with usable(settings):
-        database = connect(settings.sqlalchemy_url, connections=1)
+    with _opened(settings) as database:
         require_current(database)
-        database.close()
     at, active = time.time(), set() if bucket is None else _active_jobs(settings)
     if settings.is_sqlite:
         with usable(settings):
@@ -145,11 +144,9 @@ def restore(settings: Settings, folder: Path, *, accept_differences: bool = Fals
     if (settings.data / PROJECTS).exists() or (settings.is_sqlite and settings.sqlite_file.exists()):
         raise RequestError(f"data {settings.data}: there is a service in this folder already: give a new one")
     if not settings.is_sqlite:
-        with usable(settings):
-            database = connect(settings.sqlalchemy_url, connections=1)
-            tables = sa.inspect(database.engine).get_table_names()
-            database.close()
-        if tables:
+        with _opened(settings) as database:
+            has_tables = bool(sa.inspect(database.engine).get_table_names())
+        if has_tables:
             raise RequestError("database_url: the database has tables already: give an empty one")
     for name, entry in files.items():
         if not (folder / name).is_file() or _entry(folder / name) != entry:
@@ -169,13 +166,16 @@ def restore(settings: Settings, folder: Path, *, accept_differences: bool = Fals
                   stored is not None and stored["copied"], differing)
 
 
+@contextmanager
+def _opened(settings: Settings) -> Iterator[Database]:
+    with usable(settings), closing(connect(settings.sqlalchemy_url, connections=1)) as database:
+        yield database
+
+
 def _active_jobs(settings: Settings) -> set[str]:
     """Return the jobs that have not ended, whose objects may still change."""
-    with usable(settings):
-        database = connect(settings.sqlalchemy_url, connections=1)
-        found = {row["id"] for row in database.rows(sa.select(tables.jobs.c.id).where(tables.jobs.c.state.in_(ACTIVE)))}
-        database.close()
-    return found
+    with _opened(settings) as database:
+        return {row["id"] for row in database.rows(sa.select(tables.jobs.c.id).where(tables.jobs.c.state.in_(ACTIVE)))}
 
 
 def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str, Any]], stored: dict[str, Any] | None, *,

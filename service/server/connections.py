@@ -149,8 +149,6 @@ class GuardedConnection(H11Protocol):
         """Forget the connection."""
         self._leave()
         super().connection_lost(exc)
-        if hasattr(self.transport, "_read_ready_cb"):  # of asyncio's own loop: by it a transport refers to itself, and would wait for the
-            self.transport._read_ready_cb = lambda: None  # collector, which looks at what has lived for long every few minutes
 
     def data_received(self, data: bytes) -> None:
         """Read bytes of a request, unless the connection is to close."""

@@ -6,11 +6,7 @@ from pathlib import Path
 
 
 def take(path: Path, mode: int = 0o600) -> int | None:
-    """Lock a file, which is created if there is none; its folder must exist.
-
-    Args:
-        path: of the file, not of a link.
-        mode: permissions of a new file.
+    """Lock a file, which is created if there is none; its folder must exist, and its path must be no link.
 
     Returns:
         The descriptor, open for reading and writing; closing it releases the lock. None: another process has the lock.

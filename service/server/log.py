@@ -28,14 +28,10 @@ REFUSED = (401, 429, 503)
 
 
 def configure(level: str, form: str) -> None:
-    """Log to standard error, the warnings of libraries too.
+    """Log to standard error, from a level on and as json or text, the warnings of libraries too.
 
     One of pydantic is left out: FastAPI gives a body its parameter's name as an alias, and leaves the warning out itself only where the
     schema is built at once, not at the first request.
-
-    Args:
-        level: debug, info, warning or error.
-        form: json or text.
     """
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,

@@ -1,17 +1,20 @@
-"""What the processes of the service have in common: their signals, and how they begin."""
+"""Signals and the start of the processes of the service; and a worker alone, without the API."""
 
 import os
 import signal
 import time
 from queue import SimpleQueue
 
-from service.server import log
+from service.server import devices, log, telemetry
+from service.server.database.engine import Database, open_database
+from service.server.database.schema import is_current
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
-from service.server.permissions import keep_private
 from service.server.settings import Settings, unknown_variables
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
+PRIVATE = 0o027
+"""Bits that new files and folders do not have: others read neither captures nor the database, and the group writes nothing."""
 SAME_S = 1.0
 """Seconds within which signals count as one: terminals, `timeout` and supervisors signal a process and its group."""
 
@@ -38,10 +41,32 @@ def hear_signals(supervisors: list[Supervisor]) -> "SimpleQueue[int]":
 
 def configure(settings: Settings) -> None:
     """Set up the permissions of files and the log, and warn of settings that seem mistaken."""
-    keep_private()
+    os.umask(os.umask(PRIVATE) | PRIVATE)  # a stricter mask stays
     log.configure(settings.log_level, settings.log_format)
     for name, near in unknown_variables(os.environ).items():
         logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))
     for root in (*settings.roots, *(root.folder for root in settings.project_roots)):
         if not root.is_dir():
             logger.warning("a root is no folder", root=str(root))
+
+
+def work(settings: Settings, device: str | None) -> None:
+    """Run one worker, as a machine beside that of the API does; it is started again when it dies, until SIGTERM or SIGINT."""
+    supervisors: list[Supervisor] = []
+    asked = hear_signals(supervisors)
+    configure(settings)
+    open_database(settings, _prepare).close()
+    telemetry.close(telemetry.provider(settings))  # so that a missing extra is reported here, and not by every worker
+    supervisors.append(Supervisor(settings, [devices.resolve(device)]))
+    supervisors[0].start()
+    asked.get()
+    supervisors[0].stop()
+
+
+def _prepare(settings: Settings, database: Database) -> None:
+    """Make or upgrade the tables where that is to do; the worker looks at those of the queue, whose library this process need not load."""
+    settings.data.mkdir(parents=True, exist_ok=True)
+    if not is_current(database):
+        from service.server.jobs.queue import prepare
+
+        prepare(settings, database)

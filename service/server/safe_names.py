@@ -32,10 +32,7 @@ class NameFault(RequestError):
 
 
 def check_path(path: str) -> None:
-    """Refuse a path that is not safe on every system.
-
-    Args:
-        path: within a capture, with / between folders.
+    """Refuse a path within a capture, with / between folders, that is not safe on every system.
 
     Raises:
         NameFault: the path is not safe.

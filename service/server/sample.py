@@ -39,8 +39,7 @@ def show_sample(address: str, database: Database, queue: JobQueue, storage: Stor
     """Register the sample and its environment, add results that were made of it, and print what to try.
 
     Args:
-        address: of the service.
-        database, queue, storage: of the service.
+        address, database, queue, storage: of the service.
         sample: folder of the capture, with environment.exr.
         made: results, which are added unless the service has some already; None: nothing is added.
     """

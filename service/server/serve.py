@@ -21,13 +21,10 @@ from service.server import devices, telemetry
 from service.server.api.app import create_app
 from service.server.connections import AT_ONCE, BACKLOG, ConnectionLimits, Connections, GuardedConnection, limits_of, raise_descriptors
 from service.server.database.engine import Database, open_database
-from service.server.garbage import collect_seldom
 from service.server.housekeeping import Housekeeper
-from service.server.interned import enlarge_interned
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
-from service.server.malloc import keep_freed_blocks, share_one_arena
 from service.server.processes import configure, hear_signals
 from service.server.settings import Settings
 from service.server.storage.folder import Storage
@@ -53,8 +50,6 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     """
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
-    share_one_arena()
-    keep_freed_blocks()
     configure(settings)
     limits = limits_of(settings, raise_descriptors())
     listening = _listen(settings)
@@ -88,14 +83,11 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     housekeeper.start()
     ending = threading.Thread(target=end, name="relit-end", daemon=True)
     ending.start()
-    collect_seldom()
-    enlarge_interned()
     try:
         server.run(sockets=[listening])
     finally:
         asked.put(0)  # if the server ended without a signal
         ending.join()
-        app.state.service.leases.close()
         database.close()
         telemetry.close(tracing)
         logger.info("service ended")

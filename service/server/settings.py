@@ -42,39 +42,15 @@ class ProjectRoot(NamedTuple):
     """A folder below which one project may register captures and environments."""
 
     project: str
-    folder: Path
-
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what PROJECT=/folder stands for."""
-        if not isinstance(given, str):
-            return given
-        project, mark, folder = given.partition("=")
-        if not mark or not folder or not re.fullmatch(PROJECT_PATTERN, project):
-            raise ValueError(f"is {given}: give PROJECT=/folder")
-        return cls(project, _absolute(Path(folder)))
+    folder: Folder
 
 
 class Grant(NamedTuple):
-    """What a token with a value of the claim may do."""
+    """The rights of a token with a value of the claim."""
 
     value: str
     project: str
     scope: Scope
-
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what VALUE=PROJECT:SCOPE stands for."""
-        if not isinstance(given, str):
-            return given
-        value, _, granted = given.rpartition("=")
-        project, _, scope = granted.partition(":")
-        if not value or not re.fullmatch(PROJECT_PATTERN, project) or scope not in list(Scope):
-            raise ValueError(f"is {given}: give VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")
-        return cls(value, project, Scope(scope))
-
-
-QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
 
 
 class ProjectQuota(NamedTuple):
@@ -84,25 +60,37 @@ class ProjectQuota(NamedTuple):
     quota: str
     limit: int
 
-    @classmethod
-    def read(cls, given: object) -> object:
-        """Return what PROJECT:QUOTA=NUMBER stands for."""
+
+QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
+
+
+def _reader(pattern: str, form: str) -> BeforeValidator:
+    """Return a validator that takes a text apart.
+
+    Args:
+        pattern: regular expression with a group for each field; <project> in it stands for the name of a project.
+        form: how the text is written, for the error.
+    """
+    whole = re.compile(pattern.replace("<project>", f"({PROJECT_PATTERN.strip('^$')})"))
+
+    def read(given: object) -> object:
         if not isinstance(given, str):
             return given
-        project, _, rest = given.partition(":")
-        quota, _, limit = rest.partition("=")
-        if not re.fullmatch(PROJECT_PATTERN, project) or quota not in QUOTAS or not re.fullmatch(r"[0-9]{1,18}", limit):
-            raise ValueError(f"is {given}: give PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")
-        return cls(project, quota, int(limit))
+        if (found := whole.fullmatch(given)) is None:
+            raise ValueError(f"is {given}: give {form}")
+        return found.groups()
+
+    return BeforeValidator(read)
 
 
-Quoted = Annotated[ProjectQuota, BeforeValidator(ProjectQuota.read)]
-Granted = Annotated[Grant, BeforeValidator(Grant.read)]
-ProjectFolder = Annotated[ProjectRoot, BeforeValidator(ProjectRoot.read)]
+Quoted = Annotated[ProjectQuota, _reader(rf"<project>:({'|'.join(QUOTAS)})=([0-9]{{1,18}})",
+                                         f"PROJECT:QUOTA=NUMBER, with a quota of {', '.join(QUOTAS)}")]
+Granted = Annotated[Grant, _reader(rf"(.+)=<project>:({'|'.join(Scope)})", f"VALUE=PROJECT:SCOPE, with a scope of {', '.join(Scope)}")]
+ProjectFolder = Annotated[ProjectRoot, _reader("<project>=(.+)", "PROJECT=/folder")]
 
 
 class Settings(BaseSettings):
-    """What an operator may choose.
+    """The settings that an operator may choose.
 
     Settings(config=FILE, name=value, …): arguments override the environment, which overrides the file.
     """
@@ -160,9 +148,9 @@ class Settings(BaseSettings):
     project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
     """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
-    """Requests of one key a second, on average, over all API processes."""
+    """Requests of one key a second, on average, in each API process; a new capture or environment counts as ten."""
     request_burst: Count = 200
-    """Requests of one key that may come at once, over all API processes."""
+    """Requests of one key that may come at once, in each API process."""
     max_connections: Count | None = None
     """Connections of clients at most; without it 8192, or as many as the open files that the system allows leave room for."""
     max_address_connections: Count | None = None
@@ -170,9 +158,9 @@ class Settings(BaseSettings):
     max_requests: Count = 256
     """Requests of one key that may be under way at one time, event streams among them, in each API process."""
     max_streams: Count = 128
-    """Event streams of one key at most, over all API processes."""
+    """Event streams of one key at most, in each API process."""
     max_project_streams: Count = 512
-    """Event streams of one project at most, over all API processes."""
+    """Event streams of one project at most, in each API process."""
     trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3
@@ -256,12 +244,12 @@ class Settings(BaseSettings):
 
     @cached_property
     def loopback(self) -> bool:
-        """Whether the API listens to this machine only."""
+        """True if the API listens to this machine only."""
         return is_loopback(self.host)
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether the database is a file in the data folder."""
+        """True if the database is a file in the data folder."""
         return self.database_url is None
 
     @property

@@ -3,7 +3,7 @@
 from typing import Any
 
 from service.requests.identifiers import UploadId
-from service.views.base import Time, View
+from service.views import Time, View
 from service.views.states import IntakeState
 
 
@@ -15,10 +15,10 @@ class IntakeView(View):
     state: IntakeState
     """receiving: takes files; checking: is being looked at; ready: jobs may use it; refused: `problem` says why."""
     registered: bool
-    """Whether it lies in a folder of the server, and was not uploaded."""
+    """True if it lies in a folder of the server, and was not uploaded."""
     problem: str | None
     facts: dict[str, Any] | None
-    """What the check found: captures, frames, resolution …"""
+    """The findings of the check: captures, frames, resolution …"""
     created_at: Time
 
 

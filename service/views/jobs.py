@@ -2,12 +2,12 @@
 
 from service.requests.identifiers import JobId
 from service.requests.jobs import AnyJob
-from service.views.base import Time, View
+from service.views import Time, View
 from service.views.states import JobState
 
 
 class ProgressView(View):
-    """How far a running job is."""
+    """The progress of a running job."""
 
     stage: str
     """ingest, normals, frames …"""
@@ -47,7 +47,7 @@ class LogEntry(View):
 
 
 class JobLog(View):
-    """What happened to a job, the oldest first; of a long log, the first thousand entries."""
+    """The events of a job, the oldest first; of a long log, the first thousand entries."""
 
     entries: list[LogEntry]
 
@@ -69,7 +69,7 @@ class ResultView(View):
     """Bytes."""
     modified_at: Time
     url: str
-    """Where it is downloaded, on this server."""
+    """Path of its download on this server."""
 
 
 class ResultPage(View):

@@ -7,17 +7,13 @@ from fastapi.telemetry import TelemetryConfig
 from opentelemetry.trace import TracerProvider
 
 from service import __version__
-from service.server.api import document, environment_files, events, intakes, jobs, middleware, operations, problems, results, tus, uploads
-from service.server.api.access import RateLimiter, RunningRequests
+from service.server.api import document, events, intakes, jobs, middleware, operations, problems, results, tus, uploads
 from service.server.api.context import Service
+from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
-from service.server.api.request_leases import RequestLeases
-from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import TokenReader
 from service.server.api.watch import MAX_STREAMS, Watcher
 from service.server.database.engine import Database
-from service.server.database.rates import Rate
-from service.server.database.streams import Limits
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
 from service.server.settings import Settings
@@ -31,8 +27,7 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     """Create the app over a prepared database.
 
     Args:
-        settings: of the service.
-        database: of the service.
+        settings, database: of the service.
         tracing: makes the spans of requests; None: there are none.
         max_streams: event streams of this process at most.
     """
@@ -43,21 +38,21 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     storage = open_storage(settings)
     app.state.service = Service(
         settings, database, JobQueue(database), storage, open_upload_parts(settings, database, storage),
-        RateLimiter(settings.requests_per_second, settings.request_burst), RunningRequests(settings.max_requests),
+        RateLimiter(settings.requests_per_second, settings.request_burst),
+        running=AtOnce(settings.max_requests, "requests of this key are under way"),
+        key_streams=AtOnce(settings.max_streams, "event streams of this key are open"),
+        project_streams=AtOnce(settings.max_project_streams, "event streams of this project are open"),
         draining=threading.Event(), closing=closing, watcher=Watcher(database, closing, most=min(max_streams, MAX_STREAMS)),
-        leases=StreamLeases(database, Limits(settings.max_project_streams, settings.max_streams)),
-        rates=RequestLeases(database, Rate(settings.requests_per_second, settings.request_burst)),
         tokens=None if settings.oidc_issuer is None else TokenReader(settings))
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)
-    for router in (intakes.captures, intakes.environments, environment_files.router, uploads.router, uploads.listings, uploads.options,
+    for router in (intakes.captures, intakes.environments, results.environments, uploads.router, uploads.listings, uploads.options,
                    jobs.router, events.router, results.router, operations.router):
         app.include_router(router)
     pages.install(app)
-    app.add_middleware(middleware.JsonBodies)
+    app.add_middleware(middleware.Bodies)
     app.add_middleware(tus.TusHeaders)
-    app.add_middleware(middleware.OneLength)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)
     return app
 

@@ -1,35 +1,39 @@
-"""What routes depend on: the service, the caller and its scope, the space that is left, and requests that may be sent twice."""
+"""Dependencies of routes: the service, the caller and its scope, and the space that is left."""
 
-import shutil
+import os
 import threading
+import time
 from collections.abc import Awaitable, Callable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
+from urllib.parse import urlsplit
 
-import sqlalchemy as sa
 from fastapi import Depends, Header, Request, Security
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.security.utils import get_authorization_scheme_param
 from starlette.concurrency import run_in_threadpool
 
+from service.requests.identifiers import KEY
 from service.requests.keys import Scope
-from service.server.api.access import RateLimiter, RunningRequests, require_local
+from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.problems import ApiError
-from service.server.api.request_leases import RequestLeases
-from service.server.api.stream_leases import StreamLeases
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
-from service.server.database import idempotency, keys, quotas
+from service.server.database import keys
 from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
-from service.server.settings import Settings
+from service.server.settings import Settings, is_loopback
 from service.server.storage.folder import Storage
 from service.server.storage.upload_parts import UploadParts
 
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)
-SPACE_RETRY_S = QUOTA_RETRY_S = 600
+SPACE_RETRY_S = 600
 FOR_WORK, FOR_UPLOAD = "new work", "this upload"
 """Purposes of space, as the sentence names them."""
+MIN_FREE_FILES = 1000
+"""Files that the file system of the data folder must have room for."""
+FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+"""Headers that proxies add to a request."""
 
 
 class Service(NamedTuple):
@@ -41,16 +45,17 @@ class Service(NamedTuple):
     storage: Storage
     parts: UploadParts
     limiter: RateLimiter
-    running: RunningRequests
+    running: AtOnce
+    """Requests of each key."""
+    key_streams: AtOnce
+    """Streams of events of each key."""
+    project_streams: AtOnce
+    """Streams of events of each project."""
     draining: threading.Event
     """Set when the service is asked to end: it still answers while its workers finish their steps, and says that it is not ready."""
     closing: threading.Event
     """Set when the workers have ended: streams of events end, and then the service."""
     watcher: Watcher
-    leases: StreamLeases
-    """Count the streams of events of each key and project."""
-    rates: RequestLeases
-    """Count the requests of each key over all API processes; `limiter` counts those of this one, also while the database is away."""
     tokens: TokenReader | None = None
     """Reads the tokens of the identity provider; None: there is none."""
 
@@ -98,12 +103,10 @@ async def authenticated(request: Request) -> Caller:
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
     if getattr(request.state, "caller", None) is None and scheme.lower() == "bearer":
         service.limiter.require(given.partition(".")[0])
-        service.rates.require(given.partition(".")[0])
     caller = await run_in_threadpool(authenticate, request)
     if not getattr(request.state, "running", False):
         service.running.enter(caller.key)
         request.state.running = True  # middleware.RequestLog ends it
-        await service.rates.take(caller.key or "")
     return caller
 
 
@@ -128,55 +131,55 @@ IdempotencyKey = Annotated[str | None, Header(
     description="Chosen by the client: the same request sent again with it creates nothing again.")]
 
 
-def created_before(service: Service, caller: Caller, token: str | None, asked: Any) -> str | None:
-    """Return what the same request has created before; None: nothing. Whether it could be created now does not matter then."""
+def require_local(request: Request) -> None:
+    """Refuse a request that a program of this machine did not send.
+
+    A page in a browser of this machine can send requests to a loopback address: under its own name, which it has made to point there (the
+    Host shows it), or from another site (the Origin shows it).
+
+    Raises:
+        ApiError: the request came through a proxy, or from a page of another site.
+    """
+    host = request.headers.get("host", "")
+    if not is_loopback(_name(host)):
+        raise ApiError("forbidden", "without a key, the Host must be localhost or a loopback address")
+    if any(name in request.headers for name in FORWARDED):
+        raise ApiError("forbidden", "without a key, requests through a proxy are refused: make keys with relit keys create")
+    origin = request.headers.get("origin")
+    if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+        raise ApiError("forbidden", "without a key, requests from pages of other sites are refused")
+
+
+def _name(host: str) -> str:
     try:
-        return None if token is None else idempotency.created_by(service.database, caller.project, token, asked)
-    except idempotency.TokenReused:
-        raise _reused(token) from None
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
 
 
-def create_once(service: Service, caller: Caller, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something once for an Idempotency-Key; the arguments are those of `idempotency.create_once`."""
-    try:
-        return idempotency.create_once(service.database, caller.project, token, asked, make)
-    except idempotency.TokenReused:
-        raise _reused(token) from None
+def require_valid(service: Service, caller: Caller) -> None:
+    """Refuse a caller whose key or token was revoked or has expired since the request began.
 
-
-def _reused(token: str | None) -> ApiError:
-    return ApiError("invalid", f"Idempotency-Key {token}: came with another request before: choose a new one")
+    Raises:
+        ApiError: it was, or has.
+    """
+    revoked = (caller.key or "").startswith(f"{KEY}_") and not keys.still_valid(service.database, [str(caller.key)])
+    if revoked or (caller.until is not None and caller.until < time.time()):
+        raise ApiError("unauthenticated", "the key was revoked or has expired", headers={"WWW-Authenticate": "Bearer"})
 
 
 def has_space(settings: Settings, length: int = 0) -> bool:
-    """Return whether `min_free_bytes` are left in the data folder after `length` more bytes."""
-    return shutil.disk_usage(settings.data).free - length >= settings.min_free_bytes
+    """Return whether the data folder has room for MIN_FREE_FILES files and, after `length` more bytes, for `min_free_bytes`."""
+    found = os.statvfs(settings.data)
+    has_files = found.f_files == 0 or found.f_favail >= MIN_FREE_FILES  # some file systems have no bound of files, and say 0
+    return has_files and found.f_bavail * found.f_frsize - length >= settings.min_free_bytes
 
 
 def require_space(service: Service, purpose: str, length: int = 0) -> None:
-    """Refuse a request for which there is no space.
-
-    Args:
-        service: of the request.
-        purpose: FOR_WORK or FOR_UPLOAD.
-        length: bytes that will be written, if that is known.
+    """Refuse a request, for `purpose` (FOR_WORK or FOR_UPLOAD), for whose `length` bytes there is no space.
 
     Raises:
         ApiError: less than `min_free_bytes` would be left.
     """
     if not has_space(service.settings, length):
         raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(SPACE_RETRY_S)})
-
-
-def require_quota(service: Service, connection: sa.Connection, quota: str, project: str, more: int) -> None:
-    """Refuse, and so roll back the transaction, if a project would have more than it may; the arguments are those of `quotas.require`.
-
-    Raises:
-        ApiError: the quota is exceeded: too-large for bytes, else too-many.
-    """
-    try:
-        quotas.require(connection, service.settings, quota, project, more)
-    except quotas.QuotaExceeded as error:
-        if quota == quotas.BYTES:
-            raise ApiError("too-large", str(error)) from None
-        raise ApiError("too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)}) from None

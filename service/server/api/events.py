@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import AsyncIterator
+from contextlib import ExitStack
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Response
@@ -10,10 +11,9 @@ from starlette.types import Receive, Scope, Send
 
 from service.server.api.context import Reader, Service, ServiceDep
 from service.server.api.jobs import get_job
-from service.server.api.problems import ApiError, responses
+from service.server.api.problems import responses
 from service.server.api.watch import Change, Listener
 from service.server.database.keys import Caller
-from service.server.database.streams import Holder
 from service.views.jobs import JobView
 from service.views.states import ENDED
 
@@ -48,28 +48,27 @@ async def stream_jobs(service: ServiceDep, caller: Reader) -> Response:
 
 
 async def _stream(service: Service, caller: Caller, topic: str, *, after: int, to_its_end: bool) -> "_Stream":
-    holder = await service.leases.take(caller)
-    try:
+    with ExitStack() as held:
+        for streams, holder in ((service.key_streams, caller.key), (service.project_streams, caller.project)):
+            streams.enter(holder)
+            held.callback(streams.leave, holder)
         listener = service.watcher.listen(topic, after=after, caller=caller)
-    except ApiError:
-        service.leases.release(holder)
-        raise
-    return _Stream(service, holder, listener, to_its_end=to_its_end)
+        held.callback(service.watcher.remove, listener)
+        return _Stream(listener, held.pop_all(), to_its_end=to_its_end)
 
 
 class _Stream(EventSourceResponse):
     """The events of a listener, which is removed when the answer ends, also if it never began."""
 
-    def __init__(self, service: Service, holder: Holder, listener: Listener, *, to_its_end: bool) -> None:
-        self._service, self._holder, self._listener = service, holder, listener
+    def __init__(self, listener: Listener, held: ExitStack, *, to_its_end: bool) -> None:
+        self._held = held
         super().__init__(_events(listener, to_its_end=to_its_end), headers=HEADERS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            self._service.watcher.remove(self._listener)
-            self._service.leases.release(self._holder)
+            self._held.close()
 
 
 async def _events(listener: Listener, *, to_its_end: bool) -> AsyncIterator[bytes]:

@@ -11,22 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
-from service.server.api.context import (
-    FOR_WORK,
-    IdempotencyKey,
-    Reader,
-    Service,
-    ServiceDep,
-    Writer,
-    create_once,
-    require_quota,
-    require_space,
-)
+from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
+from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
-from service.server.database import audit, intakes, jobs, quotas, uploads
+from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.safe_names import shown
 from service.server.storage import layout
@@ -159,11 +150,12 @@ def _registered(service: Service, caller: Caller, field: str, given: str) -> Pat
 
 def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
             response: Response) -> IntakeView:
+    service.limiter.take(caller.key, CREATION_COST - 1)  # as a request it has taken one token already
     require_space(service, FOR_WORK)
 
     def make(connection: sa.Connection) -> str:
         identifier = new_id(prefix)
-        require_quota(service, connection, quotas.CAPTURES, caller.project, 1)
+        quotas.require(connection, service.settings, quotas.CAPTURES, caller.project, 1)
         intakes.insert(connection, identifier=identifier, project=caller.project, kind=prefix, name=name,
                        folder=None if folder is None else str(folder))
         if folder is not None:
@@ -171,7 +163,8 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Pa
         audit.record(connection, caller, "intake.create" if folder is None else "intake.register", identifier)
         return identifier
 
-    identifier, _ = create_once(service, caller, token, [prefix, name, None if folder is None else str(folder)], make)
+    asked = [prefix, name, None if folder is None else str(folder)]
+    identifier, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
     return intake_view(row_of(service, caller, identifier))
 

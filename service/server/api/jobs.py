@@ -13,23 +13,12 @@ from pydantic_core import CoreSchema, core_schema
 from service.requests.identifiers import JobId
 from service.requests.job import JobRequest
 from service.requests.jobs import CheckJob, UserJob
-from service.server.api.context import (
-    FOR_WORK,
-    IdempotencyKey,
-    Reader,
-    Service,
-    ServiceDep,
-    Writer,
-    create_once,
-    created_before,
-    require_quota,
-    require_space,
-)
+from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view, log_view
-from service.server.database import audit, job_log, jobs, quotas
+from service.server.database import audit, idempotency, job_log, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from service.views import states
@@ -85,12 +74,13 @@ class Priority(BaseModel):
 def create_job(service: ServiceDep, caller: Writer, response: Response, request: Asked, token: IdempotencyKey = None) -> JobView:
     """Queue a job. Its Location gives its state, /events streams its changes, /results lists its files."""
     asked = ["job", request.model_dump(mode="json", by_alias=True)]
-    job = created_before(service, caller, token, asked)
+    job = idempotency.created_by(service.database, caller.project, token, asked)
     if job is None:
         require_space(service, FOR_WORK)
         inputs = inputs_of(service, caller.project, request)
         spelled = spelled_out(service, caller.project, request)
-        job, _ = create_once(service, caller, token, asked, lambda connection: submit(service, caller, spelled, connection, inputs))
+        job, _ = idempotency.create_once(service.database, caller.project, token, asked,
+                                         lambda connection: submit(service, caller, spelled, connection, inputs))
     response.headers["Location"] = f"/v1/jobs/{job}"
     return view(service, caller, job)
 
@@ -211,7 +201,7 @@ def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
         if attempt is not None:
             service.queue.enqueue(connection, job, attempt, request, before.priority, caller.project)
             require_queue(service, caller, connection)
-            require_quota(service, connection, quotas.JOBS, caller.project, 0)
+            quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)
             audit.record(connection, caller, "job.again", job)
         return attempt is not None
 

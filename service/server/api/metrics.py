@@ -2,9 +2,11 @@
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Iterator
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info, disable_created_metrics, generate_latest
+from prometheus_client import CollectorRegistry, Gauge, Histogram, Info, disable_created_metrics, generate_latest
+from prometheus_client import Counter as CounterMetric
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.gc_collector import GCCollector
@@ -36,11 +38,11 @@ class Metrics:
         GCCollector(registry=self._registry)
         Info("relit", "The program.", registry=self._registry).info({"version": __version__})
         self.running = Gauge("relit_http_requests_running", "Requests that have not been answered whole.", registry=self._registry)
-        self._requests = Counter("relit_http_requests", "Requests.", ("method", "route", "status"), registry=self._registry)
+        self._requests = CounterMetric("relit_http_requests", "Requests.", ("method", "route", "status"), registry=self._registry)
         self._waits = Histogram("relit_http_wait_seconds", "From a request to the beginning of its answer.", ("method", "route"),
                                 registry=self._registry)
-        self._received = Counter("relit_http_received_bytes", "Bytes of bodies that came, uploads above all.", ("route",),
-                                 registry=self._registry)
+        self._received = CounterMetric("relit_http_received_bytes", "Bytes of bodies that came, uploads above all.", ("route",),
+                                       registry=self._registry)
         self._registry.register(_DatabaseMetrics(settings, database))
 
     def count(self, scope: Scope, status: int, waited_s: float, received: int) -> None:
@@ -86,10 +88,6 @@ class _DatabaseMetrics(Collector):
                                 value=0.0 if oldest is None else max(0.0, time.time() - oldest))
         yield GaugeMetricFamily("relit_job_frames", "Frames that jobs which are kept have made.", value=frames)
         seen = GaugeMetricFamily("relit_workers", "Workers that were seen lately.", labels=("device", "state"))
-        devices: dict[tuple[str, str], int] = {}
-        for worker in present:
-            place = worker["device"], worker["state"]
-            devices[place] = devices.get(place, 0) + 1
-        for place, count in devices.items():
+        for place, count in Counter((worker["device"], worker["state"]) for worker in present).items():
             seen.add_metric(place, count)
         yield seen

@@ -73,25 +73,11 @@ class RequestLog:
                 **({} if caller is None else {"project": caller.project, "key": caller.key}))
 
 
-class OneLength:
-    """Refuses a request that says twice how long its body is: a proxy before the service may believe the other header (RFC 9112, 6.3)."""
+class Bodies:
+    """Refuses bodies that say twice how long they are and, except those of uploads, bodies that are not JSON or larger than MAX_BYTES.
 
-    def __init__(self, app: ASGIApp) -> None:
-        """Args: app: the next application."""
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse the request and close its connection, or pass it on."""
-        names = [name for name, _ in scope["headers"]] if scope["type"] == "http" else []
-        if b"transfer-encoding" in names and b"content-length" in names:
-            await answer(Request(scope), "bad-request", "the request has both Content-Length and Transfer-Encoding: send one of them",
-                         headers={"Connection": "close"})(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
-
-
-class JsonBodies:
-    """Refuses bodies that are not JSON or larger than MAX_BYTES, except those of uploads."""
+    A proxy before the service may believe the other header (RFC 9112, 6.3).
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         """Args: app: the next application."""
@@ -99,10 +85,14 @@ class JsonBodies:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a body before it is in memory; a body without a length, as soon as it is too large."""
+        headers = dict(scope["headers"]) if scope["type"] == "http" else {}
+        if b"transfer-encoding" in headers and b"content-length" in headers:
+            await answer(Request(scope), "bad-request", "the request has both Content-Length and Transfer-Encoding: send one of them",
+                         headers={"Connection": "close"})(scope, receive, send)
+            return
         if scope["type"] != "http" or scope["path"].startswith(UPLOADS):
             await self._app(scope, receive, send)
             return
-        headers = dict(scope["headers"])
         length = headers.get(b"content-length", b"0")
         if int(length) > MAX_BYTES:  # the server has refused a length that is not a number
             await answer(Request(scope), "too-large", TOO_LARGE)(scope, receive, send)

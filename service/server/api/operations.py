@@ -9,8 +9,7 @@ from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
 from service.requests.keys import Scope
-from service.server.api.access import require_local
-from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space
+from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space, require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import workers
@@ -59,7 +58,7 @@ def _faults(service: Service) -> list[str]:
     except StorageError:
         found.append("the storage cannot be written")
     if not has_space(service.settings):
-        found.append("there is less space left than min_free_bytes")
+        found.append("there is less space left than min_free_bytes, or no room for further files")
     return found
 
 

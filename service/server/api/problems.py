@@ -14,13 +14,14 @@ from starlette.exceptions import HTTPException
 
 from service.errors import RequestError, sentence
 from service.server.database.engine import UNANSWERED, message_of
+from service.server.database.quotas import BYTES, QuotaExceeded
 from service.server.log import logger
 from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"
 CHECKSUM_MISMATCH = 460
 """Status of a wrong checksum in the tus protocol."""
-RETRY_S = 5
+RETRY_S, QUOTA_RETRY_S = 5, 600
 MAX_TEXT, MAX_FAULTS = 2000, 20
 """Characters of a sentence and number of invalid values that an answer repeats at most."""
 
@@ -113,6 +114,12 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(RequestError)
     async def unasked(request: Request, error: RequestError) -> JSONResponse:
         return answer(request, "invalid", sentence(error))
+
+    @app.exception_handler(QuotaExceeded)
+    async def beyond_quota(request: Request, error: QuotaExceeded) -> JSONResponse:
+        if error.quota == BYTES:
+            return answer(request, "too-large", str(error))
+        return answer(request, "too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)})
 
     @app.exception_handler(HTTPException)
     async def routed(request: Request, error: HTTPException) -> JSONResponse:

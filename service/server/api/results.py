@@ -1,4 +1,4 @@
-"""Routes of results: the list of a job's files, and downloads, whole or in part (RFC 9110: ETag, preconditions, ranges).
+"""Routes of results, and downloads of them and of environments, whole or in part (RFC 9110: ETag, preconditions, one range).
 
 A file is opened once, so that its ETag, its size and its bytes are those of one file, whatever replaces it meanwhile. Starlette's
 FileResponse does not keep that: it opens the path again to send it, and takes a Last-Modified of the same second for the same file. It
@@ -6,8 +6,11 @@ also has no preconditions, answers an unreadable Range with 400 instead of the f
 """
 
 import os
-from collections.abc import AsyncIterator, Iterator, Sequence
+import re
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack
 from email.utils import formatdate
+from pathlib import Path as FilePath
 from pathlib import PurePosixPath
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -16,16 +19,21 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from service.requests.identifiers import EnvironmentId
 from service.server.api.context import Reader, ServiceDep
+from service.server.api.intakes import row_of
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
-from service.server.api.ranges import Span, asked_for, content_range, multipart, names
 from service.server.api.views import result_view
 from service.server.safe_names import NameFault, check_path
 from service.server.storage import layout
 from service.views.jobs import ResultPage
+from service.views.states import READY
+from stage import inputs
+from stage.errors import StageError
 
 router = APIRouter(prefix="/v1/jobs/{job}/results", tags=["results"], responses=responses(401, 403, 404, 422, 429, 503))
+environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 404, 409, 422, 429, 503))
 
 MAX_PAGE = 1000
 PIECE_BYTES = 1 << 20
@@ -37,11 +45,14 @@ CONTENT: dict[str, Any] = {kind: {"schema": {} if kind == "application/json" els
                            for kind in (*sorted(MEDIA_TYPES.values()), BYTES)}
 DOWNLOAD: dict[int | str, dict[str, Any]] = {
     200: {"description": "The file.", "content": CONTENT},
-    206: {"description": "The part, or the parts, that Range names.", "content": CONTENT | {
-        "multipart/byteranges": {"schema": {"type": "string", "format": "binary"}}}},
+    206: {"description": "The part that Range names.", "content": CONTENT},
     304: {"description": "If-None-Match names the file as it is."},
     **responses(412, 416),
 }
+TAG = re.compile(r'(W/)?("[\x21\x23-\x7e\x80-\xff]*")')
+RANGE = re.compile(r"\s*bytes\s*=\s*(?:([0-9]{1,18})-([0-9]{0,18})|-([0-9]{1,18}))\s*", re.IGNORECASE)
+Wanted = Annotated[str | None, Header(alias="Range", description="bytes=0-99; for several ranges at once the whole file is sent.")]
+IfRange = Annotated[str | None, Header(description="The entity tag that Range is meant for.")]
 Name = Annotated[str, Path(description="As the listing has it.", examples=["maps.exr"])]
 Tags = Annotated[str | None, Header(description="Entity tags, or *.")]
 
@@ -79,6 +90,41 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
         os.close(file.descriptor)
 
 
+def opened_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> Iterator[Opened]:
+    """Open the image of an environment until the answer has been sent.
+
+    Raises:
+        ApiError: the project has no such environment, it is not ready, or its file is not there any more.
+    """
+    row = row_of(service, caller, environment)
+    if row["state"] != READY:
+        raise ApiError("conflict", f"{environment} is {row['state']}, not ready")
+    gone = ApiError("not-found", f"the file of {environment} is not there any more")
+    with ExitStack() as held:
+        if row["folder"] is None:
+            prefix = layout.intake(caller.project, environment)
+            found = [service.storage.open(prefix, file.name) for file in service.storage.files(prefix)]
+            if len(found) != 1 or found[0] is None:
+                raise gone
+            path = found[0]
+        else:
+            path = FilePath(row["folder"])
+            root = next((root for root in service.settings.roots_of(caller.project) if path.is_relative_to(root)), None)
+            if root is None:
+                raise gone
+            try:
+                held.enter_context(inputs.confined(path.parent, root))
+            except StageError:
+                raise gone from None
+        try:
+            file = held.enter_context(inputs.opened(path)).file
+        except StageError:
+            raise gone from None
+        status = os.fstat(file.fileno())
+        etag = f'"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}"'
+        yield Opened(path.name, file.fileno(), status.st_size, etag, status.st_mtime)
+
+
 @router.get("", summary="List the results of a job")
 def list_results(service: ServiceDep, caller: Reader, job: JobName,
                  limit: Annotated[int, Query(ge=1, le=MAX_PAGE)] = MAX_PAGE,
@@ -92,25 +138,17 @@ def list_results(service: ServiceDep, caller: Reader, job: JobName,
 
 @router.get("/{name:path}", responses=DOWNLOAD, response_class=Response, summary="Download a result")
 async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
-                          wanted: Annotated[str | None, Header(alias="Range", description="bytes=0-99, for one, or several.")] = None,
-                          if_range: Annotated[str | None, Header(description="The entity tag that Range is meant for.")] = None,
-                          ) -> Response:
-    """Send a file, or parts of it. Under one ETag a file never changes, so that an interrupted download can be continued."""
+                          wanted: Wanted = None, if_range: IfRange = None) -> Response:
+    """Send a file, or a part of it. Under one ETag a file never changes, so that an interrupted download can be continued."""
     headers = _headers(file)
     if _unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
-    media_type = _media_type(file)
-    spans = asked_for(wanted, file.size) if if_range is None or if_range == file.etag else None
-    if spans is None:
-        return _answer(file, 200, [Span(0, file.size)], file.size, media_type, headers)
-    if not spans:
-        raise ApiError("range-not-satisfiable", f"{file.name} has {file.size} bytes, and {wanted} asks for none of them",
-                       headers={"Content-Range": f"bytes */{file.size}"})
-    if len(spans) > 1:
-        parts = multipart(spans, file.size, media_type)
-        return _answer(file, 206, parts.pieces, parts.length, parts.media_type, headers)
-    span, = spans
-    return _answer(file, 206, [span], span.stop - span.start, media_type, headers | {"Content-Range": content_range(span, file.size)})
+    part = _part(wanted or "", file) if if_range is None or if_range == file.etag else None
+    if part is not None:
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{file.size}"
+    sent = range(file.size) if part is None else part
+    return StreamingResponse(_body(file.descriptor, sent), 200 if part is None else 206, headers | {"Content-Length": str(len(sent))},
+                             _media_type(file))
 
 
 @router.head("/{name:path}", responses={200: DOWNLOAD[200], 304: DOWNLOAD[304], 412: DOWNLOAD[412]}, response_class=Response,
@@ -123,10 +161,44 @@ async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags =
     return Response(headers=headers | {"Content-Length": str(file.size)}, media_type=_media_type(file))
 
 
+@environments.get("/{environment}/file", responses=DOWNLOAD, response_class=Response, summary="Download the image of an environment")
+async def download_environment(file: Annotated[Opened, Depends(opened_environment)], if_match: Tags = None, if_none_match: Tags = None,
+                               wanted: Wanted = None, if_range: IfRange = None) -> Response:
+    """Send the image of an environment that is ready, or a part of it."""
+    return await download_result(file, if_match, if_none_match, wanted, if_range)
+
+
 def _unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:
-    if if_match is not None and not names(if_match, file.etag, strong=True):
+    if if_match is not None and not _names(if_match, file.etag, strong=True):
         raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {file.etag}", headers={"ETag": file.etag})
-    return if_none_match is not None and names(if_none_match, file.etag, strong=False)
+    return if_none_match is not None and _names(if_none_match, file.etag, strong=False)
+
+
+def _names(header: str, etag: str, *, strong: bool) -> bool:
+    """Return whether a list of entity tags contains `etag` or is *; with `strong`, weak tags do not count (RFC 9110, 13.1)."""
+    return header.strip() == "*" or any(tag == etag and not (weak and strong) for weak, tag in TAG.findall(header))
+
+
+def _part(header: str, file: Opened) -> range | None:
+    """Return the bytes of a file that a Range header names, or None where it is not read.
+
+    A server may ignore the header (RFC 9110, 14.2). This one does so where it is malformed, and where it names several ranges.
+
+    Raises:
+        ApiError: the range lies outside the file.
+    """
+    found = RANGE.fullmatch(header)
+    if found is None:
+        return None
+    first, last, suffix = found.groups()
+    if last and int(last) < int(first):
+        return None
+    part = range(max(0, file.size - int(suffix)), file.size) if suffix else range(
+        int(first), min(file.size, int(last) + 1 if last else file.size))
+    if not part:
+        raise ApiError("range-not-satisfiable", f"{file.name} has {file.size} bytes, and {header} asks for none of them",
+                       headers={"Content-Range": f"bytes */{file.size}"})
+    return part
 
 
 def _headers(file: Opened) -> dict[str, str]:
@@ -140,20 +212,11 @@ def _media_type(file: Opened) -> str:
     return MEDIA_TYPES.get(PurePosixPath(file.name).suffix.lower(), BYTES)
 
 
-def _answer(file: Opened, status: int, pieces: Sequence[bytes | Span], length: int, media_type: str,
-            headers: dict[str, str]) -> StreamingResponse:
-    return StreamingResponse(_body(file.descriptor, pieces), status, headers | {"Content-Length": str(length)}, media_type)
-
-
-async def _body(descriptor: int, pieces: Sequence[bytes | Span]) -> AsyncIterator[bytes]:
-    for piece in pieces:
-        if isinstance(piece, bytes):
-            yield piece
-            continue
-        at = piece.start
-        while at < piece.stop:
-            read = await anyio.to_thread.run_sync(os.pread, descriptor, min(PIECE_BYTES, piece.stop - at), at)
-            if not read:
-                raise OSError("a result became shorter while it was sent")
-            at += len(read)
-            yield read
+async def _body(descriptor: int, part: range) -> AsyncIterator[bytes]:
+    at = part.start
+    while at < part.stop:
+        read = await anyio.to_thread.run_sync(os.pread, descriptor, min(PIECE_BYTES, part.stop - at), at)
+        if not read:
+            raise OSError("a result became shorter while it was sent")
+        at += len(read)
+        yield read

@@ -1,4 +1,4 @@
-"""Whether a job can be submitted: its captures and environments are ready, and it keeps within the limits."""
+"""Submission of jobs: the captures and environments must be ready, and the job within the limits."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ from service.requests.jobs import (
 )
 from service.requests.relight import RelightOptions
 from service.server import telemetry
-from service.server.api.context import Service, require_quota
+from service.server.api.context import Service
 from service.server.api.problems import ApiError
 from service.server.database import audit, intakes, jobs, quotas
 from service.server.database.keys import Caller
@@ -48,8 +48,8 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
                               chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
     require_queue(service, caller, connection)
     if not isinstance(request, CheckJob):  # of which there is one for each capture
-        require_quota(service, connection, quotas.JOBS, caller.project, 0)  # it is counted already
-        require_quota(service, connection, quotas.BYTES, caller.project, 0)
+        quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)  # it is counted already
+        quotas.require(connection, service.settings, quotas.BYTES, caller.project, 0)
     audit.record(connection, caller, "job.submit", job)
     return job
 

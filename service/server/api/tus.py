@@ -94,13 +94,13 @@ class Metadata(NamedTuple):
 
 
 def metadata_header(row: Row) -> str:
-    """Upload-Metadata of an upload, as it was given."""
+    """Return the Upload-Metadata of an upload, as it was given."""
     words = {key: row[key] for key in METADATA_KEYS if row[key] is not None}
     return ",".join(f"{key} {b64encode(word.encode()).decode()}" for key, word in words.items())
 
 
 def state_headers(row: Row, received: int, upload_hours: float) -> dict[str, str]:
-    """How far an upload is, and how long it is kept as it is."""
+    """Return the headers that say how far an upload is, and how long it is kept as it is."""
     headers = {"Upload-Offset": str(received), "Cache-Control": "no-store"}
     if not row["done"]:
         headers["Upload-Expires"] = formatdate(expires_at(row, upload_hours), usegmt=True)

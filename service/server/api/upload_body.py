@@ -1,9 +1,6 @@
 """The body of a PATCH on its way to the part file: in bounded memory, and written while more of it arrives."""
 
 import asyncio
-import hashlib
-import threading
-from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -22,8 +19,6 @@ SAVE_EVERY = 64 << 20
 """Bytes after which the flushed offset is also recorded."""
 IDLE_S = 60.0
 """Seconds without a byte after which the client counts as gone; until then the part file is locked, and it cannot continue."""
-KEPT = 1024
-"""Number of uploads whose running hash is kept for their next PATCH."""
 
 savers = ThreadPoolExecutor(4, thread_name_prefix="relit-save")
 """Threads that flush, beside those that write."""
@@ -134,27 +129,3 @@ async def write_body(stream: AsyncIterator[bytes], writer: PartFileWriter) -> No
             await writing
         if block:
             await writer.take(block)
-
-
-class RunningHashes:
-    """The running SHA-256 of each upload, so that a complete file need not be read again; a restart of the process loses them."""
-
-    def __init__(self) -> None:
-        """Create an empty collection."""
-        self._kept: OrderedDict[str, tuple[int, Any]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def take(self, upload: str, start: int) -> Any | None:
-        """Return the hash of the first `start` bytes, to be updated with the next ones; None: it is not known."""
-        with self._lock:
-            at, digest = self._kept.pop(upload, (None, None))
-        if start == 0:
-            return hashlib.sha256()
-        return digest if at == start else None
-
-    def keep(self, upload: str, at: int, digest: Any) -> None:
-        """Keep the hash of the first `at` bytes for the next PATCH."""
-        with self._lock:
-            self._kept[upload] = (at, digest)
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)

@@ -5,11 +5,12 @@ import hashlib
 import hmac
 import time
 
-from service.server.api.context import FOR_UPLOAD, Service, require_space
+from service.server.api.context import FOR_UPLOAD, Service, require_space, require_valid
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
-from service.server.api.upload_body import PartFileWriter, RunningHashes
+from service.server.api.upload_body import PartFileWriter
 from service.server.database import intakes, uploads
+from service.server.database.keys import Caller
 from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.safe_names import shown
@@ -29,17 +30,17 @@ class UploadPatch:
     The methods wait for the disk or the database: call them from a thread.
     """
 
-    def __init__(self, service: Service, hashes: RunningHashes, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
+    def __init__(self, service: Service, caller: Caller, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
         """Create the patch; `begin` locks the part file.
 
         Args:
-            service: of the request.
-            hashes: of the uploads that are not complete.
+            service, caller: of the request.
             upload: row of the upload, which is read again under the lock.
             offset: from which the client continues.
             checksum: of the body; None: the client gave none.
         """
-        self._service, self._hashes, self._row, self._offset, self._checksum = service, hashes, upload, offset, checksum
+        self._service, self._caller = service, caller
+        self._row, self._offset, self._checksum = upload, offset, checksum
         self._part: PartFile | None = None
         self._digest = None if checksum is None else hashlib.new(checksum.algorithm)
         self._saved = 0
@@ -64,13 +65,12 @@ class UploadPatch:
         if not row["done"]:
             require_space(self._service, FOR_UPLOAD)
             self._part.cut(start)
-        # another process may have added other bytes since this one kept a hash of what were then the first
-        known = row["sha256"] is not None and not row["done"] and (start == 0 or self._service.parts.saves_while_writing)
-        self._whole = self._hashes.take(row["id"], start) if known else None
+        # a file that comes in one request is hashed meanwhile, one that comes in several is read when it is complete
+        self._whole = hashlib.sha256() if row["sha256"] is not None and not row["done"] and start == 0 else None
         digests = [digest for digest in (self._digest, self._whole) if digest is not None]
         self.writer = PartFileWriter(self._part, start, row["length"], digests=digests,
                              save=self._save if self._checksum is None and self._service.parts.saves_while_writing else None,
-                             guard=lambda: require_space(self._service, FOR_UPLOAD))
+                             guard=self._guard)
 
     def end(self, broken: str | None) -> Row:
         """Verify and count the bytes that came.
@@ -82,12 +82,17 @@ class UploadPatch:
             The row of the upload as it is now.
 
         Raises:
-            ApiError: a checksum is wrong, or the body did not come to its end.
+            ApiError: a checksum is wrong, the body did not come to its end, or the key was revoked meanwhile.
         """
         assert self._part is not None
         if self._row["done"]:
             return self._row
         self.writer.settle()
+        try:
+            require_valid(self._service, self._caller)
+        except ApiError:
+            self.give_up()
+            raise
         if self._checksum is not None and self._digest is not None:
             right = hmac.compare_digest(self._digest.digest(), self._checksum.digest)
             if broken is not None or not right:
@@ -98,8 +103,6 @@ class UploadPatch:
         if self.writer.at == self._row["length"]:
             self._complete()
         else:
-            if self._whole is not None:
-                self._hashes.keep(self._row["id"], self.writer.at, self._whole)
             self._save(self.writer.at)
             if broken is not None:
                 raise ApiError("bad-request", broken)
@@ -118,7 +121,10 @@ class UploadPatch:
         if self._part is not None:
             self._part.close()
             being_written.discard(self._row["id"])
-        vars(self).pop("writer", None)  # it refers to this patch by `_save`: both would wait for the garbage collector
+
+    def _guard(self) -> None:
+        require_space(self._service, FOR_UPLOAD)
+        require_valid(self._service, self._caller)
 
     def _save(self, at: int) -> None:
         self._saved = at
@@ -167,12 +173,7 @@ def _locked(row: Row) -> ApiError:
 
 
 def safe_offset(row: Row, there: int) -> int:
-    """Return the number of bytes of an upload that the client need not send again.
-
-    Args:
-        row: of the upload, settled.
-        there: size of its part file, which is smaller than what was counted if somebody has removed it.
-    """
+    """Return the bytes of an upload that the client need not send again: none, if its part file, of `there` bytes, lacks some."""
     received = int(row["received"])
     return received if row["done"] or there >= received else 0
 

@@ -9,17 +9,7 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.server.api.context import (
-    FOR_UPLOAD,
-    IdempotencyKey,
-    Reader,
-    Service,
-    ServiceDep,
-    Writer,
-    create_once,
-    require_quota,
-    require_space,
-)
+from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
 from service.server.api.tus import (
@@ -36,7 +26,7 @@ from service.server.api.tus import (
     metadata_header,
     state_headers,
 )
-from service.server.api.upload_body import BodyBroken, RunningHashes, TooLong, write_body
+from service.server.api.upload_body import BodyBroken, TooLong, write_body
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
 from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
@@ -49,7 +39,6 @@ from service.views.intakes import FilePage, FileView
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
 options = APIRouter(prefix="/v1", tags=["uploads"])
-hashes = RunningHashes()
 BREAK_S, LOOK_S = 2.0, 0.02
 """Seconds for which HEAD waits for a PATCH to end, and between two looks: a client may ask before its broken connection is noticed here."""
 
@@ -121,7 +110,7 @@ async def patch_upload(
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = UploadPatch(service, hashes, row, offset=offset, checksum=expected)
+    patch = UploadPatch(service, caller, row, offset=offset, checksum=expected)
     try:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
@@ -200,7 +189,7 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         elif before is not None:
             raise ApiError("conflict", f"path {shown(given.path)}: is being uploaded as {before['id']}: go on with it, or delete it")
         _require_room(service, connection, intake)
-        require_quota(service, connection, quotas.BYTES, caller.project, length)
+        quotas.require(connection, service.settings, quotas.BYTES, caller.project, length)
         identifier = new_id(UPLOAD)
         try:
             uploads.insert(connection, identifier=identifier, project=caller.project, intake=intake, path=given.path, length=length,
@@ -211,16 +200,16 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
         return identifier
 
     asked = ["upload", intake, given.path, length, given.sha256]
-    upload, _ = create_once(service, caller, token, asked, make)
+    upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
     row = uploads.find(service.database, upload, caller.project)
     if token is not None and (row is None or _expired(service, row)):  # or deleted or replaced since: the same request makes another
         service.database.transact(partial(idempotency.forget_token, project=caller.project, token=token, gone=upload))
-        upload, _ = create_once(service, caller, token, asked, make)
+        upload, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
         row = uploads.find(service.database, upload, caller.project)
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
     if length == 0 and not row["done"]:
-        return _answer(service, _complete_empty(service, row), response)
+        return _answer(service, _complete_empty(service, caller, row), response)
     return _answer(service, row, response)
 
 
@@ -236,8 +225,8 @@ def _answer(service: Service, row: Row, response: Response) -> FileView:
     return view
 
 
-def _complete_empty(service: Service, row: Row) -> Row:
-    patch = UploadPatch(service, hashes, row, offset=0, checksum=None)
+def _complete_empty(service: Service, caller: Caller, row: Row) -> Row:
+    patch = UploadPatch(service, caller, row, offset=0, checksum=None)
     try:
         patch.begin()
         return patch.end(None)

@@ -1,11 +1,9 @@
 """Locks under which a transaction counts what there is before it adds to it, whichever API process runs it."""
 
-import time
-
 import sqlalchemy as sa
 
-PROJECT, STREAMS, RATES = 11, 12, 13
-"""Kinds of locks: of what a project has, and of the tables of event streams and request rates."""
+PROJECT = 11
+"""The kind of the lock of what a project has."""
 
 
 def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
@@ -26,10 +24,3 @@ def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
     assert driver is not None, "the connection is open"
     if not driver.in_transaction:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-
-def now(connection: sa.Connection) -> float:
-    """Return the time by the one clock that all processes share, in seconds since 1970: of PostgreSQL's machine, or of this one."""
-    if connection.dialect.name == "postgresql":
-        return float(connection.execute(sa.select(sa.extract("epoch", sa.func.clock_timestamp()))).scalar_one())
-    return time.time()

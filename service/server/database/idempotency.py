@@ -9,12 +9,13 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
+from service.errors import RequestError
 from service.server.database.engine import Database
 from service.server.database.tables import idempotency
 
 
-class TokenReused(Exception):
-    """The token was sent with another request before."""
+class TokenReused(RequestError):
+    """The token was sent with another request before; the message says so."""
 
 
 def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
@@ -53,9 +54,9 @@ def create_once(database: Database, project: str, token: str | None, asked: Any,
         return database.transact(work)
 
 
-def created_by(database: Database, project: str, token: str, asked: Any) -> str | None:
+def created_by(database: Database, project: str, token: str | None, asked: Any) -> str | None:
     """Return what was created with a token; None: nothing. Arguments and errors are those of `create_once`."""
-    row = database.row(_by_token(project, token))
+    row = None if token is None else database.row(_by_token(project, token))
     return None if row is None else _same(row, _fingerprint(asked))
 
 
@@ -83,5 +84,5 @@ def _fingerprint(asked: Any) -> str:
 
 def _same(row: sa.RowMapping, fingerprint: str) -> str:
     if row["fingerprint"] != fingerprint:
-        raise TokenReused
+        raise TokenReused(f"Idempotency-Key {row['token']}: came with another request before: choose a new one")
     return str(row["made"])

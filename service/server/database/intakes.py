@@ -26,6 +26,11 @@ def find(database: Database, identifier: str, project: str) -> sa.RowMapping | N
     return database.row(sa.select(intakes).where(intakes.c.id == identifier, intakes.c.project == project))
 
 
+def read_by(database: Database, job: str) -> list[sa.RowMapping]:
+    """Return the intakes that a job reads."""
+    return database.rows(sa.select(intakes).join(job_inputs, job_inputs.c.input == intakes.c.id).where(job_inputs.c.job == job))
+
+
 def time_steps(intake: sa.RowMapping | None) -> int:
     """Return how many time steps a sequence of captures has; 0: the intake is no sequence, or there is none."""
     facts = {} if intake is None else intake["facts"] or {}

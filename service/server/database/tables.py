@@ -143,22 +143,6 @@ workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks 
     sa.Column("seen_at", sa.Float, nullable=False),
     sa.Column("state", sa.String(16), nullable=False))
 
-streams = sa.Table(  # how many event streams each API process has open, until a time at which that expires unless it writes again
-    "relit_streams", metadata,
-    sa.Column("process", sa.String(32), primary_key=True),
-    sa.Column("project", sa.String(64), primary_key=True),
-    sa.Column("key", sa.String(32), primary_key=True),  # of Caller; empty: anonymous
-    sa.Column("open", sa.Integer, nullable=False),
-    sa.Column("until", sa.Float, nullable=False))
-
-rates = sa.Table(  # the requests that each key that asked lately may still send; it may send a burst if it has no row
-    "relit_rates", metadata,
-    sa.Column("key", sa.String(32), primary_key=True),  # of Caller; empty: anonymous
-    sa.Column("tokens", sa.Float, nullable=False),  # one for each request, when they were counted
-    sa.Column("counted_at", sa.Float, nullable=False),
-    sa.Column("leases", sa.JSON, nullable=False),  # of each API process: tokens beside those, and until when it may use them
-    sa.Column("full_at", sa.Float, nullable=False))  # when a burst may be sent again
-
 clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's clock is noticed
     "relit_clock", metadata, sa.Column("id", sa.Integer, primary_key=True),
     sa.Column("seen_at", sa.Float, nullable=False),  # the time at the last round

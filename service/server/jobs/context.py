@@ -46,10 +46,6 @@ class WorkerContext(NamedTuple):
         if self.settings is not None and shutil.disk_usage(self.settings.data).free < self.settings.min_free_bytes:
             raise RequestError("the service has no space left for this job (min_free_bytes): retry it when there is")
 
-    def without_folder(self, sentence: str) -> str:
-        """Return a sentence for users, in which files are named below the data folder, whose place is not theirs to know."""
-        return sentence.replace(f"{self.cache.parent}/", "")
-
 
 class Job(NamedTuple):
     """The parts of a job's row that its steps need."""

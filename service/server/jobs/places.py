@@ -88,6 +88,26 @@ def environment_image(job: Job, identifier: str | None, context: WorkerContext, 
     return None if identifier is None else environment_file(intake_folder(job, identifier, context, progress))
 
 
+def without_places(text: str, job: str, context: WorkerContext) -> str:
+    """Return a sentence for users of the service, without the folders of the server, whose places are not theirs to know.
+
+    A registered capture or environment is named by its identifier. Any other file is named below the data folder or the root.
+
+    Args:
+        text: the sentence, of an error.
+        job: identifier of the job that it is about.
+        context: of the worker.
+    """
+    names = {f"{context.cache.parent}/": ""}
+    for row in intakes.read_by(context.database, job):
+        names |= {f"{root}/": "" for root in context.roots_of(row["project"])}
+        if row["folder"] is not None:
+            names[row["folder"]] = row["id"]
+    for place in sorted(names, key=len, reverse=True):
+        text = text.replace(place, names[place])
+    return text
+
+
 def _named(place: Path, identifier: str) -> Path:
     """Return a place of the server, which reports then name by its identifier."""
     name_place(place, identifier)

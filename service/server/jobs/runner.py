@@ -23,6 +23,7 @@ from service.server.database.jobs import Claim
 from service.server.jobs.context import Job, JobStep, WorkerContext
 from service.server.jobs.helping import HelpProgress, help_with
 from service.server.jobs.pieces import JobPieces
+from service.server.jobs.places import without_places
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
 from service.server.jobs.steps import steps_of
@@ -262,7 +263,7 @@ class JobRunner:
 
     def _fail(self, claim: Claim, error: str, job: Job | None = None) -> str:
         logger.info("job failed", job=claim.job, attempt=claim.attempt, error=error)
-        error = self._context.without_folder(error)
+        error = without_places(error, claim.job, self._context)
         if job is not None and isinstance(job.request, CheckJob):
             intakes.refuse(self._context.database, job.request.intake, error)
         if not jobs.end(self._context.database, claim, FAILED, error) and job is not None:

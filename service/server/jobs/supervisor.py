@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
 
-from service.server.garbage import spared
 from service.server.jobs.heartbeat import Heartbeat
 from service.server.log import logger
 from service.server.settings import Settings
@@ -21,8 +20,8 @@ KILL_AFTER_S = 10.0
 
 def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     """Run a worker in this process, which alone imports what jobs need; the arguments are those of `worker.run_worker`."""
-    with spared():
-        from service.server.jobs import worker
+    from service.server.jobs import worker
+
     worker.run_worker(settings, device, heartbeat)
 
 

@@ -17,29 +17,14 @@ from service.requests.job import JobRequest
 from service.requests.jobs import JOBS
 from service.requests.options import Option, help_text, is_document, places_of, typed
 
-
-def _kinds(*names: str) -> dict[str, type[JobRequest]]:
-    return {name: JOBS[name] for name in names}
-
-
-CAPTURE_JOBS = _kinds(
-    "solve", "pipeline", "depth", "scan", "inspect-board", "relight", "basis", "separate", "calibrate-mirror-ball",
-    "calibrate-light-positions", "calibrate-grey-ball", "calibrate-intensity", "calibrate-dark", "calibrate-flat-field",
-    "calibrate-saturation", "calibrate-procam", "calibrate-stereo", "calibrate-response", "calibrate-tof", "calibrate-white-balance",
-    "calibrate-laser-planes")
-"""Jobs that begin with a capture, by kind."""
-MAPS_JOBS = _kinds("export", "shade", "join", "register", "fuse")
-"""Jobs that begin with the maps of another job, by kind."""
-FREE_JOBS = _kinds("patterns", "gauge-board")
-"""Jobs that begin with neither a capture nor maps, by kind."""
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
           "inspect-board": "Inspect a board", "gauge-board": "Find how well inspections of boards repeat",
           "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
           "separate": "Separate direct and global light",
+          "export": "Export an asset", "shade": "Shade one picture",
           "join": "Join with a depth of the same view", "register": "Find the poses of several depths",
-          "fuse": "Fuse registered depths into one mesh", "patterns": "Draw patterns to project", "export": "Export an asset",
-          "shade": "Shade one picture",
+          "fuse": "Fuse registered depths into one mesh", "patterns": "Draw patterns to project",
           "calibrate-mirror-ball": "Calibrate light directions: one mirror ball",
           "calibrate-light-positions": "Calibrate light positions: two or more mirror balls",
           "calibrate-grey-ball": "Calibrate the brightness of lights: a grey ball",
@@ -49,8 +34,15 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "calibrate-response": "Calibrate the response of the projector",
           "calibrate-tof": "Calibrate a time-of-flight camera",
           "calibrate-white-balance": "Calibrate colours: a grey card", "calibrate-laser-planes": "Calibrate the planes of a laser"}
+CAPTURE_JOBS = {name: JOBS[name] for name in TITLES if any(
+    field.is_required() for part, field in JOBS[name].model_fields.items() if part in ("capture", "captures"))}
+"""Jobs that begin with a capture, by kind."""
+FREE_JOBS = {name: JOBS[name] for name in ("patterns", "gauge-board")}
+"""Jobs that begin with neither a capture nor maps, by kind."""
+MAPS_JOBS = {name: JOBS[name] for name in TITLES if name not in CAPTURE_JOBS and name not in FREE_JOBS}
+"""Jobs that begin with the maps of another job, by kind."""
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
-"""What the identifiers of a pattern name."""
+"""The kind of thing that the identifiers of a pattern name."""
 
 
 class Field(NamedTuple):
@@ -85,7 +77,7 @@ class Form(NamedTuple):
     title: str
     about: str
     main: tuple[Field, ...]
-    """What the job reads, and options without a default."""
+    """Inputs of the job, and options without a default."""
     more: tuple[Field, ...]
     """Options with a default."""
 

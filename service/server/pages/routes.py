@@ -22,7 +22,7 @@ HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
 THREE = f"{STATIC}/vendor/three"
 IMPORT_MAP = json.dumps({"imports": {"three": f"{THREE}/three.module.js", "three/addons/": f"{THREE}/addons/"}})
-"""Where modules find three.js, which is vendored."""
+"""The places where modules find three.js, which is vendored."""
 IMPORT_MAP_HASH = base64.b64encode(hashlib.sha256(IMPORT_MAP.encode()).digest()).decode()
 HEADERS = {
     "Content-Security-Policy": "; ".join([

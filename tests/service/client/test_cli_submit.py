@@ -129,9 +129,10 @@ def test_bad_input_is_one_sentence_and_exit_code_2(relit, arguments, sentence):
 
 
 def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]:
-    """The job, and the program, ended by Ctrl-C while it waits."""
-    process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-5000", "--wait"],
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    """The job, and the program, ended by SIGINT while it waits; it was started without this signal, as a shell starts what ends with &."""
+    program = [sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-5000", "--wait"]
+    process = subprocess.Popen(["sh", "-c", 'trap "" INT; exec "$0" "$@"', *program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                               text=True)
     assert process.stdout is not None
     line = process.stdout.readline()
     time.sleep(1)  # until it waits; were it earlier, it would end all the same

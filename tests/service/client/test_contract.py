@@ -15,8 +15,7 @@ from service.client.errors import Fault
 from service.requests.jobs import ExportJob, RelightJob, SolveJob, UserJob
 from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
-from service.views import intakes, jobs
-from service.views.base import View
+from service.views import View, intakes, jobs
 from tests.scenes.captures import write_capture
 from tests.service.client.conftest import SKY, Between
 

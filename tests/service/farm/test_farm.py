@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.farm.template import Job, write_job
+from service.farm.jobs import Job, write_job
 from service.requests.base import Role
 from service.requests.options import options_of
 from service.requests.relight import RelightRequest
@@ -199,8 +199,8 @@ def test_the_docs_name_every_option_and_parameter(relit, tmp_path):
         own = set(re.findall(r"--[a-z-]+", outcome.out)) - set(re.findall(r"--[a-z-]+", relit(command, "--help").out))
         assert own and {option for option in own if f"`{option}" not in text} == set()
         assert all(f"`{option.flag}`" in text for option in options_of(model) if option.role in (Role.PART, Role.RUN))
-    asked = {name for file in ("jobs", "template") for name in re.findall(
-        r'given\.(?:text|count|file|folder)\("(\w+)"', (ROOT / "service" / "farm" / f"{file}.py").read_text(encoding="utf-8"))}
+    asked = set(re.findall(r'given\.(?:text|count|file|folder)\("(\w+)"',
+                           (ROOT / "service" / "farm" / "jobs.py").read_text(encoding="utf-8")))
     asked |= {option.name.title().replace("_", "") for model in (RelightRequest, ShadeRequest) for option in options_of(model)
               if option.role is Role.INPUT or (option.role is Role.CHOICE and option.kind is str)}
     assert len(asked) > 10 and {name for name in asked if f"`{name}`" not in text} == set()

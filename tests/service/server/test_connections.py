@@ -1,7 +1,5 @@
 """Connections: clients that send no whole request, or take no answer, give way, and the others are served."""
 
-import asyncio
-import gc
 import os
 import re
 import resource
@@ -103,25 +101,6 @@ def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch)
                 break
             time.sleep(0.05)
         assert ended and closed(silent) and closed(kept)
-
-
-def test_a_connection_that_has_ended_waits_for_no_collector():
-    """asyncio's transports refer to themselves: the event streams of ten minutes stayed until the oldest generation was collected. Of 21
-    one or two may stay that ended while the loop was at another step; all of them stayed."""
-    with running(ConnectionLimits(20, 20)) as (port, _):
-        answered(port)  # what is made once
-        gc.collect()
-        gc.disable()
-        try:
-            for _ in range(20):
-                assert answered(port)
-            opened(port, HALF).close()
-            deadline = time.monotonic() + WAIT_S
-            while len(found := [each for each in gc.get_objects() if isinstance(each, asyncio.Transport) and each.is_closing()]) > 2:
-                assert time.monotonic() < deadline, found
-                time.sleep(0.02)
-        finally:
-            gc.enable()
 
 
 def test_requests_wait_in_so_many_threads_and_no_more():

@@ -20,7 +20,7 @@ from service.requests.keys import Scope
 from service.server.connections import AT_ONCE, MAX_CONNECTIONS, OWN_DESCRIPTORS
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.permissions import PRIVATE
+from service.server.processes import PRIVATE
 from service.server.sample import show_sample
 from service.server.settings import Settings
 from service.server.storage.open import open_storage

@@ -1,5 +1,7 @@
 """Captures and environments: created or registered, looked at, checked, deleted."""
 
+import shutil
+
 import pytest
 
 from service.requests.identifiers import CAPTURE, new_id
@@ -10,6 +12,7 @@ from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
 from tests.service.server.api.captures import write_capture
 from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.job_calls import finish, submit
 
 
 def test_a_capture_is_created_looked_at_and_deleted(client):
@@ -121,3 +124,25 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
     found = intakes.find(database, capture, "p")
     assert found is not None and found["state"] == "checking"  # the check that ended before has no say in this one
     database.close()
+
+
+@pytest.mark.parametrize(("kind", "more"), [
+    ("solve", {}), ("depth", {}), ("scan", {"options": {"near_m": 1}}), ("basis", {}), ("inspect-board", {}),
+    ("calibrate-saturation", {}),
+])
+def test_a_job_whose_registered_capture_is_gone_does_not_say_where_it_was(server, client, gone, kind, more):
+    job = submit(client, kind=kind, capture=gone[0], **more)
+    error = finish(server, client, job, "failed")["error"]
+    log = client.get(f"/v1/jobs/{job['id']}/log").text
+    assert gone[0] in error, error
+    assert not any(str(place) in error + log for place in (gone[1], gone[1].parent, server.data)), error
+
+
+@pytest.fixture(scope="module")
+def gone(server, client, registered):
+    """A capture that was registered and checked, whose folder was deleted since, and its folder."""
+    folder = write_capture(registered / "gone")
+    made = client.post("/v1/captures", json={"name": "gone", "folder": str(folder)}).raise_for_status().json()
+    assert server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["state"] == "ready"
+    shutil.rmtree(folder)
+    return made["id"], folder

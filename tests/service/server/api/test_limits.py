@@ -7,9 +7,9 @@ import httpx2
 import pytest
 
 from service.requests.keys import NewKey, Scope
-from service.server.api import access
-from service.server.api.access import RateLimiter
+from service.server.api import context, limits
 from service.server.api.app import create_app
+from service.server.api.limits import CREATION_COST, RateLimiter
 from service.server.api.problems import ApiError
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
@@ -135,8 +135,26 @@ def test_tokens_come_back_with_time():
         limiter.take("a")
 
 
+def test_a_cost_above_the_burst_takes_a_full_bucket():
+    now = 0.0
+    limiter = RateLimiter(2.0, 4, clock=lambda: now)
+    limiter.take("a", 10)
+    with pytest.raises(ApiError) as error:
+        limiter.take("a", 2)
+    assert error.value.headers == {"Retry-After": "1"}
+    now = 1.0
+    limiter.take("a", 2)
+
+
+def test_a_new_capture_counts_as_several_requests(client):
+    """Each leaves rows in the database also after it is deleted: a key could make any number of them."""
+    found = [client.post("/v1/captures", json={"name": "x"}) for _ in range(BURST // CREATION_COST + 1)]
+    assert [response.status_code for response in found[:-1]] == [201] * (BURST // CREATION_COST)
+    refused(found[-1], 429, "more than", later=True)
+
+
 def test_keys_that_ask_no_more_are_forgotten(monkeypatch):
-    monkeypatch.setattr(access, "FORGET_ABOVE", 10)
+    monkeypatch.setattr(limits, "FORGET_ABOVE", 10)
     now = 0.0
     limiter = RateLimiter(1.0, 1, clock=lambda: now)
     for number in range(10):
@@ -212,3 +230,12 @@ def test_without_space_nothing_new_is_taken_and_the_service_says_so(tmp_path):
         assert ready.status_code == 503 and "less space left than min_free_bytes" in ready.json()["detail"]
         for path in ("/v1/captures", "/v1/jobs", "/healthz", "/metrics"):
             assert client.get(path).status_code == 200
+
+
+def test_a_file_system_without_room_for_files_takes_nothing_new(small, monkeypatch):
+    server, database = small
+    monkeypatch.setattr(context, "MIN_FREE_FILES", 1 << 62)
+    app = create_app(Settings(data=server.data, min_free_bytes=0), database)
+    headers = {"Authorization": f"Bearer {key(database)}", "Content-Type": "application/json", "Content-Length": "13"}
+    call = Call(app, "/v1/captures", method="POST", headers=headers, sent=b'{"name": "x"}')
+    assert asyncio.run(call.run()).status == 507

@@ -1,10 +1,10 @@
 """Results: listed while they are made, downloaded whole and in parts, and nothing but results."""
 
 import asyncio
-import email
 import http.client
 import os
 import time
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from service.requests.identifiers import new_id
 from service.requests.jobs import SolveJob
 from service.server.api.app import create_app
-from service.server.api.ranges import MAX_RANGES, Span, asked_for, names
+from service.server.api.problems import ApiError
+from service.server.api.results import Opened, _names, _part
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
@@ -162,27 +163,13 @@ def test_parts(client, frames, folder):
         assert (response.status_code, response.content) == (206, part)
         assert response.headers["Content-Range"] == f"bytes {start}-{start + len(part) - 1}/{size}"
         assert int(response.headers["Content-Length"]) == len(part)
-    for ignored in ("lines=0-9", "bytes=9-3", "bytes=x", "bytes=", "bytes=-", ",".join(["bytes=0-1", *["3-4"] * MAX_RANGES])):
+    for ignored in ("lines=0-9", "bytes=9-3", "bytes=x", "bytes=", "bytes=-", "bytes=5-9, -3"):
         response = client.get(url, headers={"Range": ignored})
         assert (response.status_code, response.content) == (200, content)
-    for outside in (f"bytes={size}-", "bytes=-0", f"bytes={size + 1}-{size + 2},{size}-"):
+    for outside in (f"bytes={size}-", "bytes=-0"):
         response = client.get(url, headers={"Range": outside})
         assert (response.status_code, response.headers["Content-Range"]) == (416, f"bytes */{size}")
         assert response.headers["Content-Type"] == "application/problem+json"
-
-
-def test_several_parts_at_once(client, frames, folder):
-    url, content = f"/v1/jobs/{frames}/results/frame.0003.exr", (folder / "frame.0003.exr").read_bytes()
-    response = client.get(url, headers={"Range": "bytes=5-9, -3, 999999999-, 0-0"})
-    assert response.status_code == 206 and int(response.headers["Content-Length"]) == len(response.content)
-    message = email.message_from_bytes(b"Content-Type: " + response.headers["Content-Type"].encode() + b"\r\n\r\n" + response.content)
-    assert message.get_content_type() == "multipart/byteranges"
-    parts = [(part.get_content_type(), part["Content-Range"]) for part in message.get_payload()]
-    size = len(content)
-    assert parts == [("image/x-exr", f"bytes {span}/{size}") for span in ("5-9", f"{size - 3}-{size - 1}", "0-0")]
-    boundary = response.headers["Content-Type"].partition("boundary=")[2].encode()
-    bodies = [part.partition(b"\r\n\r\n")[2].removesuffix(b"\r\n") for part in response.content.split(b"--" + boundary)[1:-1]]
-    assert bodies == [content[5:10], content[-3:], content[:1]]
 
 
 def test_a_download_is_gone_on_with_only_where_the_file_is_the_same(client, frames, folder):
@@ -289,15 +276,19 @@ def test_only_results_of_a_job_that_is_there(client, frames):
     assert client.get(f"/v1/jobs/{frames}/results", params={"limit": 1001}).json()["errors"][0]["field"] == "query.limit"
 
 
-@given(st.lists(st.tuples(st.integers(0, 120), st.integers(0, 120)), min_size=1, max_size=MAX_RANGES), st.integers(0, 100))
-def test_ranges_are_cut_to_the_file(pairs, size):
-    asked = [(min(pair), max(pair)) for pair in pairs]
-    spans = asked_for("bytes=" + ",".join(f"{first}-{last}" for first, last in asked), size)
-    assert spans == [Span(first, min(last + 1, size)) for first, last in asked if first < size]
+@given(st.integers(0, 120), st.integers(0, 120), st.integers(0, 100))
+def test_a_range_is_cut_to_the_file(start, beyond, size):
+    file = Opened("x.bin", 0, size, '"a"', 0.0)
+    if start < size:
+        assert _part(f"bytes={start}-{start + beyond}", file) == range(start, min(start + beyond + 1, size))
+    else:
+        with pytest.raises(ApiError):
+            _part(f"bytes={start}-{start + beyond}", file)
 
 
 @given(st.text())
 def test_any_range_and_any_tag_can_be_said(text):
-    spans = asked_for(text, 10)
-    assert spans is None or all(0 <= span.start < span.stop <= 10 for span in spans)
-    assert names(text, '"a"', strong=True) <= names(text, '"a"', strong=False)
+    with suppress(ApiError):
+        part = _part(text, Opened("x.bin", 0, 10, '"a"', 0.0))
+        assert part is None or 0 <= part.start < part.stop <= 10
+    assert _names(text, '"a"', strong=True) <= _names(text, '"a"', strong=False)

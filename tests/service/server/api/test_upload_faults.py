@@ -10,13 +10,17 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from fastapi.testclient import TestClient
 
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.keys import NewKey, Scope
+from service.server.api import uploads as api_uploads
+from service.server.api.app import create_app
 from service.server.database import keys, tables, uploads
 from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
 from service.server.database.schema import upgrade
+from service.server.settings import Settings
 from service.server.storage.part_files import PartFile, PartFileLocked
 from tests.service.server.api.test_uploads import at_once, begun, made, part, soon, stored
 from tests.service.server.api.tus import Tus, checksum, encoded
@@ -245,3 +249,30 @@ def test_a_part_is_locked_once(tmp_path):
         PartFile.open(tmp_path, "up_1")
     with PartFile.open(tmp_path, "up_1") as again:
         assert again.size == 4
+
+
+@pytest.mark.parametrize("checked", [False, True], ids=["plain", "with a checksum"])
+def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(tmp_path, monkeypatch, checked):
+    settings = Settings(data=tmp_path / "data", min_free_bytes=0)
+    settings.data.mkdir()
+    database = connect(settings.sqlalchemy_url)
+    upgrade(database)
+    key, other = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.WRITE)) for _ in range(2))
+    write_body = api_uploads.write_body
+
+    async def write_and_revoke(*arguments) -> None:
+        await write_body(*arguments)
+        keys.revoke(database, key.partition(".")[0])
+
+    monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
+    tus = {"Tus-Resumable": "1.0.0"}
+    with TestClient(create_app(settings, database), headers={"Authorization": f"Bearer {key}", **tus}) as client:
+        capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
+        place = client.post(f"/v1/captures/{capture}/files", headers={
+            "Upload-Length": "5", "Upload-Metadata": encoded(path="a.bin")}).raise_for_status().headers["Location"]
+        response = client.patch(place, content=b"hello", headers={
+            "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream",
+            **({"Upload-Checksum": checksum("sha256", b"hello")} if checked else {})})
+        assert response.status_code == 401 and "revoked" in response.json()["detail"]
+        assert client.head(place, headers={"Authorization": f"Bearer {other}"}).headers["Upload-Offset"] == "0"
+    database.close()

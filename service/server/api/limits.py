@@ -1,0 +1,95 @@
+"""Limits of each API process, in its memory: how often a key may ask, and how much of a kind may be under way at once.
+
+A service of several API processes behind one address allows as many times these limits. nginx can hold them over all processes, as
+docs/service.md shows.
+"""
+
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import NoReturn
+
+from service.server.api.problems import RETRY_S, ApiError
+
+FORGET_ABOVE = 10_000
+"""Number of buckets above which the full ones are dropped, since a full bucket is like a new one."""
+CREATION_COST = 10
+"""Tokens that a new capture or environment takes: each leaves rows in the database, also after it is deleted."""
+
+
+class RateLimiter:
+    """A token bucket for each key, in this process."""
+
+    def __init__(self, per_second: float, burst: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Args: per_second: tokens that a bucket gains. burst: tokens that it holds. clock: returns seconds."""
+        self._per_second, self._burst, self._clock = per_second, burst, clock
+        self._buckets: dict[str | None, tuple[float, float]] = {}  # tokens, and when they were counted
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        """Return the number of buckets."""
+        return len(self._buckets)
+
+    def take(self, key: str | None, cost: int = 1) -> None:
+        """Take tokens from the bucket of a key: `cost` of them, or all that the bucket holds if that is less.
+
+        Raises:
+            ApiError: there are fewer in the bucket.
+        """
+        now, cost = self._clock(), min(cost, self._burst)
+        with self._lock:
+            tokens = self._tokens(key, now)
+            if tokens >= cost:
+                self._buckets[key] = (tokens - cost, now)
+                if len(self._buckets) > FORGET_ABOVE:
+                    self._forget(now)
+                return
+        self._refuse(tokens, cost)
+
+    def require(self, key: str | None) -> None:
+        """Take nothing from the bucket of a key, of which it need not be known whether it is right.
+
+        Raises:
+            ApiError: the bucket is empty.
+        """
+        if key in self._buckets and (tokens := self._tokens(key, self._clock())) < 1:
+            self._refuse(tokens, 1)
+
+    def _tokens(self, key: str | None, now: float) -> float:
+        tokens, counted = self._buckets.get(key, (float(self._burst), now))
+        return min(float(self._burst), tokens + (now - counted) * self._per_second)
+
+    def _refuse(self, tokens: float, cost: int) -> NoReturn:
+        wait = math.ceil((cost - tokens) / self._per_second)
+        raise ApiError("too-many", f"the key asks more than {self._per_second:g} times a second", headers={"Retry-After": str(wait)})
+
+    def _forget(self, now: float) -> None:
+        self._buckets = {key: (tokens, counted) for key, (tokens, counted) in self._buckets.items()
+                         if tokens + (now - counted) * self._per_second < self._burst}
+
+
+class AtOnce:
+    """Counts what each holder (a key or a project) has under way in this process. Everything runs in the event loop."""
+
+    def __init__(self, most: int, what: str) -> None:
+        """Args: most: of one holder. what: is counted, as a refusal names it."""
+        self._most, self._what = most, what
+        self._running: Counter[str | None] = Counter()
+
+    def enter(self, holder: str | None) -> None:
+        """Count one more, which `leave` must end.
+
+        Raises:
+            ApiError: the holder has as many as it may.
+        """
+        if self._running[holder] >= self._most:
+            raise ApiError("too-many", f"{self._most} {self._what}", headers={"Retry-After": str(RETRY_S)})
+        self._running[holder] += 1
+
+    def leave(self, holder: str | None) -> None:
+        """Count one less."""
+        self._running[holder] -= 1
+        if not self._running[holder]:
+            del self._running[holder]
