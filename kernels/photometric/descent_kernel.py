@@ -10,7 +10,8 @@ from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_roo
 from kernels.packs import pack_type
 from kernels.photometric.candidates import LEAST_NZ, tangents
 from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
-from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
+from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
+from kernels.photometric.samples import samples_type
 
 SWEEPS = 8
 """Coordinate sweeps of the non-negative solve in each turn, from the weights of the turn before."""
@@ -37,7 +38,7 @@ def entry(row: int, column: int):
 @once
 def descent_kernel(lanes: int) -> Any:
     """Return the kernel for one width of packs."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
     mixture = wp.types.matrix(shape=(MIXTURE, lanes), dtype=wp.float32)
     rows = wp.types.matrix(shape=(UNKNOWNS, lanes), dtype=wp.float32)
     triangle = wp.types.matrix(shape=(UNKNOWNS * (UNKNOWNS + 1) // 2, lanes), dtype=wp.float32)
@@ -47,29 +48,21 @@ def descent_kernel(lanes: int) -> Any:
     # on CUDA every element must have a register of its own, on the CPU the lanes are what the compiler unrolls
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0 if lanes > 1 else 2 * UNKNOWNS})
     def descend_kernel(first: int,
-                       grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
-                       view: wp.array2d(dtype=lane_type),  # [3, P]
+                       samples: samples_struct,
                        drawn: wp.array2d(dtype=lane_type),  # [3, P] normal of the prior
                        pull: wp.vec2,  # its strength, and 1 / rad² of its angle
-                       noise: wp.vec2,  # s0, s1
-                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                       form: wp.vec2,  # diffuse roughness, slope
+                       criteria: Criteria,
                        soft: wp.vec2,  # factor on σ² in the first turn, and its own factor from turn to turn
-                       softened: int,
-                       turns: int,
-                       light_count: int,
-                       pack_stride: int,
-                       light_stride: int,
+                       turns: wp.vec2i,  # softened ones, and all
                        # outputs
                        normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
                        weights: wp.array2d(dtype=lane_type),  # [lobes, P] in: start, out: of the best
                        found: wp.array2d(dtype=lane_type)):  # [3, P] cost, curvature, swing
         p = first + wp.tid()
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
+        vx = samples.view[0, p]
+        vy = samples.view[1, p]
+        vz = samples.view[2, p]
         ux = drawn[0, p]
         uy = drawn[1, p]
         uz = drawn[2, p]
@@ -86,11 +79,11 @@ def descent_kernel(lanes: int) -> Any:
                 x[a, k] = given_weight[k]
         sweeps = int(SWEEPS)  # a literal would be unrolled
         variance = float(soft[0])  # relative to that of the noise
-        for turn in range(turns):
+        for turn in range(turns[1]):
             narrow = 1.0 / wp.max(variance, 1.0)
             variance = variance * soft[1]
-            judged = wp.where(turn >= softened, 1.0, 0.0)
-            free = wp.where(turn >= wp.min(softened, 1), 1.0, 0.0)  # the first turn without weights finds them alone
+            judged = wp.where(turn >= turns[0], 1.0, 0.0)
+            free = wp.where(turn >= wp.min(turns[0], 1), 1.0, 0.0)  # the first turn without weights finds them alone
             ax, ay, az, ox, oy, oz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             nv, va, vo, explained = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
@@ -117,12 +110,12 @@ def descent_kernel(lanes: int) -> Any:
             total, product = lane_type(), lane_type(1.0)
             g = triangle()
             r = rows()
-            for light in range(light_count):
-                at = p * pack_stride + light * light_stride
-                reading = grey[at]
-                lx = toward[0, at]
-                ly = toward[1, at]
-                lz = toward[2, at]
+            for light in range(samples.light_count):
+                at = p * samples.pack_stride + light * samples.light_stride
+                reading = samples.grey[at]
+                lx = samples.toward[0, at]
+                ly = samples.toward[1, at]
+                lz = samples.toward[2, at]
                 nl, la, lo, nh, inverse, fresnel = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 by_h, by_l, by_v, predicted, w = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 f = rows()
@@ -137,7 +130,7 @@ def descent_kernel(lanes: int) -> Any:
                     lo[k] = ox[k] * lx[k] + oy[k] * ly[k] + oz[k] * lz[k]
                     nl[k] = wp.max(cosine, 0.0)
                     nh[k] = (cosine + nv[k]) * inverse[k]
-                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, form[0], form[1])
+                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, criteria.form[0], criteria.form[1])
                     f[0, k] = value
                     predicted[k] = x[0, k] * value
                     by_l[k] = x[0, k] * on_l
@@ -155,14 +148,14 @@ def descent_kernel(lanes: int) -> Any:
                 for k in range(lanes):
                     f[TILT, k] = by_h[k] * (la[k] + va[k]) * inverse[k] + by_l[k] * la[k] + by_v[k] * va[k]
                     f[OTHER, k] = by_h[k] * (lo[k] + vo[k]) * inverse[k] + by_l[k] * lo[k] + by_v[k] * vo[k]
-                    sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
+                    sigma = 1.0 / (criteria.noise[0] + criteria.noise[1] * wp.max(reading[k], 0.0))
                     off = (reading[k] - predicted[k]) * sigma
                     off2 = wp.where(explained[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
-                    dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+                    dark = wp.where(reading[k] < criteria.shadow[1] * predicted[k], 1, 0) * wp.where(off2 > criteria.shadow[0], 1, 0)
                     given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
                     trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
                     w[k] = given * trust * sigma * sigma / (1.0 + off2)
-                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
+                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, criteria.shadow[0], off2))
                 if light % LOG_GROUP == LOG_GROUP - 1:
                     for k in range(lanes):
                         total[k] += log_of(product[k])
@@ -280,9 +273,9 @@ def descent_kernel(lanes: int) -> Any:
                 ny[k] = my * unit
                 nz[k] = mz * unit
         for k in range(lanes):
-            best[k] = best[k] / float(light_count)
-            curvature[k] = curvature[k] / float(light_count)
-            swing[k] = swing[k] / float(light_count)
+            best[k] = best[k] / float(samples.light_count)
+            curvature[k] = curvature[k] / float(samples.light_count)
+            swing[k] = swing[k] / float(samples.light_count)
         normal[0, p] = bx
         normal[1, p] = by
         normal[2, p] = bz

@@ -8,7 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
-from kernels.photometric.samples import Samples, to_host
+from kernels.photometric.samples import Samples, samples_type, to_host
 
 INFORMATIVE = 0.1
 """Part of a pixel's level below which a reading is shadow and says little: it does not count as information."""
@@ -47,26 +47,23 @@ def _informative(samples: Samples) -> np.ndarray:
     """Return [n] the number of readings that are not shadow."""
     counts = wp.empty(samples.packs, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
     devices.launch(_count_kernel(samples.lanes), samples.packs,
-                   [samples.grey, samples.light_count, samples.pack_stride, samples.light_stride], [counts], device=samples.device)
+                   [samples.arrays], [counts], device=samples.device)
     return to_host(samples, counts)
 
 
 @once
 def _count_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def count_kernel(first: int,
-                     grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                     light_count: int,
-                     pack_stride: int,
-                     light_stride: int,
+                     samples: samples_struct,
                      # outputs
                      counts: wp.array(dtype=lane_type)):  # [P]
         p = first + wp.tid()
         count = lane_type()
-        for light in range(light_count):
-            y = grey[p * pack_stride + light * light_stride]
+        for light in range(samples.light_count):
+            y = samples.grey[p * samples.pack_stride + light * samples.light_stride]
             for k in range(lanes):
                 count[k] += wp.where(y[k] > INFORMATIVE, 1.0, 0.0)
         counts[p] = count

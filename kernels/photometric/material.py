@@ -88,7 +88,6 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     Raises:
         ArrayError: a table of other lights.
     """
-    options = options or SearchOptions()
     tinted = _fit(samples, normal, shape, options, table, TINTED)
     bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole lobe, so that F0 needs no bound
     neutral = _fit(samples, normal, shape, options, table, NEUTRAL, np.full(4, bound))
@@ -137,7 +136,7 @@ def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options:
     Args:
         samples, normal, shape, options: as for fit_material.
     """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, TINTED)
+    return _fit(samples, normal, shape, options, None, TINTED)
 
 
 def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse,
@@ -148,7 +147,7 @@ def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, sha
         samples, normal, shape, options: as for fit_material.
         material: [4] F0 and roughness.
     """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN, material)
+    return _fit(samples, normal, shape, options, None, GIVEN, material)
 
 
 def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
@@ -158,10 +157,10 @@ def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diff
         samples, normal, shape, options: as for fit_material.
         f0: of all channels.
     """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN_F0, np.full(4, f0), anew=True)
+    return _fit(samples, normal, shape, options, None, GIVEN_F0, np.full(4, f0), anew=True)
 
 
-def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions, table: wp.array | None, freedom: int,
+def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions | None, table: wp.array | None, freedom: int,
          given: np.ndarray | None = None, *, anew: bool = False) -> Material:
     if table is not None and table.shape[1:] != (samples.light_count, COLUMNS):
         raise ArrayError(f"table is {table.shape}, the samples have {samples.light_count} lights: give their response table")
@@ -170,11 +169,9 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
     fitted = wp.empty((8, packs), dtype=pack_type(lanes, wp.float32), device=device)
     responses = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     known = wp.vec4() if given is None else wp.vec4(*map(float, given))
-    scratch, strides = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
+    scratch = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
     devices.launch(material_kernel(lanes, reflectance, table is not None), packs,
-                   [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
-                    *criteria(options, shape), freedom, int(anew), known, samples.light_count, samples.pack_stride, samples.light_stride,
-                    *strides],
+                   [samples.arrays, responses, per_pixel(samples, normal), criteria(options, shape), freedom, int(anew), known],
                    [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),

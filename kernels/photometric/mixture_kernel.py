@@ -9,8 +9,9 @@ from kernels.device import once
 from kernels.logarithm import log_of
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.lobes import Reflectance
-from kernels.photometric.material_kernel import COMMON_ROUNDS, REWEIGHTINGS
-from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
+from kernels.photometric.material_kernel import REWEIGHTINGS, common_weight
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
+from kernels.photometric.samples import samples_type, scratch_type
 
 MIXED_ROWS = 6
 """Values that scratch memory holds for each light beside the reflectance and the weights: in each channel, what the lobe of the second
@@ -27,68 +28,50 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
     """
     held, prepare, respond, lambertian = reflectance
     write_weights = plain_weights(lanes)
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     channels = channels_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def mix_kernel(first: int,
-                   colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
-                   toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                   samples: samples_struct,
                    table: wp.array3d(dtype=float),  # [cells, L, columns]
-                   level: wp.array(dtype=lane_type),  # [P]
-                   view: wp.array2d(dtype=lane_type),  # [3, P]
                    normal: wp.array2d(dtype=lane_type),  # [3, P]
-                   noise: wp.vec2,  # s0, s1
-                   shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                   form: wp.vec2,  # diffuse roughness, slope
+                   criteria: Criteria,
                    pairs: wp.array2d(dtype=wp.vec4),  # [pairs, 2] F0 and roughness
-                   light_count: int,
-                   pack_stride: int,
-                   light_stride: int,
-                   scratch_pack: int,
-                   scratch_step: int,
                    # outputs
-                   scratch: wp.array(dtype=lane_type),  # [P · L · (held + WEIGHT_ROWS + MIXED_ROWS)]
+                   scratch: scratch_struct,  # held + WEIGHT_ROWS + MIXED_ROWS values a light
                    fitted: wp.array2d(dtype=lane_type)):  # [6, P] albedo, abundance of the first material, pair, cost
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
         nx = normal[0, p]
         ny = normal[1, p]
         nz = normal[2, p]
-        bright = level[p]
-        start = p * pack_stride
-        base = p * scratch_pack
-        light_step = wp.static(held + WEIGHT_ROWS + MIXED_ROWS) * scratch_step
-        weight_rows = base + held * scratch_step
-        prepare(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, light_step, scratch_step, scratch)
-        write_weights(colour, bright, noise, start, light_count, light_stride, weight_rows, light_step, scratch_step, scratch)
+        prepare(samples, table, criteria.form, nx, ny, nz, p, scratch)
+        write_weights(samples, criteria.noise, p, held, scratch)
         best_cost, best_share, best_pair = lane_type(1.0e30), lane_type(), lane_type()
         best_rho = channels()
         for pair in range(pairs.shape[0]):
             one, two = pairs[pair, 0], pairs[pair, 1]
             rough_one, rough_two = lane_type(one[3]), lane_type(two[3])
-            respond(table, nx, ny, nz, vx, vy, vz, rough_two, light_count, base, light_step, scratch_step, scratch)
-            for light in range(light_count):
-                at = base + light * light_step
-                fs_two = scratch[at + scratch_step]
-                fixed_two = scratch[at + 2 * scratch_step]
+            respond(samples, table, nx, ny, nz, rough_two, p, scratch)
+            for light in range(samples.light_count):
+                at = p * scratch.pack_stride + light * scratch.light_stride
+                fs_two = scratch.values[at + scratch.step]
+                fixed_two = scratch.values[at + 2 * scratch.step]
                 for c in range(3):
                     mixed = lane_type()
                     for k in range(lanes):
                         mixed[k] = two[c] * fs_two[k] + fixed_two[k]
-                    scratch[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch_step] = mixed
-            respond(table, nx, ny, nz, vx, vy, vz, rough_one, light_count, base, light_step, scratch_step, scratch)
-            for light in range(light_count):
-                at = base + light * light_step
-                fs = scratch[at + scratch_step]
-                fixed = scratch[at + 2 * scratch_step]
+                    scratch.values[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch.step] = mixed
+            respond(samples, table, nx, ny, nz, rough_one, p, scratch)
+            for light in range(samples.light_count):
+                at = p * scratch.pack_stride + light * scratch.light_stride
+                fs = scratch.values[at + scratch.step]
+                fixed = scratch.values[at + 2 * scratch.step]
                 for c in range(3):
-                    mixed = scratch[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch_step]
+                    mixed = scratch.values[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch.step]
                     for k in range(lanes):
                         mixed[k] = one[c] * fs[k] + fixed[k] - mixed[k]
-                    scratch[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch_step] = mixed
+                    scratch.values[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch.step] = mixed
             rho, share = channels(), lane_type()
             cost, product = lane_type(), lane_type()
             for turn in range(wp.static(REWEIGHTINGS + 1)):
@@ -96,17 +79,17 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                 dd = lane_type()
                 cost, product = lane_type(), lane_type(1.0)
                 ds, ss, rd, rs = channels(), channels(), channels(), channels()
-                for light in range(light_count):
-                    element = start + light * light_stride
-                    at = base + light * light_step
-                    fd = scratch[at]
-                    plain = scratch[at + held * scratch_step]
+                for light in range(samples.light_count):
+                    element = p * samples.pack_stride + light * samples.light_stride
+                    at = p * scratch.pack_stride + light * scratch.light_stride
+                    fd = scratch.values[at]
+                    plain = scratch.values[at + held * scratch.step]
                     off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
                     for c in range(3):
-                        y = colour[c, element]
-                        inverse = scratch[at + (held + 1 + c) * scratch_step]
-                        below = scratch[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch_step]
-                        apart = scratch[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch_step]
+                        y = samples.colour[c, element]
+                        inverse = scratch.values[at + (held + 1 + c) * scratch.step]
+                        below = scratch.values[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch.step]
+                        apart = scratch.values[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch.step]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + below[k] + share[k] * apart[k]
                             off = (y[k] - predicted) * inverse[k]
@@ -114,7 +97,7 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], shadow)
+                        weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], criteria.shadow)
                         w[k] = weight
                         product[k] = product[k] * factor
                         dd[k] += weight * fd[k] * fd[k]
@@ -123,9 +106,9 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                             cost[k] += log_of(product[k])
                             product[k] = 1.0
                     for c in range(3):
-                        y = colour[c, element]
-                        below = scratch[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch_step]
-                        apart = scratch[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch_step]
+                        y = samples.colour[c, element]
+                        below = scratch.values[at + (wp.static(held + WEIGHT_ROWS) + c) * scratch.step]
+                        apart = scratch.values[at + (wp.static(held + WEIGHT_ROWS + 3) + c) * scratch.step]
                         for k in range(lanes):
                             left = y[k] - below[k]
                             wa = w[k] * apart[k]
@@ -135,16 +118,8 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                             rs[c, k] += wa * left
                 if turn < wp.static(REWEIGHTINGS):
                     for k in range(lanes):
-                        common = float(0.0)
-                        for _round in range(COMMON_ROUNDS):
-                            # it explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others
-                            top, bottom, whole = float(0.0), float(0.0), float(0.0)
-                            for c in range(3):
-                                shared = wp.where(rd[c, k] > common * ds[c, k], ds[c, k] / wp.max(dd[k], 1.0e-20), 0.0)
-                                top += rs[c, k] - shared * rd[c, k]
-                                bottom += ss[c, k] - shared * ds[c, k]
-                                whole += ss[c, k]
-                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, 1.0), 0.0)
+                        common = common_weight(dd[k], wp.vec3(ds[0, k], ds[1, k], ds[2, k]), wp.vec3(ss[0, k], ss[1, k], ss[2, k]),
+                                               wp.vec3(rd[0, k], rd[1, k], rd[2, k]), wp.vec3(rs[0, k], rs[1, k], rs[2, k]), 1.0)
                         share[k] = common
                         for c in range(3):
                             rho[c, k] = wp.max(rd[c, k] - common * ds[c, k], 0.0) / wp.max(dd[k], 1.0e-20)
@@ -157,7 +132,7 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                 best_pair[k] = wp.where(better, float(pair), best_pair[k])
                 for c in range(3):
                     best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
-        closest = lambertian(toward, form, nx, ny, nz, vx, vy, vz, p * pack_stride, light_count, light_stride)
+        closest = lambertian(samples, criteria.form, nx, ny, nz, p)
         for c in range(3):
             out = lane_type()
             for k in range(lanes):

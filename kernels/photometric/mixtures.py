@@ -138,11 +138,9 @@ def _better(fit: _Mixed, single_cost: np.ndarray) -> np.ndarray:
 def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse, options: SearchOptions | None) -> _Mixed:
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     fitted = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
-    scratch, strides = scratch_memory(samples, HELD)
+    scratch = scratch_memory(samples, HELD)
     devices.launch(mixture_kernel(lanes, direction_reflectance(lanes)), packs,
-                   [samples.colour, samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=device), samples.level, samples.view,
-                    per_pixel(samples, normal), *criteria(options or SearchOptions(), shape), wp.array(pairs, dtype=wp.vec4, device=device),
-                    samples.light_count, samples.pack_stride, samples.light_stride, *strides],
-                   [scratch, fitted], device=device)
+                   [samples.arrays, wp.empty((0, 0, 0), dtype=wp.float32, device=device), per_pixel(samples, normal),
+                    criteria(options, shape), wp.array(pairs, dtype=wp.vec4, device=device)], [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return _Mixed(values[:, :3], values[:, 3], values[:, 4].astype(np.uint8), values[:, 5] / samples.light_count)

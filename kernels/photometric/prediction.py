@@ -8,9 +8,10 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.hypotheses import Diffuse, criteria
 from kernels.photometric.lobes import direction_lobes
-from kernels.photometric.samples import Samples, host_values, per_pixel
+from kernels.photometric.robust_weights import Criteria
+from kernels.photometric.samples import Samples, host_values, per_pixel, samples_type, scratch_memory, scratch_type
 
 
 def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape: Diffuse) -> np.ndarray:
@@ -25,49 +26,39 @@ def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape:
     Returns:
         [n, lights] float32. Waits for the device.
     """
-    lanes, packs, lights = samples.lanes, samples.packs, samples.light_count
-    lobes = direction_lobes(lanes)
-    lane_type = pack_type(lanes, wp.float32)
-    predicted = wp.empty(packs * lights, dtype=lane_type, device=samples.device)
-    scratch = wp.empty(packs * lights * lobes.held, dtype=lane_type, device=samples.device)
-    devices.launch(_predict_kernel(lanes), packs,
-                   [samples.toward, wp.empty((0, 0, 0), dtype=wp.float32, device=samples.device), samples.view,
-                    per_pixel(samples, normal), per_pixel(samples, weights), criteria(SearchOptions(), shape)[2], lights,
-                    samples.pack_stride, samples.light_stride],
-                   [scratch, predicted], device=samples.device)
+    predicted = wp.empty_like(samples.grey)
+    devices.launch(_predict_kernel(samples.lanes), samples.packs,
+                   [samples.arrays, wp.empty((0, 0, 0), dtype=wp.float32, device=samples.device), per_pixel(samples, normal),
+                    per_pixel(samples, weights), criteria(None, shape)],
+                   [scratch_memory(samples, direction_lobes(samples.lanes).held), predicted], device=samples.device)
     return host_values(samples, predicted)
 
 
 @once
 def _predict_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
-    mixture, held, _, prepare, fill = direction_lobes(lanes)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
+    mixture, _, _, prepare, fill = direction_lobes(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def predict_kernel(first: int,
-                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                       samples: samples_struct,
                        table: wp.array3d(dtype=float),  # of no use to lights of one direction
-                       view: wp.array2d(dtype=lane_type),  # [3, P]
                        normal: wp.array2d(dtype=lane_type),  # [3, P]
                        weights: wp.array2d(dtype=lane_type),  # [lobes, P]
-                       form: wp.vec2,  # diffuse roughness, slope
-                       light_count: int,
-                       pack_stride: int,
-                       light_stride: int,
+                       criteria: Criteria,
                        # outputs
-                       scratch: wp.array(dtype=lane_type),  # [P · L · held]
+                       scratch: scratch_struct,  # what the lobes hold
                        predicted: wp.array(dtype=lane_type)):  # [P · L]
         p = first + wp.tid()
-        start, base = p * pack_stride, p * light_count * held
-        prepare(toward, view[0, p], view[1, p], view[2, p], start, light_count, light_stride, base, 1, scratch)
-        fill(toward, table, form, normal[0, p], normal[1, p], normal[2, p], view[0, p], view[1, p], view[2, p],
-             start, light_count, light_stride, base, 1, scratch)
-        for light in range(light_count):
+        prepare(samples, p, scratch)
+        fill(samples, table, criteria.form, normal[0, p], normal[1, p], normal[2, p], p, scratch)
+        for light in range(samples.light_count):
             total = lane_type()
             for a in range(mixture):
-                f, x = scratch[base + light * held + a], weights[a, p]
+                f = scratch.values[p * scratch.pack_stride + light * scratch.light_stride + a * scratch.step]
+                x = weights[a, p]
                 for k in range(lanes):
                     total[k] += f[k] * x[k]
-            predicted[start + light * light_stride] = total
+            predicted[p * samples.pack_stride + light * samples.light_stride] = total
 
     return predict_kernel

@@ -21,8 +21,8 @@ from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes,
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.candidates import LEAST_NZ, tangents
 from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
-from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
-from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
+from kernels.photometric.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 
 LINEAR_TURNS = 2
 """Rounds of the robust linear fit before the first step."""
@@ -62,15 +62,12 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
     Returns:
         The best fit met on the way, never of higher cost than the first. Waits for the device.
     """
-    options = options or SearchOptions()
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     refined = wp.empty((5, packs), dtype=pack_type(lanes, wp.float32), device=device)
     start = np.concatenate([normal, roughness[:, None]], axis=1)
-    scratch, strides = scratch_memory(samples, HELD)
+    scratch = scratch_memory(samples, HELD)
     devices.launch(_refine_kernel(lanes), packs,
-                   [samples.colour, samples.toward, samples.level, samples.view, per_pixel(samples, start), *criteria(options, shape),
-                    samples.light_count, samples.pack_stride, samples.light_stride, *strides],
-                   [scratch, refined], device=device)
+                   [samples.arrays, per_pixel(samples, start), criteria(options, shape)], [scratch, refined], device=device)
     values = to_host(samples, refined)
     return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
 
@@ -101,53 +98,40 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
 @once
 def _refine_kernel(lanes: int) -> Any:
     write_weights = plain_weights(lanes)
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     channels = channels_type(lanes)
     triples = wp.types.matrix(shape=(9, lanes), dtype=wp.float32)  # [3 · channel + unknown]
     squares = wp.types.matrix(shape=(6, lanes), dtype=wp.float32)  # 00 01 02 11 12 22
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def refine_kernel(first: int,
-                      colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
-                      toward: wp.array2d(dtype=lane_type),  # [3, P · L]
-                      level: wp.array(dtype=lane_type),  # [P]
-                      view: wp.array2d(dtype=lane_type),  # [3, P]
+                      samples: samples_struct,
                       start: wp.array2d(dtype=lane_type),  # [4, P] normal, roughness
-                      noise: wp.vec2,  # s0, s1
-                      shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                      form: wp.vec2,  # diffuse roughness, slope
-                      light_count: int,
-                      pack_stride: int,
-                      light_stride: int,
-                      scratch_pack: int,
-                      scratch_step: int,
+                      criteria: Criteria,
                       # outputs
-                      scratch: wp.array(dtype=lane_type),  # [P · L · HELD]
+                      scratch: scratch_struct,  # HELD values a light
                       refined: wp.array2d(dtype=lane_type)):  # [5, P] normal, roughness, cost
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
+        vx = samples.view[0, p]
+        vy = samples.view[1, p]
+        vz = samples.view[2, p]
         nx = start[0, p]
         ny = start[1, p]
         nz = start[2, p]
         rough = start[3, p]
-        bright = level[p]
-        first_light = p * pack_stride
-        base = p * scratch_pack
-        light_step = HELD * scratch_step
-        write_weights(colour, bright, noise, first_light, light_count, light_stride, base, light_step, scratch_step, scratch)
-        for light in range(light_count):
-            element = first_light + light * light_stride
-            lx = toward[0, element]
-            ly = toward[1, element]
-            lz = toward[2, element]
+        write_weights(samples, criteria.noise, p, 0, scratch)
+        for light in range(samples.light_count):
+            element = p * samples.pack_stride + light * samples.light_stride
+            lx = samples.toward[0, element]
+            ly = samples.toward[1, element]
+            lz = samples.toward[2, element]
             hv, rise = lane_type(), lane_type()
             for k in range(lanes):
                 hv[k] = wp.sqrt(wp.max(0.5 + 0.5 * (lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]), 2.5e-7))
                 rise[k] = schlick(hv[k])
-            scratch[base + light * light_step + WEIGHT_ROWS * scratch_step] = hv
-            scratch[base + light * light_step + wp.static(WEIGHT_ROWS + 1) * scratch_step] = rise
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            scratch.values[at + WEIGHT_ROWS * scratch.step] = hv
+            scratch.values[at + wp.static(WEIGHT_ROWS + 1) * scratch.step] = rise
         best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
@@ -175,14 +159,14 @@ def _refine_kernel(lanes: int) -> Any:
             rd, rs = channels(), channels()
             jd, js, jy = triples(), triples(), triples()
             jj = squares()
-            for light in range(light_count):
-                element = first_light + light * light_stride
-                at = base + light * light_step
-                lx = toward[0, element]
-                ly = toward[1, element]
-                lz = toward[2, element]
-                hv = scratch[at + WEIGHT_ROWS * scratch_step]
-                rise = scratch[at + wp.static(WEIGHT_ROWS + 1) * scratch_step]
+            for light in range(samples.light_count):
+                element = p * samples.pack_stride + light * samples.light_stride
+                at = p * scratch.pack_stride + light * scratch.light_stride
+                lx = samples.toward[0, element]
+                ly = samples.toward[1, element]
+                lz = samples.toward[2, element]
+                hv = scratch.values[at + WEIGHT_ROWS * scratch.step]
+                rise = scratch.values[at + wp.static(WEIGHT_ROWS + 1) * scratch.step]
                 # responses, and their derivatives by the two tilts and the roughness
                 fd, fs, fixed, d0, d1 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 s0, s1, s2 = lane_type(), lane_type(), lane_type()
@@ -194,7 +178,7 @@ def _refine_kernel(lanes: int) -> Any:
                     nl = wp.max(cosine, 0.0)
                     lobe, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl, nv[k], (cosine + nv[k]) * inverse, alpha[k], view_root[k],
                                                                      view_slope[k])
-                    value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv[k] * hv[k], form[0], form[1])
+                    value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv[k] * hv[k], criteria.form[0], criteria.form[1])
                     fd[k] = INVERSE_PI * value
                     d0[k] = INVERSE_PI * (on_l * la + on_v * va[k])
                     d1[k] = INVERSE_PI * (on_l * lo + on_v * vo[k])
@@ -203,11 +187,11 @@ def _refine_kernel(lanes: int) -> Any:
                     s0[k] = by_h * (la + va[k]) * inverse + by_l * la + by_v * va[k]
                     s1[k] = by_h * (lo + vo[k]) * inverse + by_l * lo + by_v * vo[k]
                     s2[k] = by_a2 * 4.0 * alpha[k] * rough[k]
-                plain = scratch[at]
+                plain = scratch.values[at]
                 off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
                 for c in range(3):
-                    y = colour[c, element]
-                    inverse_sigma = scratch[at + (1 + c) * scratch_step]
+                    y = samples.colour[c, element]
+                    inverse_sigma = scratch.values[at + (1 + c) * scratch.step]
                     for k in range(lanes):
                         predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
                         off = (y[k] - predicted) * inverse_sigma[k]
@@ -216,7 +200,7 @@ def _refine_kernel(lanes: int) -> Any:
                         expected[k] += predicted
                 wd, ws = lane_type(), lane_type()
                 for k in range(lanes):
-                    weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], shadow)
+                    weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], criteria.shadow)
                     w[k] = weight
                     product[k] = product[k] * factor
                     wd[k] = weight * fd[k]
@@ -229,7 +213,7 @@ def _refine_kernel(lanes: int) -> Any:
                         cost[k] += log_of(product[k])
                         product[k] = 1.0
                 for c in range(3):
-                    y = colour[c, element]
+                    y = samples.colour[c, element]
                     for k in range(lanes):
                         left = y[k] - fixed[k]
                         shine = f0[c, k] * (1.0 - rise[k]) + rise[k]

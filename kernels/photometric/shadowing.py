@@ -12,9 +12,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
 from kernels.photometric.near import Places
-from kernels.photometric.samples import Samples
+from kernels.photometric.samples import Samples, samples_type
 from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
 
 
@@ -41,19 +40,17 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     where = wp.array(pixels[order], dtype=wp.int32, device=samples.device)
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
-                   [samples.toward, wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
-                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy())),
-                    samples.light_count, samples.pack_stride, samples.light_stride], [samples.grey, samples.colour],
-                   device=samples.device)
+                   [wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
+                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy()))],
+                   [samples.arrays], device=samples.device)
 
 
 @once
 def _exclude_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    samples_struct = samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def exclude_kernel(first: int,
-                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
                        places: wp.array(dtype=wp.vec4),  # [L or padded] position and 1, or anything and 0
                        pixels: wp.array(dtype=wp.int32),  # [P · lanes]
                        height: wp.array2d(dtype=float),
@@ -63,24 +60,20 @@ def _exclude_kernel(lanes: int) -> Any:
                        centre: wp.vec2,
                        box: wp.vec4i,
                        highest: float,
-                       light_count: int,
-                       pack_stride: int,
-                       light_stride: int,
                        # outputs
-                       grey: wp.array(dtype=lane_type),
-                       colour: wp.array2d(dtype=lane_type)):
+                       samples: samples_struct):
         p = first + wp.tid()
         cols = mask.shape[1]
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
             place = places[light]
-            lx = toward[0, at]
-            ly = toward[1, at]
-            lz = toward[2, at]
-            y = grey[at]
-            red = colour[0, at]
-            green = colour[1, at]
-            blue = colour[2, at]
+            lx = samples.toward[0, at]
+            ly = samples.toward[1, at]
+            lz = samples.toward[2, at]
+            y = samples.grey[at]
+            red = samples.colour[0, at]
+            green = samples.colour[1, at]
+            blue = samples.colour[2, at]
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 row, col = n / cols, n % cols
@@ -92,9 +85,9 @@ def _exclude_kernel(lanes: int) -> Any:
                     red[k] = -1.0
                     green[k] = -1.0
                     blue[k] = -1.0
-            grey[at] = y
-            colour[0, at] = red
-            colour[1, at] = green
-            colour[2, at] = blue
+            samples.grey[at] = y
+            samples.colour[0, at] = red
+            samples.colour[1, at] = green
+            samples.colour[2, at] = blue
 
     return exclude_kernel

@@ -12,7 +12,7 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.photometric.samples import Samples, per_pixel
+from kernels.photometric.samples import Samples, per_pixel, samples_type
 
 LEAST_PART = 0.5
 """Least part of the light of a source, as the pixel reflects it, at which its reading is used: below it, the shape of the shadow's
@@ -33,35 +33,30 @@ def divide_by_visible(samples: Samples, part: np.ndarray) -> None:
     if part.shape != (samples.pixel_count, samples.light_count):
         raise ArrayError(f"part is {part.shape}: give one number for each of {samples.pixel_count} pixels and {samples.light_count} lights")
     devices.launch(_divide_kernel(samples.lanes), samples.packs,
-                   [per_pixel(samples, part), samples.light_count, samples.pack_stride, samples.light_stride],
-                   [samples.grey, samples.colour], device=samples.device)
+                   [per_pixel(samples, part)], [samples.arrays], device=samples.device)
 
 
 @once
 def _divide_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def divide_kernel(first: int,
                       part: wp.array2d(dtype=lane_type),  # [L, P]
-                      light_count: int,
-                      pack_stride: int,
-                      light_stride: int,
                       # outputs
-                      grey: wp.array(dtype=lane_type),  # [P · L]
-                      colour: wp.array2d(dtype=lane_type)):  # [3, P · L]
+                      samples: samples_struct):
         p = first + wp.tid()
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
             seen = part[light, p]
-            y = grey[at]
+            y = samples.grey[at]
             for k in range(lanes):
                 y[k] = wp.where(seen[k] >= LEAST_PART, y[k] / wp.max(seen[k], LEAST_PART), -1.0)
-            grey[at] = y
+            samples.grey[at] = y
             for c in range(3):
-                channel = colour[c, at]
+                channel = samples.colour[c, at]
                 for k in range(lanes):
                     channel[k] = wp.where(seen[k] >= LEAST_PART, channel[k] / wp.max(seen[k], LEAST_PART), -1.0)
-                colour[c, at] = channel
+                samples.colour[c, at] = channel
 
     return divide_kernel
