@@ -35,6 +35,21 @@ def entry(row: int, column: int):
     return row * (row + 1) / 2 + column
 
 
+@wp.func
+def moved_by(n: wp.vec3, along: wp.vec3, across: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """Return the unit normal moved by a step along its tangents, and along the view v where it would look away from the viewer."""
+    mx = n[0] + along[0] + across[0]
+    my = n[1] + along[1] + across[1]
+    mz = n[2] + along[2] + across[2]
+    size = wp.sqrt(mx * mx + my * my + mz * mz)
+    lift = wp.max(LEAST_NZ - (mx * v[0] + my * v[1] + mz * v[2]) / size, 0.0)
+    mx = mx / size + lift * v[0]
+    my = my / size + lift * v[1]
+    mz = mz / size + lift * v[2]
+    unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
+    return wp.vec3(mx * unit, my * unit, mz * unit)
+
+
 @once
 def descent_kernel(lanes: int) -> Any:
     """Return the kernel for one width of packs."""
@@ -44,6 +59,54 @@ def descent_kernel(lanes: int) -> Any:
     triangle = wp.types.matrix(shape=(UNKNOWNS * (UNKNOWNS + 1) // 2, lanes), dtype=wp.float32)
     widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
     gloss = len(LOBES)
+
+    @wp.func
+    def eliminated(x: mixture, g: triangle, r: rows):
+        """Return the L D Lᵀ of normal equations without the weights above 0, those at 0 having no row, and their right-hand side."""
+        on, y = rows(), rows()
+        left = triangle()
+        for a in range(UNKNOWNS):
+            for k in range(lanes):
+                on[a, k] = 1.0
+        for a in range(MIXTURE):
+            for k in range(lanes):
+                on[a, k] = wp.where(x[a, k] > 0.0, 1.0, 0.0)
+        for a in range(UNKNOWNS):
+            for k in range(lanes):
+                y[a, k] = on[a, k] * r[a, k]
+            for b in range(a + 1):
+                for k in range(lanes):
+                    left[entry(a, b), k] = on[a, k] * on[b, k] * g[entry(a, b), k]
+        for b in range(MIXTURE):
+            inverse_pivot = lane_type()
+            for k in range(lanes):
+                pivot = left[entry(b, b), k]
+                inverse_pivot[k] = wp.where(pivot > LEAST_PIVOT * g[entry(b, b), k], 1.0 / wp.max(pivot, 1.0e-30), 0.0)
+            for a in range(b + 1, UNKNOWNS):
+                share = lane_type()
+                for k in range(lanes):
+                    share[k] = left[entry(a, b), k] * inverse_pivot[k]
+                    y[a, k] -= share[k] * y[b, k]
+                for c in range(b + 1, a + 1):
+                    for k in range(lanes):
+                        left[entry(a, c), k] -= share[k] * left[entry(c, b), k]
+        return left, y
+
+    @wp.func
+    def mixed(x: mixture, g: triangle, r: rows, pivots: mixture):
+        """Return the weights after SWEEPS coordinate sweeps of the non-negative solve."""
+        sweeps = int(SWEEPS)  # a literal would be unrolled
+        for _ in range(sweeps):
+            for a in range(MIXTURE):
+                rest = lane_type()
+                for k in range(lanes):
+                    rest[k] = r[a, k]
+                for b in range(MIXTURE):
+                    for k in range(lanes):
+                        rest[k] -= g[entry(wp.max(a, b), wp.min(a, b)), k] * x[b, k]
+                for k in range(lanes):
+                    x[a, k] = wp.max(x[a, k] + rest[k] * pivots[a, k], 0.0)
+        return x
 
     # on CUDA every element must have a register of its own, on the CPU the lanes are what the compiler unrolls
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0 if lanes > 1 else 2 * UNKNOWNS})
@@ -77,7 +140,6 @@ def descent_kernel(lanes: int) -> Any:
             given_weight = weights[a, p]
             for k in range(lanes):
                 x[a, k] = given_weight[k]
-        sweeps = int(SWEEPS)  # a literal would be unrolled
         variance = float(soft[0])  # relative to that of the noise
         for turn in range(turns[1]):
             narrow = 1.0 / wp.max(variance, 1.0)
@@ -182,34 +244,7 @@ def descent_kernel(lanes: int) -> Any:
                 r[TILT, k] += draw * (ux[k] * ax[k] + uy[k] * ay[k] + uz[k] * az[k])
                 r[OTHER, k] += draw * (ux[k] * ox[k] + uy[k] * oy[k] + uz[k] * oz[k])
                 worse[k] = judged * wp.where(total[k] >= best[k], 1.0, 0.0) * wp.where(undone[k] == 0.0, 1.0, 0.0)
-            # eliminate the weights above zero: L D Lᵀ of their rows; those at zero have none
-            on, y = rows(), rows()
-            left = triangle()
-            for a in range(UNKNOWNS):
-                for k in range(lanes):
-                    on[a, k] = 1.0
-            for a in range(MIXTURE):
-                for k in range(lanes):
-                    on[a, k] = wp.where(x[a, k] > 0.0, 1.0, 0.0)
-            for a in range(UNKNOWNS):
-                for k in range(lanes):
-                    y[a, k] = on[a, k] * r[a, k]
-                for b in range(a + 1):
-                    for k in range(lanes):
-                        left[entry(a, b), k] = on[a, k] * on[b, k] * g[entry(a, b), k]
-            for b in range(MIXTURE):
-                inverse_pivot = lane_type()
-                for k in range(lanes):
-                    pivot = left[entry(b, b), k]
-                    inverse_pivot[k] = wp.where(pivot > LEAST_PIVOT * g[entry(b, b), k], 1.0 / wp.max(pivot, 1.0e-30), 0.0)
-                for a in range(b + 1, UNKNOWNS):
-                    share = lane_type()
-                    for k in range(lanes):
-                        share[k] = left[entry(a, b), k] * inverse_pivot[k]
-                        y[a, k] -= share[k] * y[b, k]
-                    for c in range(b + 1, a + 1):
-                        for k in range(lanes):
-                            left[entry(a, c), k] -= share[k] * left[entry(c, b), k]
+            left, y = eliminated(x, g, r)
             # keep what costs less, go back from what costs more, and step
             step_a, step_o = lane_type(), lane_type()
             for k in range(lanes):
@@ -249,29 +284,13 @@ def descent_kernel(lanes: int) -> Any:
                     x[a, k] = wp.where(worse[k] > 0.0, x_best[a, k], x[a, k])
                     pivots[a, k] = (1.0 - worse[k]) / (g[entry(a, a), k] + 1.0e-8)
                     r[a, k] -= g[entry(TILT, a), k] * step_a[k] + g[entry(OTHER, a), k] * step_o[k]
-            for _ in range(sweeps):
-                for a in range(MIXTURE):
-                    rest = lane_type()
-                    for k in range(lanes):
-                        rest[k] = r[a, k]
-                    for b in range(MIXTURE):
-                        for k in range(lanes):
-                            rest[k] -= g[entry(wp.max(a, b), wp.min(a, b)), k] * x[b, k]
-                    for k in range(lanes):
-                        x[a, k] = wp.max(x[a, k] + rest[k] * pivots[a, k], 0.0)
+            x = mixed(x, g, r, pivots)
             for k in range(lanes):
-                mx = nx[k] + step_a[k] * ax[k] + step_o[k] * ox[k]
-                my = ny[k] + step_a[k] * ay[k] + step_o[k] * oy[k]
-                mz = nz[k] + step_a[k] * az[k] + step_o[k] * oz[k]
-                size = wp.sqrt(mx * mx + my * my + mz * mz)
-                lift = wp.max(LEAST_NZ - (mx * vx[k] + my * vy[k] + mz * vz[k]) / size, 0.0)
-                mx = mx / size + lift * vx[k]
-                my = my / size + lift * vy[k]
-                mz = mz / size + lift * vz[k]
-                unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
-                nx[k] = mx * unit
-                ny[k] = my * unit
-                nz[k] = mz * unit
+                n = moved_by(wp.vec3(nx[k], ny[k], nz[k]), step_a[k] * wp.vec3(ax[k], ay[k], az[k]), step_o[k] * wp.vec3(ox[k], oy[k], oz[k]),
+                             wp.vec3(vx[k], vy[k], vz[k]))
+                nx[k] = n[0]
+                ny[k] = n[1]
+                nz[k] = n[2]
         for k in range(lanes):
             best[k] = best[k] / float(samples.light_count)
             curvature[k] = curvature[k] / float(samples.light_count)

@@ -62,6 +62,8 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
         vx = samples.view[0, p]
         vy = samples.view[1, p]
         vz = samples.view[2, p]
+        noise = criteria.noise
+        shadow = criteria.shadow
         light_count = samples.light_count
         start = p * samples.pack_stride
         base = p * scratch.pack_stride
@@ -104,14 +106,14 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                             for k in range(lanes):
                                 predicted[k] += f[k] * x_best[a, k]
                         for k in range(lanes):
-                            sigma = 1.0 / (criteria.noise[0] + criteria.noise[1] * wp.max(reading[k], 0.0))
+                            sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
                             off = (reading[k] - predicted[k]) * sigma
                             off2 = wp.where(turn == 0, 0.0, wp.min(off * off, LARGEST_SQUARE))
-                            dark = wp.where(reading[k] < criteria.shadow[1] * predicted[k], 1, 0) * wp.where(off2 > criteria.shadow[0], 1, 0)
+                            dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
                             given = inside * wp.where(reading[k] >= 0.0, 1.0, 0.0)
                             trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
                             w[j, k] = given * trust * sigma * sigma / (1.0 + off2)
-                            product[k] = product[k] * (1.0 + given * wp.where(dark == 1, criteria.shadow[0], off2))
+                            product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
                     if turn == reweightings and triple % wp.static(LOG_GROUP // 3) == wp.static(LOG_GROUP // 3 - 1):
                         for k in range(lanes):
                             total[k] += log_of(product[k])
