@@ -8,7 +8,7 @@ belongs to the standard deviation.
 import numpy as np
 
 from kernels.photometric.candidates import rings
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import Material, explains, fit_given_f0, is_dielectric, outlying
 from kernels.photometric.metal_search import moved
 from kernels.photometric.samples import Samples, choose, to_host
@@ -19,8 +19,7 @@ RING_COUNT = 6
 """Candidates on each of them."""
 
 
-def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: Diffuse,
-                options: SearchOptions | None = None) -> np.ndarray:
+def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: Diffuse) -> np.ndarray:
     """Return the angle in degrees, [n] float32, to a normal that explains the pixel about as well with the shared F0.
 
     It is 0 where F0 is not far above the shared ones, and where no such normal was found.
@@ -31,7 +30,6 @@ def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared
         material: of material.fit_material.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
         shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
     """
     doubt = np.zeros(len(normal), np.float32)
     common = shared[is_dielectric(shared), 0]
@@ -43,12 +41,12 @@ def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared
         return doubt
     few, best = choose(samples, at), normal[at].astype(np.float64)
     view = to_host(few, few.view)
-    least = fit_given_f0(few, normal[at], float(common.max()), shape=shape, options=options)
+    least = fit_given_f0(few, normal[at], float(common.max()), shape=shape)
     for degrees in RINGS:
         middle = best.copy()
         for offset in rings((degrees,), RING_COUNT)[1:]:
             candidate = moved(middle, offset, view)
-            trial = fit_given_f0(few, candidate, float(common.max()), shape=shape, options=options)
+            trial = fit_given_f0(few, candidate, float(common.max()), shape=shape)
             lower = trial.cost < least.cost
             best[lower], least.cost[lower] = candidate[lower], trial.cost[lower]
     known = Material(*(plane[at] for plane in material))

@@ -37,18 +37,16 @@ class LeftOut(NamedTuple):
         return self.general / max(self.lambert, 1e-9)
 
 
-def leave_out(samples: Samples, start: np.ndarray, *, options: SearchOptions | None = None) -> LeftOut:
+def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     """Predict the readings of each light from those of the others.
 
     Args:
         samples: some hundreds of pixels, spread over the object, under four lights or more.
         start: [n, 3] unit normals to begin from.
-        options: how readings are judged.
 
     Returns:
         Costs of both predictions. Waits for the device.
     """
-    options = options or SearchOptions()
     lights = samples.light_count
     readings = host_values(samples, samples.grey).astype(np.float64)
     toward = np.stack([host_values(samples, samples.toward[axis]) for axis in range(3)], axis=-1).astype(np.float64)
@@ -59,11 +57,11 @@ def leave_out(samples: Samples, start: np.ndarray, *, options: SearchOptions | N
         kept = np.where(out, -1.0, readings)
         lambertian = _lambert(kept, toward)
         rest = samples._replace(grey=device_values(samples, kept))
-        found = find_normals(rest, start, shape=Diffuse(), options=options, sweep=QUICK).best
+        found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
         general = predict(samples, found.normal, found.weights, shape=Diffuse())
         given = readings[:, out] >= 0
         for kept_costs, predicted in zip(costs, (general, np.einsum("nlc,nc->nl", toward, lambertian)), strict=True):
-            kept_costs.append(_cost(readings[:, out], np.maximum(predicted[:, out], 0), options)[given])
+            kept_costs.append(_cost(readings[:, out], np.maximum(predicted[:, out], 0))[given])
     return LeftOut(*(float(np.concatenate(each).mean()) if sum(map(len, each)) else 0.0 for each in costs))
 
 
@@ -74,8 +72,9 @@ def _lambert(readings: np.ndarray, toward: np.ndarray) -> np.ndarray:
     return np.linalg.solve(gram, np.einsum("nl,nli->ni", weights * readings, toward)[..., None])[..., 0]
 
 
-def _cost(readings: np.ndarray, predicted: np.ndarray, options: SearchOptions) -> np.ndarray:
+def _cost(readings: np.ndarray, predicted: np.ndarray) -> np.ndarray:
     """Return the cost of each reading as the search counts it."""
+    options = SearchOptions()
     squared = ((readings - predicted) / (options.noise_floor + options.noise_slope * np.maximum(readings, 0))) ** 2
     dark = (readings < options.shadow_depth * predicted) & (squared > np.expm1(options.shadow_cost))
     return np.where(dark, options.shadow_cost, np.log1p(squared))

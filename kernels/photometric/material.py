@@ -97,7 +97,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     own = _where(metal, tinted, neutral)
     if shared is None or not len(shared):
         return own
-    blend = _blend([fit_given(samples, normal, material, shape=shape, options=options) for material in shared])
+    blend = _blend([fit_given(samples, normal, material, shape=shape) for material in shared])
     explained = explains(blend, own)
     found = _where(explained, blend, own)
     common = np.unique(shared[is_dielectric(shared), 0])
@@ -108,7 +108,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
         return found
     few, there = choose(samples, doubtful), normal[doubtful]
     cold = _fit(few, there, shape, options, None, NEUTRAL, np.full(4, BRIGHTEST_DIELECTRIC), anew=True)
-    one_f0 = [fit_given_f0(few, there, f0, shape=shape, options=options) for f0 in common]
+    one_f0 = [fit_given_f0(few, there, f0, shape=shape) for f0 in common]
     again = _reconcile(_pick(own, doubtful), cold, one_f0, _pick(blend, doubtful), common)
     for plane, better in zip(found, again, strict=True):
         plane[doubtful] = better
@@ -130,34 +130,33 @@ def is_dielectric(materials: np.ndarray) -> np.ndarray:
     return np.asarray((np.ptp(materials[:, :3], axis=1) == 0) & (materials[:, 0] <= BRIGHTEST_DIELECTRIC))
 
 
-def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
+def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> Material:
     """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost.
 
     Args:
-        samples, normal, shape, options: as for fit_material.
+        samples, normal, shape: as for fit_material.
     """
-    return _fit(samples, normal, shape, options, None, TINTED)
+    return _fit(samples, normal, shape, None, None, TINTED)
 
 
-def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse,
-              options: SearchOptions | None = None) -> Material:
+def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse) -> Material:
     """Fit the albedo of sampled pixels to a specular lobe that is given.
 
     Args:
-        samples, normal, shape, options: as for fit_material.
+        samples, normal, shape: as for fit_material.
         material: [4] F0 and roughness.
     """
-    return _fit(samples, normal, shape, options, None, GIVEN, material)
+    return _fit(samples, normal, shape, None, None, GIVEN, material)
 
 
-def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
+def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse) -> Material:
     """Fit albedo and roughness of sampled pixels to an F0 that is given. Each roughness begins with the weights of readings without misfit.
 
     Args:
-        samples, normal, shape, options: as for fit_material.
+        samples, normal, shape: as for fit_material.
         f0: of all channels.
     """
-    return _fit(samples, normal, shape, options, None, GIVEN_F0, np.full(4, f0), anew=True)
+    return _fit(samples, normal, shape, None, None, GIVEN_F0, np.full(4, f0), anew=True)
 
 
 def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions | None, table: wp.array | None, freedom: int,

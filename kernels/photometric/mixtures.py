@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.hypotheses import Diffuse, criteria
 from kernels.photometric.lobes import RESPONSES, direction_reflectance
 from kernels.photometric.material import COST_FLOOR, Material
 from kernels.photometric.mixture_kernel import MIXED_ROWS, mixture_kernel
@@ -54,8 +54,7 @@ class _Mixed(NamedTuple):
     cost: np.ndarray  # [n] per light
 
 
-def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: Diffuse,
-                 options: SearchOptions | None = None) -> np.ndarray:
+def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: Diffuse) -> np.ndarray:
     """Choose the pairs of shared materials that pixels mix.
 
     Args:
@@ -64,14 +63,13 @@ def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, si
         materials: [materials, 4] F0 and roughness, of shared_materials.choose_materials.
         single: what one material a pixel makes of the same samples.
         shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
 
     Returns:
         [pairs, 2, 4] float32, the pair that explains most first; none where two materials explain no pixel clearly better than
         one. Waits for the device.
     """
     pairs = np.array([(materials[i], materials[j]) for i in range(len(materials)) for j in range(i)], dtype=np.float32).reshape(-1, 2, 4)
-    fits = [_fit(samples, normal, pair[None], shape, options) for pair in pairs]
+    fits = [_fit(samples, normal, pair[None], shape) for pair in pairs]
     best, chosen = single.cost, []
     while fits and len(chosen) < MOST_PAIRS:
         saved = [np.where(_better(fit, single.cost), np.maximum(best - fit.cost, 0), 0) for fit in fits]
@@ -83,8 +81,7 @@ def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, si
     return pairs[chosen]
 
 
-def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *, shape: Diffuse,
-                  options: SearchOptions | None = None) -> tuple[Material, Mixture]:
+def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *, shape: Diffuse) -> tuple[Material, Mixture]:
     """Replace the material of pixels that two materials explain clearly better than one.
 
     Args:
@@ -93,7 +90,6 @@ def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs:
         single: one material a pixel.
         pairs: [pairs, 2, 4] of choose_pairs.
         shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
 
     Returns:
         The materials, in mixed pixels with the albedo of both together and with F0 and roughness of single_lobe; and the mixture. Waits for
@@ -103,7 +99,7 @@ def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs:
     tried = np.flatnonzero(single.cost > COST_FLOOR)  # what costs less needs no second material
     if not len(tried) or not len(pairs):
         return single, mixture
-    fit = _fit(choose(samples, tried), normal[tried], pairs, shape, options)
+    fit = _fit(choose(samples, tried), normal[tried], pairs, shape)
     kept = _better(fit, single.cost[tried])
     mixed = tried[kept]
     material = Material(*(plane.copy() for plane in single))
@@ -135,12 +131,12 @@ def _better(fit: _Mixed, single_cost: np.ndarray) -> np.ndarray:
     return inside & (MIXED_RISE * fit.cost + COST_FLOOR < single_cost)
 
 
-def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse, options: SearchOptions | None) -> _Mixed:
+def _fit(samples: Samples, normal: np.ndarray, pairs: np.ndarray, shape: Diffuse) -> _Mixed:
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     fitted = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
     scratch = scratch_memory(samples, HELD)
     devices.launch(mixture_kernel(lanes, direction_reflectance(lanes)), packs,
                    [samples.arrays, wp.empty((0, 0, 0), dtype=wp.float32, device=device), per_pixel(samples, normal),
-                    criteria(options, shape), wp.array(pairs, dtype=wp.vec4, device=device)], [scratch, fitted], device=device)
+                    criteria(None, shape), wp.array(pairs, dtype=wp.vec4, device=device)], [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return _Mixed(values[:, :3], values[:, 3], values[:, 4].astype(np.uint8), values[:, 5] / samples.light_count)

@@ -20,7 +20,7 @@ from kernels.logarithm import log_of
 from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.candidates import LEAST_NZ, tangents
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
+from kernels.photometric.hypotheses import Diffuse, criteria
 from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
 from kernels.photometric.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 
@@ -48,8 +48,7 @@ class Refinement(NamedTuple):
     cost: np.ndarray  # [n] float32, per light, as of the material fit
 
 
-def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse,
-           options: SearchOptions | None = None) -> Refinement:
+def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse) -> Refinement:
     """Refine the normal and material of sampled pixels under lights of one direction each.
 
     Args:
@@ -57,7 +56,6 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
         normal: [n, 3] unit normals, within a few degrees of the truth.
         roughness: [n] of the material fit at these normals.
         shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
 
     Returns:
         The best fit met on the way, never of higher cost than the first. Waits for the device.
@@ -67,7 +65,7 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
     start = np.concatenate([normal, roughness[:, None]], axis=1)
     scratch = scratch_memory(samples, HELD)
     devices.launch(_refine_kernel(lanes), packs,
-                   [samples.arrays, per_pixel(samples, start), criteria(options, shape)], [scratch, refined], device=device)
+                   [samples.arrays, per_pixel(samples, start), criteria(None, shape)], [scratch, refined], device=device)
     values = to_host(samples, refined)
     return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
 

@@ -17,7 +17,7 @@ import numpy as np
 from kernels.photometric.certainty import assess
 from kernels.photometric.descent import WARM, descend
 from kernels.photometric.f0_doubt import doubt_of_f0
-from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions
+from kernels.photometric.hypotheses import Diffuse, Prior
 from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
 from kernels.photometric.metal_search import Metals, search_metals
 from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
@@ -51,7 +51,7 @@ class SvbrdfFit(NamedTuple):
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: Diffuse | None = None,
-                 options: SearchOptions | None = None, shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
+                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
                  beside: np.ndarray | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
@@ -61,7 +61,6 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
         shape: of the diffuse lobe under which normals are found, from diffuse_shape.choose_diffuse.
         lobe: the shape under which materials are fitted; None: the same.
-        options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         pairs: [pairs, 2, 4] of mixtures.choose_pairs.
         metals: of metal_search.metals_of; None: normals are not searched under shared metals.
@@ -78,38 +77,38 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         ArrayError: shapes that do not fit.
     """
     lobe = shape if lobe is None else lobe
-    found = find_normals(samples, start, shape=shape, options=options, beside=beside, prior=prior)
+    found = find_normals(samples, start, shape=shape, beside=beside, prior=prior)
     normals, costs = [found.best.normal], [found.best.cost]
     for nearby in nearby_shapes(shape):
-        other = descend(samples, found.best.normal, shape=nearby, options=options, weights=found.best.weights, prior=prior, schedule=WARM)
+        other = descend(samples, found.best.normal, shape=nearby, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
     if single_lobe and prior is None:
         if roughness is None:
-            roughness = fit_tinted(samples, found.best.normal, shape=shape, options=options).roughness
-        single = refine(samples, found.best.normal, roughness, shape=shape, options=options)
+            roughness = fit_tinted(samples, found.best.normal, shape=shape).roughness
+        single = refine(samples, found.best.normal, roughness, shape=shape)
         kinds = np.stack([np.min(costs, axis=0), SINGLE_LOBE_CHARGE * single.cost])
         normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE,
                                          spreads=np.stack([spread, np.zeros_like(spread)]))
     if prior is None:
-        material = fit_material(samples, normal, shape=lobe, options=options, shared=shared)
+        material = fit_material(samples, normal, shape=lobe, shared=shared)
         if metals is not None:
-            better = search_metals(samples, normal, material, metals, shape=lobe, options=options)
+            better = search_metals(samples, normal, material, metals, shape=lobe)
             moved = np.flatnonzero((better != normal).any(axis=1))
             if len(moved):
-                again = fit_material(choose(samples, moved), better[moved], shape=lobe, options=options, shared=shared)
+                again = fit_material(choose(samples, moved), better[moved], shape=lobe, shared=shared)
                 for plane, replaced in zip(material, again, strict=True):
                     plane[moved] = replaced
                 spread = np.hypot(spread, _angles(normal, better))
                 normal = better
     else:
-        material = fit_given(samples, normal, MATT, shape=lobe, options=options)
-        found = find_normals(samples, normal, shape=shape, options=options)  # the readings alone say how sure the normal is
+        material = fit_given(samples, normal, MATT, shape=lobe)
+        found = find_normals(samples, normal, shape=shape)  # the readings alone say how sure the normal is
         spread = np.hypot(spread, _angles(found.best.normal, normal))
-    material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe, options=options)
+    material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
-        spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe, options=options))
+        spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
     certainty = assess(samples, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
                      certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)
