@@ -286,9 +286,9 @@ def descent_kernel(lanes: int) -> Any:
                     r[a, k] -= g[entry(TILT, a), k] * step_a[k] + g[entry(OTHER, a), k] * step_o[k]
             x = mixed(x, g, r, pivots)
             for k in range(lanes):
-                along = step_a[k] * wp.vec3(ax[k], ay[k], az[k])
-                across = step_o[k] * wp.vec3(ox[k], oy[k], oz[k])
-                n = moved_by(wp.vec3(nx[k], ny[k], nz[k]), along, across, wp.vec3(vx[k], vy[k], vz[k]))
+                one = step_a[k] * wp.vec3(ax[k], ay[k], az[k])
+                two = step_o[k] * wp.vec3(ox[k], oy[k], oz[k])
+                n = moved_by(wp.vec3(nx[k], ny[k], nz[k]), one, two, wp.vec3(vx[k], vy[k], vz[k]))
                 nx[k] = n[0]
                 ny[k] = n[1]
                 nz[k] = n[2]
