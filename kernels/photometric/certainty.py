@@ -22,10 +22,9 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
 from kernels.photometric.candidates import candidate_at, rings
-from kernels.photometric.evidence import evidence
 from kernels.photometric.normal_search import Found
 from kernels.photometric.samples import Samples, per_pixel, to_host
-from kernels.photometric.survey import Survey
+from kernels.photometric.survey import Survey, evidence
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.descent import COLD, WARM, descend
-from kernels.photometric.hypotheses import Diffuse
-from kernels.photometric.prediction import predict
+from kernels.photometric.hypotheses import Diffuse, predict
 from kernels.photometric.samples import Samples, choose, device_values, host_values
 from kernels.photometric.untold_factors import untold
 

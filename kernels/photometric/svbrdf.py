@@ -4,6 +4,10 @@ Normals come from `normal_search` under the diffuse shape that the object shares
 joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel, first those of the mixture under all shapes
 and then their mean and that of the single lobe. The material then follows for the normal found.
 
+Towards the rim, and where bounced light fills the shadows, a pixel can trade a tilt of its normal for an F0. Where a tilted normal with the
+F0 that the object's dielectrics share explains a far brighter pixel about as well, the angle between both normals belongs to the standard
+deviation.
+
 Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
 model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the cost of normals is
@@ -14,16 +18,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.candidates import rings
 from kernels.photometric.certainty import assess
 from kernels.photometric.descent import WARM, descend
-from kernels.photometric.f0_doubt import doubt_of_f0
 from kernels.photometric.hypotheses import Diffuse, Prior
-from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
-from kernels.photometric.metal_search import Metals, search_metals
+from kernels.photometric.material import (
+    MATT,
+    Material,
+    explains,
+    fit_given,
+    fit_given_f0,
+    fit_material,
+    fit_tinted,
+    is_dielectric,
+    outlying,
+)
+from kernels.photometric.metal_search import Metals, moved, search_metals
 from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.refine import refine
-from kernels.photometric.samples import Samples, choose
+from kernels.photometric.samples import Samples, choose, to_host
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A
@@ -146,3 +160,45 @@ def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: floa
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the angles in degrees between unit vectors along the last axis."""
     return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
+
+
+RINGS = (2.0, 0.8, 0.3, 0.12)
+"""Radii in degrees of the rings of candidates, each about the best so far."""
+RING_COUNT = 6
+"""Candidates on each of them."""
+
+
+def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+    """Return the angle in degrees, [n] float32, to a normal that explains the pixel about as well with the shared F0.
+
+    It is 0 where F0 is not far above the shared ones, and where no such normal was found.
+
+    Args:
+        samples: readings.
+        normal: [n, 3] unit normals.
+        material: of material.fit_material.
+        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
+        shape: of the diffuse lobe.
+    """
+    doubt = np.zeros(len(normal), np.float32)
+    common = shared[is_dielectric(shared), 0]
+    if not len(common):
+        return doubt
+    lobes = np.column_stack([material.specular, material.roughness])
+    at = np.flatnonzero(is_dielectric(lobes) & outlying(material.specular, common))
+    if not len(at):
+        return doubt
+    few, best = choose(samples, at), normal[at].astype(np.float64)
+    view = to_host(few, few.view)
+    least = fit_given_f0(few, normal[at], float(common.max()), shape=shape)
+    for degrees in RINGS:
+        middle = best.copy()
+        for offset in rings((degrees,), RING_COUNT)[1:]:
+            candidate = moved(middle, offset, view)
+            trial = fit_given_f0(few, candidate, float(common.max()), shape=shape)
+            lower = trial.cost < least.cost
+            best[lower], least.cost[lower] = candidate[lower], trial.cost[lower]
+    known = Material(*(plane[at] for plane in material))
+    angle = np.degrees(np.arccos(np.clip((best * normal[at]).sum(axis=1), -1, 1)))
+    doubt[at] = np.where(explains(least, known), angle, 0)
+    return doubt

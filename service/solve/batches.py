@@ -10,8 +10,7 @@ from kernels.photometric.near import NearField, NearLights, see_near
 from kernels.photometric.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.samples import Samples, gather
 from kernels.status import Status
-from service.solve.several_devices import deal
-from service.solve.sharing import Results
+from service.solve.sharing import Results, deal
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS

@@ -19,8 +19,7 @@ from kernels.photometric.metal_search import Metals, metals_of
 from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.mixtures import HELD, NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.propagation import neighbours
+from kernels.photometric.normal_search import find_normals, neighbours
 from kernels.photometric.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly

@@ -7,7 +7,7 @@ interreflection are those of a surface that was solved without them.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from kernels.photometric.near import NearField, pad_places
 from kernels.photometric.readings import Lights, pad_lights
 from kernels.status import Status
 from service.requests.solve import Method
-from service.solve.distant import NormalSolver
 from service.solve.solution import Solution, SolveInput, mark_not_facing
 from service.solve.surface import integrate, mean_height, whole_surface
 from stage.point_lights import PlacedLights
@@ -33,6 +32,19 @@ shadow."""
 MATERIAL_ROUNDS = 4
 """Most rounds of `svbrdf`, which start on a surface that has nearly settled: a round leaves about a tenth of the change before it, where
 the object throws much light on itself a half. A round after the first is two thirds of its work."""
+
+
+class NormalSolver(Protocol):
+    """Solves the normals of every pixel of the mask from frames with one light each: `solve_diffuse` or `solve_material`."""
+
+    def __call__(self, given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
+        """Return the solution.
+
+        Args:
+            given: the images.
+            lights: lights of the stack, padded.
+            field: where the lights are, and the surface point of each pixel, where some light is near.
+        """
 
 
 class Rounds(NamedTuple):

@@ -18,7 +18,7 @@ from kernels.photometric.bounce import subtract_bounce
 from kernels.photometric.readings import Lights, channel_weights
 from kernels.photometric.samples import Samples
 from kernels.photometric.sampling import SHARP, Found
-from kernels.photometric.visible_part import LEAST_PART, divide_by_visible
+from kernels.photometric.shadowing import LEAST_PART, divide_by_visible
 from kernels.relight.occlusion import see_lights
 from kernels.status import Status
 from service.solve.batches import View

@@ -14,8 +14,7 @@ import warp as wp
 from kernels.photometric.readings import Lights, pad_lights
 from kernels.photometric.samples import evenly, readings_of
 from kernels.photometric.shadow_evidence import shadow_odds
-from kernels.surface.offsets import GROUPS, Offset, choose_offset, weigh_offsets
-from kernels.surface.part_shadows import march_part
+from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection
 from kernels.surface.slopes import STEEPEST
 from service.solve.batches import View, pick_pixels, view_directions
