@@ -10,7 +10,7 @@ from kernels import device as devices
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import REPORT_FILE, metadata, report
+from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, Method, SolveRequest
 from service.solve import integrability
 from service.solve.diagnosis import diagnose, raise_error
@@ -24,6 +24,7 @@ from service.solve.surface import guessed_part, height_warnings, integrate
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
 from stage.files import write_text
+from stage.ingest import LAYOUT
 from stage.maps import MAPS_FILE, SurfaceMaps
 from stage.point_lights import DistantLights
 from stage.radiance import clipping_sentences
@@ -136,7 +137,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged) -> SolveResul
         solution.warnings.append(_nothing_solved(counts))
     solution.warnings += height_warnings(judged.guessed, method)
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
-    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
+    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents) | {HASHING: str(LAYOUT)}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
