@@ -15,7 +15,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import MATT, METAL_DIFFUSE, Material, fit_given
 from kernels.photometric.near import NearField, falloff
@@ -30,10 +30,8 @@ def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, sha
     sends on nothing in this sense: what it mirrors comes from one direction.
 
     Args:
-        samples: the readings.
         normal: [n, 3] unit normals.
         tinted: of material.fit_tinted at these normals.
-        shape: of the diffuse lobe.
     """
     matt = fit_given(samples, normal, MATT, shape=shape).diffuse_albedo
     metal = tinted.diffuse_albedo.mean(axis=1) < METAL_DIFFUSE * tinted.specular.mean(axis=1)
@@ -100,9 +98,7 @@ def _bounce_kernel(lanes: int, near: bool) -> Any:
             at = p * samples.pack_stride + light * samples.light_stride
             taken, inverse = lane_type(), lane_type(1.0)  # inverse: 1 / falloff
             if wp.static(near):
-                px = points[0, p]
-                py = points[1, p]
-                pz = points[2, p]
+                px, py, pz = vector_at(points, p)
                 for k in range(lanes):
                     fall = falloff(places[light], lobes[light], px[k], py[k], pz[k])
                     inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)

@@ -76,9 +76,7 @@ def descend(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: Sea
     """Return the normal of least cost near the start of each sampled pixel, under lights of one direction each.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from.
-        shape: of the diffuse lobe.
         options: how normals are judged.
         weights: [n, lobes] of the mixture at the start; None: unknown.
         prior: normals that the result is drawn to, of which the costs include the cost; None: none.

@@ -7,7 +7,7 @@ import warp as wp
 from kernels.device import once
 from kernels.logarithm import log_of
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import LEAST_NZ, tangents
 from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
 from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
@@ -123,15 +123,9 @@ def descent_kernel(lanes: int) -> Any:
                        found: wp.array2d(dtype=lane_type)):  # [3, P] cost, curvature, swing
         p = first + wp.tid()
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
-        ux = drawn[0, p]
-        uy = drawn[1, p]
-        uz = drawn[2, p]
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
+        ux, uy, uz = vector_at(drawn, p)
+        nx, ny, nz = vector_at(normal, p)
         bx, by, bz = lane_type(), lane_type(), lane_type()
         best, damping, undone = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         curvature, swing = lane_type(), lane_type()
@@ -175,9 +169,7 @@ def descent_kernel(lanes: int) -> Any:
             for light in range(samples.light_count):
                 at = p * samples.pack_stride + light * samples.light_stride
                 reading = samples.grey[at]
-                lx = samples.toward[0, at]
-                ly = samples.toward[1, at]
-                lz = samples.toward[2, at]
+                lx, ly, lz = vector_at(samples.toward, at)
                 nl, la, lo, nh, inverse, fresnel = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 by_h, by_l, by_v, predicted, w = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 f = rows()

@@ -114,9 +114,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     """Find the candidate normal of least cost for each sampled pixel.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from.
-        shape: of the diffuse lobe.
         wide: radii of the first rings, about the start, in degrees, and the number of candidates on the last of them.
         fine: the same of the rings that follow, each about the best candidate so far.
         options: how candidates are judged.
@@ -163,7 +161,6 @@ def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape:
         samples: directions of lights and viewer.
         normal: [n, 3] unit normals.
         weights: [n, lobes] of the mixtures, from search_normals.
-        shape: of the diffuse lobe.
 
     Returns:
         [n, lights] float32. Waits for the device.

@@ -59,7 +59,6 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
         start: [n, 3] unit normals to begin from.
         directions: [lights, 3] unit, in the camera frame.
         row, col: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour.
-        shape: of the diffuse lobe.
     """
     half = (row + col) % 2 == 0
     square = np.unique(np.stack([row, col]), axis=1, return_inverse=True)[1].reshape(-1)

@@ -9,7 +9,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.microfacet import INVERSE_PI, diffuse, ggx_seen, masking_root, schlick
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.samples import samples_type, scratch_type
 
 LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
@@ -66,15 +66,11 @@ def direction_lobes(lanes: int) -> Lobes:
 
     @wp.func
     def prepare(samples: samples_struct, p: int, scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         for light in range(samples.light_count):
             at = p * scratch.pack_stride + light * scratch.light_stride
             element = p * samples.pack_stride + light * samples.light_stride
-            wx = samples.toward[0, element]
-            wy = samples.toward[1, element]
-            wz = samples.toward[2, element]
+            wx, wy, wz = vector_at(samples.toward, element)
             inverse, rise = lane_type(), lane_type()
             for k in range(lanes):
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
@@ -86,9 +82,7 @@ def direction_lobes(lanes: int) -> Lobes:
     @wp.func
     def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
              scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
         nv, view_root = lane_type(), roots()
         for k in range(lanes):
@@ -98,9 +92,7 @@ def direction_lobes(lanes: int) -> Lobes:
                 view_root[a, k] = masking_root(nv[k], alphas[a])
         for light in range(samples.light_count):
             element = p * samples.pack_stride + light * samples.light_stride
-            lx = samples.toward[0, element]
-            ly = samples.toward[1, element]
-            lz = samples.toward[2, element]
+            lx, ly, lz = vector_at(samples.toward, element)
             at = p * scratch.pack_stride + light * scratch.light_stride
             inverse = scratch.values[at + wp.static(MIXTURE) * scratch.step]
             rise = scratch.values[at + wp.static(MIXTURE + 1) * scratch.step]
@@ -129,17 +121,13 @@ def direction_reflectance(lanes: int) -> Reflectance:
     @wp.func
     def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type,
                 p: int, scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         nv = lane_type()
         for k in range(lanes):
             nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
         for light in range(samples.light_count):
             element = p * samples.pack_stride + light * samples.light_stride
-            lx = samples.toward[0, element]
-            ly = samples.toward[1, element]
-            lz = samples.toward[2, element]
+            lx, ly, lz = vector_at(samples.toward, element)
             fd, nl, nh, rise = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 hv2 = wp.max(0.5 + 0.5 * (lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]), 2.5e-7)
@@ -158,9 +146,7 @@ def direction_reflectance(lanes: int) -> Reflectance:
     @wp.func
     def respond(samples: samples_struct, table: wp.array3d(dtype=float), nx: lane_type, ny: lane_type, nz: lane_type, rough: lane_type,
                 p: int, scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         nv, view_root = lane_type(), lane_type()
         for k in range(lanes):
             nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
@@ -179,15 +165,11 @@ def direction_reflectance(lanes: int) -> Reflectance:
 
     @wp.func
     def lambertian(samples: samples_struct, form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         above, below, share = lane_type(), lane_type(), lane_type()
         for light in range(samples.light_count):
             at = p * samples.pack_stride + light * samples.light_stride
-            wx = samples.toward[0, at]
-            wy = samples.toward[1, at]
-            wz = samples.toward[2, at]
+            wx, wy, wz = vector_at(samples.toward, at)
             for k in range(lanes):
                 nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]

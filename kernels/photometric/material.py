@@ -72,9 +72,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     """Fit the material of sampled pixels.
 
     Args:
-        samples: their readings.
         normal: [n, 3] unit normals.
-        shape: of the diffuse lobe.
         options: noise and shadows, as in the search.
         table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel has a material of its own.
@@ -131,11 +129,7 @@ def is_dielectric(materials: np.ndarray) -> np.ndarray:
 
 
 def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> Material:
-    """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost.
-
-    Args:
-        samples, normal, shape: as for fit_material.
-    """
+    """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost."""
     return _fit(samples, normal, shape, None, None, TINTED)
 
 
@@ -143,7 +137,6 @@ def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, sha
     """Fit the albedo of sampled pixels to a specular lobe that is given.
 
     Args:
-        samples, normal, shape: as for fit_material.
         material: [4] F0 and roughness.
     """
     return _fit(samples, normal, shape, None, None, GIVEN, material)
@@ -153,7 +146,6 @@ def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diff
     """Fit albedo and roughness of sampled pixels to an F0 that is given. Each roughness begins with the weights of readings without misfit.
 
     Args:
-        samples, normal, shape: as for fit_material.
         f0: of all channels.
     """
     return _fit(samples, normal, shape, None, None, GIVEN_F0, np.full(4, f0), anew=True)

@@ -7,7 +7,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.packs import channels_type, pack_type
+from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.lobes import Reflectance
 from kernels.photometric.robust_weights import LOG_GROUP, Criteria, plain_weights, weigh
 from kernels.photometric.samples import samples_type, scratch_type
@@ -61,8 +61,6 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """Return the kernel for one width of packs and one kind of light.
 
     Args:
-        lanes: pixels of a pack.
-        reflectance: expected readings.
         bare: whether a surface without any specular lobe is a candidate of its own.
     """
     held, prepare, respond, lambertian = reflectance
@@ -85,9 +83,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                    scratch: scratch_struct,  # held + WEIGHT_ROWS values a light
                    fitted: wp.array2d(dtype=lane_type)):  # [8, P] albedo, F0, roughness, cost
         p = first + wp.tid()
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        nx, ny, nz = vector_at(normal, p)
         prepare(samples, table, criteria.form, nx, ny, nz, p, scratch)
         write_weights(samples, criteria.noise, p, held, scratch)
         best_cost, best_rough = lane_type(1.0e30), lane_type()

@@ -55,11 +55,9 @@ def search_metals(samples: Samples, normal: np.ndarray, material: Material, meta
     """Return the normals, [n, 3] float32, with those of metals replaced that a shared metal explains at less than half of the cost.
 
     Args:
-        samples: readings.
         normal: [n, 3] unit normals found so far.
         material: what they make of each pixel.
         metals: of the object.
-        shape: of the diffuse lobe.
     """
     tried = np.flatnonzero(SAVED * material.cost > metals.cost + COST_FLOOR)
     if not len(tried) or not len(metals.lobes):

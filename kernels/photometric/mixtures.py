@@ -17,7 +17,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.packs import channels_type, pack_type
+from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.hypotheses import Diffuse, criteria
 from kernels.photometric.lobes import RESPONSES, Reflectance, direction_reflectance
 from kernels.photometric.material import COST_FLOOR, Material
@@ -33,12 +33,7 @@ material reads, and how much more that of the first reads."""
 
 @once
 def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
-    """Return the kernel for one width of packs and one kind of light.
-
-    Args:
-        lanes: pixels of a pack.
-        reflectance: expected readings.
-    """
+    """Return the kernel for one width of packs and one kind of light."""
     held, prepare, respond, lambertian = reflectance
     write_weights = plain_weights(lanes)
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
@@ -55,9 +50,7 @@ def mixture_kernel(lanes: int, reflectance: Reflectance) -> Any:
                    scratch: scratch_struct,  # held + WEIGHT_ROWS + MIXED_ROWS values a light
                    fitted: wp.array2d(dtype=lane_type)):  # [6, P] albedo, abundance of the first material, pair, cost
         p = first + wp.tid()
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        nx, ny, nz = vector_at(normal, p)
         prepare(samples, table, criteria.form, nx, ny, nz, p, scratch)
         write_weights(samples, criteria.noise, p, held, scratch)
         best_cost, best_share, best_pair = lane_type(1.0e30), lane_type(), lane_type()
@@ -196,7 +189,6 @@ def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, si
         normal: [n, 3] unit normals.
         materials: [materials, 4] F0 and roughness, of shared_materials.choose_materials.
         single: what one material a pixel makes of the same samples.
-        shape: of the diffuse lobe.
 
     Returns:
         [pairs, 2, 4] float32, the pair that explains most first; none where two materials explain no pixel clearly better than
@@ -219,11 +211,9 @@ def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs:
     """Replace the material of pixels that two materials explain clearly better than one.
 
     Args:
-        samples: their readings.
         normal: [n, 3] unit normals.
         single: one material a pixel.
         pairs: [pairs, 2, 4] of choose_pairs.
-        shape: of the diffuse lobe.
 
     Returns:
         The materials, in mixed pixels with the albedo of both together and with F0 and roughness of single_lobe; and the mixture. Waits for

@@ -57,7 +57,6 @@ def propagate(samples: Samples, found: Descent, beside: np.ndarray, *, shape: Di
         samples: readings of n pixels.
         found: their descents.
         beside: [steps, n] of `neighbours`, or some of its rows.
-        shape, options, prior: as for the descents.
     """
     for neighbour in beside:
         better = (neighbour >= 0) & (found.cost[neighbour] < CLEARLY_LESS * found.cost) & (found.cost > LEAST_COST)
@@ -83,9 +82,7 @@ def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options
     """Find the normal of least cost of each sampled pixel, under lights of one direction each.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from.
-        shape: of the diffuse lobe.
         options: how normals are judged.
         beside: [steps, n] of propagation.neighbours; None: no pixel is another's neighbour.
         prior: normals that the results are drawn to, of which the costs include the cost; None: none.

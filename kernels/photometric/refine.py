@@ -52,10 +52,8 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
     """Refine the normal and material of sampled pixels under lights of one direction each.
 
     Args:
-        samples: their readings.
         normal: [n, 3] unit normals, within a few degrees of the truth.
         roughness: [n] of the material fit at these normals.
-        shape: of the diffuse lobe.
 
     Returns:
         The best fit met on the way, never of higher cost than the first. Waits for the device.
@@ -118,18 +116,28 @@ def _refine_kernel(lanes: int) -> Any:
         nz = start[2, p]
         rough = start[3, p]
         write_weights(samples, criteria.noise, p, 0, scratch)
+        shadow = criteria.shadow
+        form = criteria.form
+        colour = samples.colour
+        toward = samples.toward
+        values = scratch.values
+        light_stride = samples.light_stride
+        light_step = scratch.light_stride
+        step = scratch.step
+        first_light = p * samples.pack_stride
+        base = p * scratch.pack_stride
         for light in range(samples.light_count):
-            element = p * samples.pack_stride + light * samples.light_stride
-            lx = samples.toward[0, element]
-            ly = samples.toward[1, element]
-            lz = samples.toward[2, element]
+            element = first_light + light * light_stride
+            lx = toward[0, element]
+            ly = toward[1, element]
+            lz = toward[2, element]
             hv, rise = lane_type(), lane_type()
             for k in range(lanes):
                 hv[k] = wp.sqrt(wp.max(0.5 + 0.5 * (lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]), 2.5e-7))
                 rise[k] = schlick(hv[k])
-            at = p * scratch.pack_stride + light * scratch.light_stride
-            scratch.values[at + WEIGHT_ROWS * scratch.step] = hv
-            scratch.values[at + wp.static(WEIGHT_ROWS + 1) * scratch.step] = rise
+            at = base + light * light_step
+            values[at + WEIGHT_ROWS * step] = hv
+            values[at + wp.static(WEIGHT_ROWS + 1) * step] = rise
         best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
@@ -158,13 +166,13 @@ def _refine_kernel(lanes: int) -> Any:
             jd, js, jy = triples(), triples(), triples()
             jj = squares()
             for light in range(samples.light_count):
-                element = p * samples.pack_stride + light * samples.light_stride
-                at = p * scratch.pack_stride + light * scratch.light_stride
-                lx = samples.toward[0, element]
-                ly = samples.toward[1, element]
-                lz = samples.toward[2, element]
-                hv = scratch.values[at + WEIGHT_ROWS * scratch.step]
-                rise = scratch.values[at + wp.static(WEIGHT_ROWS + 1) * scratch.step]
+                element = first_light + light * light_stride
+                at = base + light * light_step
+                lx = toward[0, element]
+                ly = toward[1, element]
+                lz = toward[2, element]
+                hv = values[at + WEIGHT_ROWS * step]
+                rise = values[at + wp.static(WEIGHT_ROWS + 1) * step]
                 # responses, and their derivatives by the two tilts and the roughness
                 fd, fs, fixed, d0, d1 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 s0, s1, s2 = lane_type(), lane_type(), lane_type()
@@ -176,7 +184,7 @@ def _refine_kernel(lanes: int) -> Any:
                     nl = wp.max(cosine, 0.0)
                     lobe, by_h, by_l, by_v, by_a2 = ggx_with_slopes(nl, nv[k], (cosine + nv[k]) * inverse, alpha[k], view_root[k],
                                                                      view_slope[k])
-                    value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv[k] * hv[k], criteria.form[0], criteria.form[1])
+                    value, on_l, on_v = diffuse_with_slopes(nl, nv[k], hv[k] * hv[k], form[0], form[1])
                     fd[k] = INVERSE_PI * value
                     d0[k] = INVERSE_PI * (on_l * la + on_v * va[k])
                     d1[k] = INVERSE_PI * (on_l * lo + on_v * vo[k])
@@ -185,11 +193,11 @@ def _refine_kernel(lanes: int) -> Any:
                     s0[k] = by_h * (la + va[k]) * inverse + by_l * la + by_v * va[k]
                     s1[k] = by_h * (lo + vo[k]) * inverse + by_l * lo + by_v * vo[k]
                     s2[k] = by_a2 * 4.0 * alpha[k] * rough[k]
-                plain = scratch.values[at]
+                plain = values[at]
                 off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
                 for c in range(3):
-                    y = samples.colour[c, element]
-                    inverse_sigma = scratch.values[at + (1 + c) * scratch.step]
+                    y = colour[c, element]
+                    inverse_sigma = values[at + (1 + c) * step]
                     for k in range(lanes):
                         predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
                         off = (y[k] - predicted) * inverse_sigma[k]
@@ -198,7 +206,7 @@ def _refine_kernel(lanes: int) -> Any:
                         expected[k] += predicted
                 wd, ws = lane_type(), lane_type()
                 for k in range(lanes):
-                    weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], criteria.shadow)
+                    weight, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], shadow)
                     w[k] = weight
                     product[k] = product[k] * factor
                     wd[k] = weight * fd[k]
@@ -211,7 +219,7 @@ def _refine_kernel(lanes: int) -> Any:
                         cost[k] += log_of(product[k])
                         product[k] = 1.0
                 for c in range(3):
-                    y = samples.colour[c, element]
+                    y = colour[c, element]
                     for k in range(lanes):
                         left = y[k] - fixed[k]
                         shine = f0[c, k] * (1.0 - rise[k]) + rise[k]

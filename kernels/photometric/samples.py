@@ -101,7 +101,6 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     """Gather the readings of some pixels of a band.
 
     Args:
-        band: the stack on the device.
         pixels: [n] int32 positions in the band, one or more.
         view: [n, 3] unit directions from the surface to the viewer.
         lights: irradiance and scale of each light.
@@ -209,7 +208,6 @@ def choose(samples: Samples, chosen: np.ndarray) -> Samples:
     """Return the samples of some of the sampled pixels.
 
     Args:
-        samples: of n pixels.
         chosen: [n] bool, or positions among them; one or more.
 
     Returns:

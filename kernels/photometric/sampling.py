@@ -103,7 +103,6 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
-        tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
         start: [n, 3] unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere.
 
@@ -131,7 +130,6 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
-        tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
         found: of `search_sampling` for these samples; None: it is looked for here.
 

@@ -13,7 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import candidate_at
 from kernels.photometric.lobes import Lobes
 from kernels.photometric.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
@@ -51,7 +51,6 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
     """Return the cost of candidates around a normal of each sampled pixel.
 
     Args:
-        samples: their readings.
         centre: [n, 3] unit normals.
         offsets: [candidates, 4] of `candidates.rings`; the first is the centre.
         noise: [n, 2] standard deviation of a reading: constant part and part of the reading, both relative to the pixel's level.
@@ -103,12 +102,8 @@ def _score_kernel(lanes: int, lobes: Lobes) -> Any:
                      cost: wp.array2d(dtype=lane_type),  # [candidates, P]
                      misfit: wp.array2d(dtype=lane_type)):  # [5, P] lit; bright readings, squares; dim readings, squares
         p = first + wp.tid()
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
-        cx = centre[0, p]
-        cy = centre[1, p]
-        cz = centre[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
+        cx, cy, cz = vector_at(centre, p)
         floor = noise[0, p]
         slope = noise[1, p]
         unit = samples.level[p]

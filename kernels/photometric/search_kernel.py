@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import candidate_at, tangents
 from kernels.photometric.lobes import Lobes
 from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
@@ -33,8 +33,6 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
     """Return the kernel for one width of packs and one mixture.
 
     Args:
-        lanes: pixels of a pack.
-        lobes: the mixture.
         reweightings: rounds of the robust fit of each candidate.
         sweeps: coordinate sweeps of each non-negative solve.
     """
@@ -59,23 +57,17 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                      scratch: scratch_struct,  # what the lobes hold
                      found: search_struct):
         p = first + wp.tid()
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         noise = criteria.noise
         shadow = criteria.shadow
         light_count = samples.light_count
         start = p * samples.pack_stride
         base = p * scratch.pack_stride
         prepare(samples, p, scratch)
-        cx = found.normal[0, p]
-        cy = found.normal[1, p]
-        cz = found.normal[2, p]
+        cx, cy, cz = vector_at(found.normal, p)
         best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
-        ux = drawn[0, p]
-        uy = drawn[1, p]
-        uz = drawn[2, p]
+        ux, uy, uz = vector_at(drawn, p)
         x_found = coefficients()
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]

@@ -13,7 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.near import Places
 from kernels.photometric.samples import Samples, per_pixel, samples_type
 from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
@@ -69,13 +69,9 @@ def _exclude_kernel(lanes: int) -> Any:
         for light in range(samples.light_count):
             at = p * samples.pack_stride + light * samples.light_stride
             place = places[light]
-            lx = samples.toward[0, at]
-            ly = samples.toward[1, at]
-            lz = samples.toward[2, at]
+            lx, ly, lz = vector_at(samples.toward, at)
             y = samples.grey[at]
-            red = samples.colour[0, at]
-            green = samples.colour[1, at]
-            blue = samples.colour[2, at]
+            red, green, blue = vector_at(samples.colour, at)
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 row, col = n / cols, n % cols

@@ -35,7 +35,6 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
     Args:
         samples: some hundreds of pixels, spread over the object.
         normal: [n, 3] unit normals.
-        shape: of the diffuse lobe.
 
     Returns:
         [materials, 4] float32: F0 and roughness, in the order in which they were chosen. Waits for the device.

@@ -41,7 +41,6 @@ def evidence(samples: Samples, cost: np.ndarray, weights: np.ndarray) -> Evidenc
     """Return what the fits of sampled pixels leave unexplained. Waits for the device.
 
     Args:
-        samples: the readings.
         cost: [n] of the fit, per light.
         weights: [n, lobes] of its mixture.
     """
@@ -120,7 +119,6 @@ def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchO
     Args:
         samples: readings of n pixels.
         found: their descents.
-        shape, options, prior: as for the descents.
         sweep: which pixels, and how closely.
 
     Returns:

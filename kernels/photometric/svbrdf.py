@@ -71,9 +71,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
     """Estimate the normal and the material of sampled pixels.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
-        shape: of the diffuse lobe under which normals are found, from diffuse_shape.choose_diffuse.
         lobe: the shape under which materials are fitted; None: the same.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         pairs: [pairs, 2, 4] of mixtures.choose_pairs.
@@ -174,11 +172,9 @@ def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared
     It is 0 where F0 is not far above the shared ones, and where no such normal was found.
 
     Args:
-        samples: readings.
         normal: [n, 3] unit normals.
         material: of material.fit_material.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
-        shape: of the diffuse lobe.
     """
     doubt = np.zeros(len(normal), np.float32)
     common = shared[is_dielectric(shared), 0]

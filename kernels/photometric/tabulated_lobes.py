@@ -10,7 +10,7 @@ import math
 import warp as wp
 
 from kernels.device import once
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.lobes import Lobes, Reflectance
 from kernels.photometric.response_table import (
     GRID,
@@ -71,9 +71,7 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
     @wp.func
     def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
              scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         places = pairs()
         for k in range(lanes):
             n = wp.vec3(nx[k], ny[k], nz[k])
@@ -120,9 +118,7 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
     @wp.func
     def respond(samples: samples_struct, table: wp.array3d(dtype=float), nx: lane_type, ny: lane_type, nz: lane_type, rough: lane_type,
                 p: int, scratch: scratch_struct):
-        vx = samples.view[0, p]
-        vy = samples.view[1, p]
-        vz = samples.view[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
         places = pairs()
         width = lane_type()
         for k in range(lanes):

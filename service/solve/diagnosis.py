@@ -32,8 +32,6 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
 
     Args:
-        given: the images.
-        capture: the manifest.
         lights: the lights with which the normals were solved; readings are examined under distant ones.
         declared: the lights of the manifest, which may have other intensities.
         solution: its warnings, standard errors, confidence and suspect lights are changed.

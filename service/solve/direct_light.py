@@ -87,13 +87,9 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     """Find what the object does to its own light, or return None when no pixel is solved.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, where some light is near.
         normal: [3, pixels] float32, found so far.
         material: of the same.
         bouncing: [3, pixels] albedo of the light that other surfaces send.
-        solved: [rows, cols] bool.
         shadows: whether cast shadows are taken out.
         interreflection: whether interreflection is taken out.
         parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.

@@ -37,7 +37,6 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     """Solve every pixel of the mask from gradient frames.
 
     Args:
-        given: the images.
         frames: which frames of the stack measure what.
     """
     stack, inside = given.stack, given.mask.reshape(-1)

@@ -57,12 +57,7 @@ class ChosenIntensities(NamedTuple):
 
 
 def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntensities:
-    """Return the lights with the declared intensities, or with those that the images ask for.
-
-    Args:
-        given: the images.
-        lights: lights of the stack, as declared.
-    """
+    """Return the lights with the declared intensities, or with those that the images ask for."""
     if len(lights.direction) < LEAST_LIGHTS:
         return _declared(lights, f"fewer than {LEAST_LIGHTS} lights")
     inside = np.flatnonzero(given.mask)
@@ -101,12 +96,7 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
 
 
 def lambertian_misfit(given: SolveInput, lights: DistantLights) -> float:
-    """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object.
-
-    Args:
-        given: the images.
-        lights: lights of the stack.
-    """
+    """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object."""
     inside = np.flatnonzero(given.mask)
     radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     return fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction).misfit()
@@ -152,12 +142,7 @@ class LightsOverTime:
         self._first: dict[str, Any] | None = None
 
     def choose(self, given: SolveInput, lights: DistantLights) -> ChosenIntensities:
-        """Return the lights of a step with the shared intensities, or its own where its images contradict them.
-
-        Args:
-            given: the images.
-            lights: lights of the stack, as declared.
-        """
+        """Return the lights of a step with the shared intensities, or its own where its images contradict them."""
         own = choose_intensities(given, lights)
         declared = {"direction": lights.direction.tolist(), "irradiance": lights.irradiance.tolist()}
         if self._first is None:

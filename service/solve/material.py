@@ -79,9 +79,6 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near.
         options: the steps that are left out.
     """
     walk = _Walk(given, lights, field, options)
@@ -97,8 +94,6 @@ def refine_material(given: SolveInput, lights: Lights, field: NearField, before:
     """Solve again from a solution: shadows and interreflection follow from its surface, and no first search is needed.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
         field: where the lights are, and the surface point of each pixel.
         before: of `solve_material`, or of this function.
     """

@@ -38,13 +38,7 @@ class NormalSolver(Protocol):
     """Solves the normals of every pixel of the mask from frames with one light each: `solve_diffuse` or `solve_material`."""
 
     def __call__(self, given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
-        """Return the solution.
-
-        Args:
-            given: the images.
-            lights: lights of the stack, padded.
-            field: where the lights are, and the surface point of each pixel, where some light is near.
-        """
+        """Return the solution."""
 
 
 class Rounds(NamedTuple):
@@ -61,7 +55,6 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     """Solve every pixel of the mask under lights of which some are near, and its height with it.
 
     Args:
-        given: the images, of a camera with a scale.
         lights: lights of the stack, distant and near.
         series: the rounds of each solver; a solver begins with the surface on which the one before it has settled.
 

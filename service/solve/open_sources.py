@@ -86,8 +86,6 @@ def open_sources(given: SolveInput, lights: ExtendedLights, padded: Lights, stat
     """Find what the object does to its own light, or return None when it does nothing to any pixel.
 
     Args:
-        given: the images.
-        lights: lights of the stack.
         padded: the same, with their irradiance.
         status: [pixels] of kernels.status.
         found: normals and materials of all pixels of the image.

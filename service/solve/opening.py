@@ -49,7 +49,6 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     """Open the capture of a request, and read its images into a stack.
 
     Args:
-        request: what is asked.
         capture: that of the request with its pixels; None: it is opened here.
         timings: told of every stage.
         sharing: the part of this process where several share the solve.

@@ -117,8 +117,6 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images.
 
     Args:
-        given: the images.
-        lights: distant lights of the stack, padded.
         normal: [3, pixels] float32.
         material: of every pixel.
         height: [rows, cols] float32, camera-frame z, 0 outside.
@@ -157,8 +155,6 @@ def place_solution(given: SolveInput, lights: DistantLights, solution: Solution)
     """Return the surface of a solution with its parts in depth, or None where there is none.
 
     Args:
-        given: the images.
-        lights: lights of the stack.
         solution: with a height.
     """
     if solution.integration is None or solution.height is None or solution.integration.part is None:

@@ -47,7 +47,6 @@ def reference_table(readings: np.ndarray, device: str) -> wp.array:
 
     Args:
         readings: [GRID², lights] not negative.
-        device: where.
 
     Returns:
         [GRID², lights, 1] float32 on the device.
@@ -67,7 +66,6 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
 
     Args:
         samples: their readings, in the units of the ball's.
-        table: of the same lights.
         view: [n, 3] unit directions to the viewer.
 
     Returns:
@@ -100,7 +98,6 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
     """Solve every pixel of the mask for its normal alone.
 
     Args:
-        given: the images.
         ball: the ball under the same lights.
     """
     stack, timings, count = given.stack, given.timings, given.stack.light_count

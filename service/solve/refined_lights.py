@@ -40,7 +40,6 @@ def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
 
     Args:
         given: the images; where it keeps the declared intensities, only the directions change.
-        lights: lights of the stack, as declared.
 
     Raises:
         CalibrationError: the images do not determine the directions.

@@ -182,7 +182,6 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     Args:
         light: of the first search, with arriving light.
         normal: [3, pixels] of the first search.
-        shape: of the diffuse lobe.
         pick: gives the readings of a few pixels by their positions.
         relative: whether the scale of the lights, and so of albedo, is unknown.
     """

@@ -154,7 +154,6 @@ def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_c
 
     Args:
         solution: of the whole image; its status is changed.
-        stack: the images.
         max_sigma: largest standard error of a solved normal, degrees.
         least_confidence: least confidence of a solved normal.
     """
@@ -174,8 +173,6 @@ def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[Sus
 
     Args:
         solution: normals that were solved under these lights.
-        stack: the images.
-        lights: distant lights of the stack, padded.
     """
     solved = np.flatnonzero(solution.status == Status.OK)
     if len(solved) < 2 * LEAST_PIXELS:

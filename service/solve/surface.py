@@ -27,7 +27,6 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     Args:
         given: the camera and the device.
         normal: [3, pixels] float32.
-        solved: [rows, cols] bool.
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
         stage: what the progress calls this work.
 
