@@ -86,7 +86,7 @@ possible."""
 
 
 class Prior(NamedTuple):
-    """What is expected of the normals before the readings are judged."""
+    """Normals that are expected before the readings are judged."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     strength: float

@@ -41,7 +41,7 @@ SURE = 2.5
 
 
 class LightFactors(NamedTuple):
-    """What the object says about the intensities of its lights."""
+    """Intensities of the lights that the object asks for."""
 
     factor: np.ndarray  # [lights] float64: true intensity over the declared one; its logarithm is centred on 0
     gain: float

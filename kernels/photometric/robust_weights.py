@@ -24,7 +24,7 @@ ROOT_OF_THIRD = 3.0**-0.5
 
 @wp.struct
 class Criteria:
-    """What a fit judges readings by; `hypotheses.criteria` makes it."""
+    """Noise, shadows and diffuse lobe by which a fit judges readings; `hypotheses.criteria` makes them."""
 
     noise: wp.vec2  # s0, s1
     shadow: wp.vec2  # r²/σ² of equal cost, depth

@@ -49,7 +49,7 @@ class Solve(Protocol):
 
 
 class Breaks(NamedTuple):
-    """Where a surface may break."""
+    """The places at which a surface may break."""
 
     lowered: Slopes  # with lower weights for edges across contradictions
     noise: float  # of loop_noise

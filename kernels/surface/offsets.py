@@ -36,7 +36,7 @@ NO_GAP = -1.0e30
 
 
 class PartShadows(NamedTuple):
-    """What the surface on the way to the light does, for each pixel and light."""
+    """Gaps between the surface and the ray from each pixel to each light."""
 
     highest: wp.array  # [pixels, lights] float32: largest height of the surface above the ray, over all of it that moves against the pixel
     lowest: wp.array  # [pixels, lights] float32: the least

@@ -1,4 +1,4 @@
-"""What is wrong with the manifest of a capture, from what was solved with it: encoding, brightness, order and axes of the lights.
+"""Faults of the manifest of a capture, found from what was solved with it: encoding, brightness, order and axes of the lights.
 
 A wrong manifest seldom stops a solver: it finds normals that are wrong everywhere, and as sure as right ones. Every finding here is a
 sentence that names the field, and raises the standard error of every normal by the angle that the finding asks for.

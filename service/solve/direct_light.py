@@ -25,7 +25,7 @@ LARGEST_ALBEDO = 0.98
 
 
 class DirectLight(NamedTuple):
-    """What hides the lights from the pixels of an object, and what it throws on itself."""
+    """Shadows and interreflection of an object, to be taken out of readings."""
 
     given: SolveInput
     lights: Lights

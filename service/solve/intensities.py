@@ -48,12 +48,12 @@ LEAST_LIT = 5
 
 
 class ChosenIntensities(NamedTuple):
-    """What the images say about the intensities of their lights."""
+    """Intensities of the lights after comparison with the images."""
 
     lights: DistantLights
     """The lights, with the intensities that explain the images better."""
     facts: dict[str, Any]
-    """What the report says."""
+    """Facts for the report."""
 
 
 def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntensities:

@@ -24,7 +24,7 @@ Solver = Callable[[SolveInput, Any], Solution]
 
 
 class MethodEntry(NamedTuple):
-    """What one method needs of a capture, and the functions that solve it."""
+    """One method: what it needs of a capture, and the functions that solve it."""
 
     read_lights: Callable[..., Any]
     """Returns the lights or frames that the method works with. Takes the capture, and that of the reference ball where there is one;
@@ -32,7 +32,7 @@ class MethodEntry(NamedTuple):
     solvers: Mapping[type, Solver]
     """One function for each kind of lights; a kind that is not here is refused."""
     residual: str
-    """What the residual of a pixel is, as the report says it."""
+    """The meaning of the residual of a pixel, for the report."""
     is_default: Callable[[Capture], bool] = lambda capture: False
     """Whether a capture is solved by this method when the request names none."""
 

@@ -37,7 +37,7 @@ class Opened(NamedTuple):
     solver: Solver
     given: SolveInput
     facts: dict[str, Any]
-    """What the report says of the lights."""
+    """Facts about the lights for the report."""
     found: "UnknownLights | RefinedLights | None" = None
     """How the lights were found, where they are those of the images."""
     distance: Distance | None = None

@@ -50,7 +50,7 @@ INVERSE = np.diag([-1.0, -1.0, 1.0])
 
 
 class LightAxes(NamedTuple):
-    """What is wrong with the axes of the lights."""
+    """A fault of the axes of the lights."""
 
     sentence: str
     matrices: tuple[np.ndarray, ...] = ()

@@ -98,7 +98,7 @@ class Placement(NamedTuple):
 
 
 class Material(NamedTuple):
-    """What pixels reflect; F0 and roughness are None where the method estimates no highlight."""
+    """The material of all pixels; F0 and roughness are None where the method estimates no highlight."""
 
     albedo: np.ndarray  # [3, pixels]
     specular: np.ndarray | None = None  # [3, pixels]

@@ -90,8 +90,8 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
 CACHE_FOLDER = "reference"
 """Folder of the ball's stack, inside the folder that --cache names."""
 OTHER_MATERIAL = 1.7
-"""What the ball leaves unexplained over the noise of the readings, above which it is of another material: 0.7 to 1.1 with the right ball
-under noise of 0 to 10 %, 1.3 with a metal ball whose roughness is 0.5 for 0.6, and 2.4 to 5 between a metal and a dielectric."""
+"""The part that the ball leaves unexplained over the noise of the readings, above which it is of another material: 0.7 to 1.1 with the
+right ball under noise of 0 to 10 %, 1.3 with a metal ball whose roughness is 0.5 for 0.6, and 2.4 to 5 between a metal and a dielectric."""
 
 
 def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:

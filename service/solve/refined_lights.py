@@ -23,7 +23,7 @@ class RefinedLights(NamedTuple):
     lights: DistantLights
     left_degrees: float
     facts: dict[str, Any]
-    """What the report says."""
+    """Facts for the report."""
     warnings: tuple[str, ...]
 
     def doubt(self, normal: np.ndarray) -> np.ndarray:

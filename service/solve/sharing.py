@@ -69,11 +69,11 @@ LEAST_PIECES = 2
 
 
 class Results(NamedTuple):
-    """What a pass over the image makes, and what it follows from."""
+    """The results of a pass over the image, and the values that they follow from."""
 
     arrays: Sequence[np.ndarray]  # each [..., pixels]: where the work of a piece stores what it finds, at the pixels of the piece
     follows_from: object = None
-    """What the work reads besides the images and what earlier passes have stored: numbers, strings, arrays, and tuples of these."""
+    """Values that the work reads besides the images and the results of earlier passes: numbers, strings, arrays, and tuples of these."""
 
 
 class SharedSolve:
@@ -99,7 +99,7 @@ class SharedSolve:
         """Do the pieces of a pass that no other worker does, and read those of the others.
 
         Args:
-            names, pieces, work, done: as of several_devices.deal; `done` is told the pieces of other workers too.
+            names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
             waiting: called now and then while pieces of other workers are waited for.
             pixels_of: returns the place of a piece on the last axis of the arrays.
             results: where the work stores what it finds.
@@ -140,7 +140,7 @@ class SharedSolve:
 
 
 class _Pass:
-    """What the workers have found in one pass."""
+    """The results of all workers in one pass."""
 
     def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
         self._store, self._name, self._leads, self._arrays = store, name, leads, arrays

@@ -31,7 +31,7 @@ from stage.radiance import clipping_sentences
 
 
 class SolveResult(NamedTuple):
-    """What a solve made."""
+    """The files and findings of a solve."""
 
     maps: SurfaceMaps
     maps_path: Path
