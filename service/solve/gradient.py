@@ -164,7 +164,7 @@ def neighbours_doubt(doubt: np.ndarray, inside: np.ndarray) -> np.ndarray:
     if not inside.any():
         return np.zeros(doubt.shape, np.float32)
     rows, cols = np.nonzero(inside)
-    reach = max(1, (max(np.ptp(rows), np.ptp(cols)) + 1) // PART)
+    reach = max(1, (int(max(np.ptp(rows), np.ptp(cols))) + 1) // PART)
     spread = ndimage.rank_filter(doubt.astype(np.float32), -LEAST, size=3, mode="constant")
     spread = ndimage.maximum_filter(spread, 2 * reach + 1, mode="constant")
     return np.where(inside, np.maximum(spread, doubt), 0).astype(np.float32)
