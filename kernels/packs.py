@@ -44,6 +44,12 @@ def bit_of(byte: wp.uint8, frame: int) -> int:
     return (int(byte) >> (frame % 8)) & 1
 
 
+@wp.func
+def vector_at(planes: wp.array2d(dtype=Any), at: int):
+    """Return the packs of x, y and z at a place, [3, …] planes."""
+    return planes[0, at], planes[1, at], planes[2, at]
+
+
 class Band(NamedTuple):
     """Readings of a pixel range on a device, as packs, and which of them saturate.
 

@@ -8,7 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type, zeros
+from kernels.packs import Band, as_packs, pack_type, vector_at, zeros
 from kernels.photometric.lambert import NormalFit
 from kernels.photometric.near import NearLights, directions_in, falloff_or_none, toward_or_none
 from kernels.photometric.readings import Lights, Readings
@@ -18,7 +18,6 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
     """Fit the diffuse albedo: weighted least squares of radiance = ρ/π · E · n·l in each channel.
 
     Args:
-        band: the stack on the device.
         weights: what the normal solver left in its readings: the weight of each light, 0…1.
         fit: the normals.
         lights: direction, irradiance and scale of each light.
@@ -82,9 +81,7 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
                       # outputs
                       albedo: wp.array2d(dtype=float)):  # [3, N]
         p = first + wp.tid()
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        nx, ny, nz = vector_at(normal, p)
         above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
         lights = directions.shape[0]

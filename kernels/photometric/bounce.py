@@ -15,11 +15,11 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import MATT, METAL_DIFFUSE, Material, fit_given
 from kernels.photometric.near import NearField, falloff
-from kernels.photometric.samples import Samples, per_pixel
+from kernels.photometric.samples import Samples, per_pixel, samples_type
 
 
 def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, shape: Diffuse) -> np.ndarray:
@@ -30,10 +30,8 @@ def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, sha
     sends on nothing in this sense: what it mirrors comes from one direction.
 
     Args:
-        samples: the readings.
         normal: [n, 3] unit normals.
         tinted: of material.fit_tinted at these normals.
-        shape: of the diffuse lobe.
     """
     matt = fit_given(samples, normal, MATT, shape=shape).diffuse_albedo
     metal = tinted.diffuse_albedo.mean(axis=1) < METAL_DIFFUSE * tinted.specular.mean(axis=1)
@@ -75,14 +73,12 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
         near = (*(wp.array(values, dtype=wp.vec4, device=device) for values in field.places), per_pixel(samples, field.points.T))
     devices.launch(_bounce_kernel(samples.lanes, field is not None), samples.packs,
                    [wp.array(arriving, dtype=wp.float32, device=device), per_pixel(samples, corners), per_pixel(samples, shares),
-                    per_pixel(samples, albedo), samples.level, *near,
-                    wp.vec3(*(float(w) for w in grey_weights)), samples.light_count, samples.pack_stride, samples.light_stride],
-                   [samples.grey, samples.colour], device=device)
+                    per_pixel(samples, albedo), *near, wp.vec3(*(float(w) for w in grey_weights))], [samples.arrays], device=device)
 
 
 @once
 def _bounce_kernel(lanes: int, near: bool) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def bounce_kernel(first: int,
@@ -90,31 +86,24 @@ def _bounce_kernel(lanes: int, near: bool) -> Any:
                       corners: wp.array2d(dtype=lane_type),  # [4, P] patch numbers, exact in float32
                       shares: wp.array2d(dtype=lane_type),  # [4, P]
                       albedo: wp.array2d(dtype=lane_type),  # [3, P]
-                      level: wp.array(dtype=lane_type),  # [P]
                       places: wp.array(dtype=wp.vec4),  # [L or padded], if near
                       lobes: wp.array(dtype=wp.vec4),  # [L or padded], if near
                       points: wp.array2d(dtype=lane_type),  # [3, P], if near
                       weights: wp.vec3,
-                      light_count: int,
-                      pack_stride: int,
-                      light_stride: int,
                       # outputs
-                      grey: wp.array(dtype=lane_type),  # [P · L]
-                      colour: wp.array2d(dtype=lane_type)):  # [3, P · L]
+                      samples: samples_struct):
         p = first + wp.tid()
-        bright = level[p]
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
+        bright = samples.level[p]
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
             taken, inverse = lane_type(), lane_type(1.0)  # inverse: 1 / falloff
             if wp.static(near):
-                px = points[0, p]
-                py = points[1, p]
-                pz = points[2, p]
+                px, py, pz = vector_at(points, p)
                 for k in range(lanes):
                     fall = falloff(places[light], lobes[light], px[k], py[k], pz[k])
                     inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
             for c in range(3):
-                y = colour[c, at]
+                y = samples.colour[c, at]
                 rho = albedo[c, p]
                 for k in range(lanes):
                     light_in = float(0.0)  # a literal could not change inside the loop
@@ -124,11 +113,11 @@ def _bounce_kernel(lanes: int, near: bool) -> Any:
                     bounced = inverse[k] * rho[k] * light_in
                     taken[k] += weights[c] * bounced
                     y[k] = wp.where(y[k] > 0.0, wp.max(y[k] - bounced, 0.0), y[k])
-                colour[c, at] = y
-            relative = grey[at]
+                samples.colour[c, at] = y
+            relative = samples.grey[at]
             for k in range(lanes):
                 left = wp.max(relative[k] - taken[k] / bright[k], 0.0)
                 relative[k] = wp.where(relative[k] > 0.0, left, relative[k])
-            grey[at] = relative
+            samples.grey[at] = relative
 
     return bounce_kernel

@@ -20,12 +20,11 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import once
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import candidate_at, rings
-from kernels.photometric.evidence import evidence
 from kernels.photometric.normal_search import Found
 from kernels.photometric.samples import Samples, per_pixel, to_host
-from kernels.photometric.survey import Survey
+from kernels.photometric.survey import Survey, evidence
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
@@ -56,7 +55,6 @@ def assess(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarra
     """Return how sure the normals of a search are.
 
     Args:
-        samples: the readings.
         found: the search.
         normal: [n, 3] unit, the result, which may be an average of several searches.
         spread: [n] of that average, degrees.
@@ -131,18 +129,10 @@ def _mass_kernel(lanes: int) -> Any:
                     # outputs
                     masses: wp.array2d(dtype=lane_type)):  # [3, P]
         p = first + wp.tid()
-        sx = start[0, p]
-        sy = start[1, p]
-        sz = start[2, p]
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
-        least = judged[0, p]
-        soft = judged[1, p]
-        far = judged[2, p]
+        sx, sy, sz = vector_at(start, p)
+        vx, vy, vz = vector_at(view, p)
+        nx, ny, nz = vector_at(normal, p)
+        least, soft, far = vector_at(judged, p)
         for candidate in range(costs.shape[0]):
             cost = costs[candidate, p]
             for k in range(lanes):

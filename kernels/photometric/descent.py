@@ -76,9 +76,7 @@ def descend(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: Sea
     """Return the normal of least cost near the start of each sampled pixel, under lights of one direction each.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from.
-        shape: of the diffuse lobe.
         options: how normals are judged.
         weights: [n, lobes] of the mixture at the start; None: unknown.
         prior: normals that the result is drawn to, of which the costs include the cost; None: none.
@@ -103,9 +101,8 @@ def descend(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: Sea
     found = wp.empty((3, packs), dtype=lane_type, device=device)
     drawn = per_pixel(samples, start if prior is None else prior.normal)
     devices.launch(descent_kernel(lanes), packs,
-                   [samples.grey, samples.toward, samples.view, drawn, prior_pull(prior), *criteria(options or SearchOptions(), shape),
-                    wp.vec2(schedule.softness, schedule.cooling), schedule.softened, schedule.softened + schedule.judged,
-                    samples.light_count, samples.pack_stride, samples.light_stride],
+                   [samples.arrays, drawn, prior_pull(prior), criteria(options, shape), wp.vec2(schedule.softness, schedule.cooling),
+                    wp.vec2i(schedule.softened, schedule.softened + schedule.judged)],
                    [normal, mixture, found], device=device, uneven=True)
     cost, curvature, swing = to_host(samples, found).T
     return Descent(*(np.ascontiguousarray(values) for values in (to_host(samples, normal), cost, curvature, swing,

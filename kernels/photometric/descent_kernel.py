@@ -7,10 +7,11 @@ import warp as wp
 from kernels.device import once
 from kernels.logarithm import log_of
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import LEAST_NZ, tangents
 from kernels.photometric.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
-from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
+from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
+from kernels.photometric.samples import samples_type
 
 SWEEPS = 8
 """Coordinate sweeps of the non-negative solve in each turn, from the weights of the turn before."""
@@ -34,48 +35,97 @@ def entry(row: int, column: int):
     return row * (row + 1) / 2 + column
 
 
+@wp.func
+def moved_by(n: wp.vec3, along: wp.vec3, across: wp.vec3, v: wp.vec3) -> wp.vec3:
+    """Return the unit normal moved by a step along its tangents, and along the view v where it would look away from the viewer."""
+    mx = n[0] + along[0] + across[0]
+    my = n[1] + along[1] + across[1]
+    mz = n[2] + along[2] + across[2]
+    size = wp.sqrt(mx * mx + my * my + mz * mz)
+    lift = wp.max(LEAST_NZ - (mx * v[0] + my * v[1] + mz * v[2]) / size, 0.0)
+    mx = mx / size + lift * v[0]
+    my = my / size + lift * v[1]
+    mz = mz / size + lift * v[2]
+    unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
+    return wp.vec3(mx * unit, my * unit, mz * unit)
+
+
 @once
 def descent_kernel(lanes: int) -> Any:
     """Return the kernel for one width of packs."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
     mixture = wp.types.matrix(shape=(MIXTURE, lanes), dtype=wp.float32)
     rows = wp.types.matrix(shape=(UNKNOWNS, lanes), dtype=wp.float32)
     triangle = wp.types.matrix(shape=(UNKNOWNS * (UNKNOWNS + 1) // 2, lanes), dtype=wp.float32)
     widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
     gloss = len(LOBES)
 
+    @wp.func
+    def eliminated(x: mixture, g: triangle, r: rows):
+        """Return the L D Lᵀ of normal equations without the weights above 0, those at 0 having no row, and their right-hand side."""
+        on, y = rows(), rows()
+        left = triangle()
+        for a in range(UNKNOWNS):
+            for k in range(lanes):
+                on[a, k] = 1.0
+        for a in range(MIXTURE):
+            for k in range(lanes):
+                on[a, k] = wp.where(x[a, k] > 0.0, 1.0, 0.0)
+        for a in range(UNKNOWNS):
+            for k in range(lanes):
+                y[a, k] = on[a, k] * r[a, k]
+            for b in range(a + 1):
+                for k in range(lanes):
+                    left[entry(a, b), k] = on[a, k] * on[b, k] * g[entry(a, b), k]
+        for b in range(MIXTURE):
+            inverse_pivot = lane_type()
+            for k in range(lanes):
+                pivot = left[entry(b, b), k]
+                inverse_pivot[k] = wp.where(pivot > LEAST_PIVOT * g[entry(b, b), k], 1.0 / wp.max(pivot, 1.0e-30), 0.0)
+            for a in range(b + 1, UNKNOWNS):
+                share = lane_type()
+                for k in range(lanes):
+                    share[k] = left[entry(a, b), k] * inverse_pivot[k]
+                    y[a, k] -= share[k] * y[b, k]
+                for c in range(b + 1, a + 1):
+                    for k in range(lanes):
+                        left[entry(a, c), k] -= share[k] * left[entry(c, b), k]
+        return left, y
+
+    @wp.func
+    def mixed(x: mixture, g: triangle, r: rows, pivots: mixture):
+        """Return the weights after SWEEPS coordinate sweeps of the non-negative solve."""
+        sweeps = int(SWEEPS)  # a literal would be unrolled
+        for _ in range(sweeps):
+            for a in range(MIXTURE):
+                rest = lane_type()
+                for k in range(lanes):
+                    rest[k] = r[a, k]
+                for b in range(MIXTURE):
+                    for k in range(lanes):
+                        rest[k] -= g[entry(wp.max(a, b), wp.min(a, b)), k] * x[b, k]
+                for k in range(lanes):
+                    x[a, k] = wp.max(x[a, k] + rest[k] * pivots[a, k], 0.0)
+        return x
+
     # on CUDA every element must have a register of its own, on the CPU the lanes are what the compiler unrolls
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0 if lanes > 1 else 2 * UNKNOWNS})
     def descend_kernel(first: int,
-                       grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
-                       view: wp.array2d(dtype=lane_type),  # [3, P]
+                       samples: samples_struct,
                        drawn: wp.array2d(dtype=lane_type),  # [3, P] normal of the prior
                        pull: wp.vec2,  # its strength, and 1 / rad² of its angle
-                       noise: wp.vec2,  # s0, s1
-                       shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                       form: wp.vec2,  # diffuse roughness, slope
+                       criteria: Criteria,
                        soft: wp.vec2,  # factor on σ² in the first turn, and its own factor from turn to turn
-                       softened: int,
-                       turns: int,
-                       light_count: int,
-                       pack_stride: int,
-                       light_stride: int,
+                       turns: wp.vec2i,  # softened ones, and all
                        # outputs
                        normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
                        weights: wp.array2d(dtype=lane_type),  # [lobes, P] in: start, out: of the best
                        found: wp.array2d(dtype=lane_type)):  # [3, P] cost, curvature, swing
         p = first + wp.tid()
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
-        ux = drawn[0, p]
-        uy = drawn[1, p]
-        uz = drawn[2, p]
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
+        ux, uy, uz = vector_at(drawn, p)
+        nx, ny, nz = vector_at(normal, p)
         bx, by, bz = lane_type(), lane_type(), lane_type()
         best, damping, undone = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         curvature, swing = lane_type(), lane_type()
@@ -84,13 +134,12 @@ def descent_kernel(lanes: int) -> Any:
             given_weight = weights[a, p]
             for k in range(lanes):
                 x[a, k] = given_weight[k]
-        sweeps = int(SWEEPS)  # a literal would be unrolled
         variance = float(soft[0])  # relative to that of the noise
-        for turn in range(turns):
+        for turn in range(turns[1]):
             narrow = 1.0 / wp.max(variance, 1.0)
             variance = variance * soft[1]
-            judged = wp.where(turn >= softened, 1.0, 0.0)
-            free = wp.where(turn >= wp.min(softened, 1), 1.0, 0.0)  # the first turn without weights finds them alone
+            judged = wp.where(turn >= turns[0], 1.0, 0.0)
+            free = wp.where(turn >= wp.min(turns[0], 1), 1.0, 0.0)  # the first turn without weights finds them alone
             ax, ay, az, ox, oy, oz = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             nv, va, vo, explained = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
@@ -117,12 +166,10 @@ def descent_kernel(lanes: int) -> Any:
             total, product = lane_type(), lane_type(1.0)
             g = triangle()
             r = rows()
-            for light in range(light_count):
-                at = p * pack_stride + light * light_stride
-                reading = grey[at]
-                lx = toward[0, at]
-                ly = toward[1, at]
-                lz = toward[2, at]
+            for light in range(samples.light_count):
+                at = p * samples.pack_stride + light * samples.light_stride
+                reading = samples.grey[at]
+                lx, ly, lz = vector_at(samples.toward, at)
                 nl, la, lo, nh, inverse, fresnel = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 by_h, by_l, by_v, predicted, w = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 f = rows()
@@ -137,7 +184,7 @@ def descent_kernel(lanes: int) -> Any:
                     lo[k] = ox[k] * lx[k] + oy[k] * ly[k] + oz[k] * lz[k]
                     nl[k] = wp.max(cosine, 0.0)
                     nh[k] = (cosine + nv[k]) * inverse[k]
-                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, form[0], form[1])
+                    value, on_l, on_v = diffuse_with_slopes(nl[k], nv[k], hv2, criteria.form[0], criteria.form[1])
                     f[0, k] = value
                     predicted[k] = x[0, k] * value
                     by_l[k] = x[0, k] * on_l
@@ -155,14 +202,14 @@ def descent_kernel(lanes: int) -> Any:
                 for k in range(lanes):
                     f[TILT, k] = by_h[k] * (la[k] + va[k]) * inverse[k] + by_l[k] * la[k] + by_v[k] * va[k]
                     f[OTHER, k] = by_h[k] * (lo[k] + vo[k]) * inverse[k] + by_l[k] * lo[k] + by_v[k] * vo[k]
-                    sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
+                    sigma = 1.0 / (criteria.noise[0] + criteria.noise[1] * wp.max(reading[k], 0.0))
                     off = (reading[k] - predicted[k]) * sigma
                     off2 = wp.where(explained[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
-                    dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+                    dark = wp.where(reading[k] < criteria.shadow[1] * predicted[k], 1, 0) * wp.where(off2 > criteria.shadow[0], 1, 0)
                     given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
                     trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
                     w[k] = given * trust * sigma * sigma / (1.0 + off2)
-                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
+                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, criteria.shadow[0], off2))
                 if light % LOG_GROUP == LOG_GROUP - 1:
                     for k in range(lanes):
                         total[k] += log_of(product[k])
@@ -189,34 +236,7 @@ def descent_kernel(lanes: int) -> Any:
                 r[TILT, k] += draw * (ux[k] * ax[k] + uy[k] * ay[k] + uz[k] * az[k])
                 r[OTHER, k] += draw * (ux[k] * ox[k] + uy[k] * oy[k] + uz[k] * oz[k])
                 worse[k] = judged * wp.where(total[k] >= best[k], 1.0, 0.0) * wp.where(undone[k] == 0.0, 1.0, 0.0)
-            # eliminate the weights above zero: L D Lᵀ of their rows; those at zero have none
-            on, y = rows(), rows()
-            left = triangle()
-            for a in range(UNKNOWNS):
-                for k in range(lanes):
-                    on[a, k] = 1.0
-            for a in range(MIXTURE):
-                for k in range(lanes):
-                    on[a, k] = wp.where(x[a, k] > 0.0, 1.0, 0.0)
-            for a in range(UNKNOWNS):
-                for k in range(lanes):
-                    y[a, k] = on[a, k] * r[a, k]
-                for b in range(a + 1):
-                    for k in range(lanes):
-                        left[entry(a, b), k] = on[a, k] * on[b, k] * g[entry(a, b), k]
-            for b in range(MIXTURE):
-                inverse_pivot = lane_type()
-                for k in range(lanes):
-                    pivot = left[entry(b, b), k]
-                    inverse_pivot[k] = wp.where(pivot > LEAST_PIVOT * g[entry(b, b), k], 1.0 / wp.max(pivot, 1.0e-30), 0.0)
-                for a in range(b + 1, UNKNOWNS):
-                    share = lane_type()
-                    for k in range(lanes):
-                        share[k] = left[entry(a, b), k] * inverse_pivot[k]
-                        y[a, k] -= share[k] * y[b, k]
-                    for c in range(b + 1, a + 1):
-                        for k in range(lanes):
-                            left[entry(a, c), k] -= share[k] * left[entry(c, b), k]
+            left, y = eliminated(x, g, r)
             # keep what costs less, go back from what costs more, and step
             step_a, step_o = lane_type(), lane_type()
             for k in range(lanes):
@@ -256,33 +276,18 @@ def descent_kernel(lanes: int) -> Any:
                     x[a, k] = wp.where(worse[k] > 0.0, x_best[a, k], x[a, k])
                     pivots[a, k] = (1.0 - worse[k]) / (g[entry(a, a), k] + 1.0e-8)
                     r[a, k] -= g[entry(TILT, a), k] * step_a[k] + g[entry(OTHER, a), k] * step_o[k]
-            for _ in range(sweeps):
-                for a in range(MIXTURE):
-                    rest = lane_type()
-                    for k in range(lanes):
-                        rest[k] = r[a, k]
-                    for b in range(MIXTURE):
-                        for k in range(lanes):
-                            rest[k] -= g[entry(wp.max(a, b), wp.min(a, b)), k] * x[b, k]
-                    for k in range(lanes):
-                        x[a, k] = wp.max(x[a, k] + rest[k] * pivots[a, k], 0.0)
+            x = mixed(x, g, r, pivots)
             for k in range(lanes):
-                mx = nx[k] + step_a[k] * ax[k] + step_o[k] * ox[k]
-                my = ny[k] + step_a[k] * ay[k] + step_o[k] * oy[k]
-                mz = nz[k] + step_a[k] * az[k] + step_o[k] * oz[k]
-                size = wp.sqrt(mx * mx + my * my + mz * mz)
-                lift = wp.max(LEAST_NZ - (mx * vx[k] + my * vy[k] + mz * vz[k]) / size, 0.0)
-                mx = mx / size + lift * vx[k]
-                my = my / size + lift * vy[k]
-                mz = mz / size + lift * vz[k]
-                unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
-                nx[k] = mx * unit
-                ny[k] = my * unit
-                nz[k] = mz * unit
+                one = step_a[k] * wp.vec3(ax[k], ay[k], az[k])
+                two = step_o[k] * wp.vec3(ox[k], oy[k], oz[k])
+                n = moved_by(wp.vec3(nx[k], ny[k], nz[k]), one, two, wp.vec3(vx[k], vy[k], vz[k]))
+                nx[k] = n[0]
+                ny[k] = n[1]
+                nz[k] = n[2]
         for k in range(lanes):
-            best[k] = best[k] / float(light_count)
-            curvature[k] = curvature[k] / float(light_count)
-            swing[k] = swing[k] / float(light_count)
+            best[k] = best[k] / float(samples.light_count)
+            curvature[k] = curvature[k] / float(samples.light_count)
+            swing[k] = swing[k] / float(samples.light_count)
         normal[0, p] = bx
         normal[1, p] = by
         normal[2, p] = bz

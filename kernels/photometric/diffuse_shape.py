@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.descent import Schedule, descend
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.samples import Samples
 from kernels.photometric.survey import QUICK
@@ -43,25 +43,23 @@ class Shapes(NamedTuple):
     tried: np.ndarray  # [shapes, 3] float64: roughness, slope, mean cost of each
 
 
-def choose_diffuse(samples: Samples, start: np.ndarray, *,
-                   options: SearchOptions | None = None) -> Shapes:
+def choose_diffuse(samples: Samples, start: np.ndarray) -> Shapes:
     """Choose the shape of the diffuse lobe from sampled pixels.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
         start: [n, 3] unit normals to begin from.
-        options: of the search.
 
     Returns:
         The shapes. Waits for the device.
     """
-    lambert = find_normals(samples, start, shape=Diffuse(), options=options, sweep=QUICK).best
+    lambert = find_normals(samples, start, shape=Diffuse(), sweep=QUICK).best
     tried: dict[Diffuse, float] = {}
 
     def judge(rough: float, slope: float) -> None:
         shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
         if shape not in tried:
-            found = descend(samples, lambert.normal, shape=shape, options=options, weights=lambert.weights, schedule=FROM_LAMBERT)
+            found = descend(samples, lambert.normal, shape=shape, weights=lambert.weights, schedule=FROM_LAMBERT)
             tried[shape] = float(np.mean(found.cost, dtype=np.float64))
 
     for rough, slope in itertools.product(ROUGHNESSES, SLOPES):

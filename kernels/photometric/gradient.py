@@ -47,8 +47,6 @@ def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], 
         diffuse: the responses.
         grey_weights: of the channels, for the normal; they add up to one.
         gain: diffuse light over what the frames hold of it: 2 behind a crossed analyser, else 1.
-        pixel_count: pixels of the band.
-        device: where the responses are.
 
     Returns:
         The fit on the device; not synchronised on CUDA.

@@ -63,8 +63,6 @@ def fit_highlights(parts: SeparatedMoments, grey_weights: tuple[float, float, fl
         grey_weights: of the channels; they add up to one.
         view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
         gain: diffuse light over what the frames hold of it, for what counts as a highlight.
-        pixel_count: pixels of the band.
-        device: where the responses are.
 
     Returns:
         The highlights on the device; not synchronised on CUDA.
@@ -90,8 +88,6 @@ def specular_normals(parts: SeparatedMoments, grey_weights: tuple[float, float, 
         grey_weights: of the channels; they add up to one.
         view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
         gain: as for diffuse_normals.
-        pixel_count: pixels of the band.
-        device: where the responses are.
 
     Returns:
         [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from.

@@ -19,12 +19,14 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.candidates import rings
 from kernels.photometric.lobes import direction_lobes
-from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
-from kernels.photometric.search_kernel import search_kernel
+from kernels.photometric.robust_weights import Criteria
+from kernels.photometric.samples import Samples, host_values, per_pixel, samples_type, scratch_memory, scratch_type, to_host
+from kernels.photometric.search_kernel import search_kernel, search_type
 from kernels.photometric.tabulated_lobes import tabulated_lobes
 
 
@@ -68,10 +70,14 @@ class RingOptions(SearchOptions):
                    shadow_depth=options.shadow_depth, reweightings=reweightings)
 
 
-def criteria(options: SearchOptions, shape: Diffuse) -> list[Any]:
-    """Return what the kernels judge by, as they take it: s0 and s1; r²/σ² of the cost of a shadow, and its depth; the diffuse lobe."""
-    return [wp.vec2(options.noise_floor, options.noise_slope), wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth),
-            wp.vec2(shape.rough, shape.slope)]
+def criteria(options: SearchOptions | None, shape: Diffuse) -> Criteria:
+    """Return what kernels judge readings by; without options, the defaults."""
+    options = options or SearchOptions()
+    found = Criteria()
+    found.noise = wp.vec2(options.noise_floor, options.noise_slope)
+    found.shadow = wp.vec2(math.expm1(options.shadow_cost), options.shadow_depth)
+    found.form = wp.vec2(shape.rough, shape.slope)
+    return found
 
 
 PRIOR_DEGREES = 10.0
@@ -80,7 +86,7 @@ possible."""
 
 
 class Prior(NamedTuple):
-    """What is expected of the normals before the readings are judged."""
+    """Normals that are expected before the readings are judged."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     strength: float
@@ -108,9 +114,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
     """Find the candidate normal of least cost for each sampled pixel.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from.
-        shape: of the diffuse lobe.
         wide: radii of the first rings, about the start, in degrees, and the number of candidates on the last of them.
         fine: the same of the rings that follow, each about the best candidate so far.
         options: how candidates are judged.
@@ -129,23 +133,71 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         raise ArrayError(f"start is {start.shape}: give one normal for each of the {samples.pixel_count} pixels")
     if table is not None and table.shape[1] != samples.light_count:
         raise ArrayError(f"table has {table.shape[1]} lights, the samples {samples.light_count}: tabulate those of the samples")
-    device, lanes, packs, lights = samples.device, samples.lanes, samples.packs, samples.light_count
+    device, lanes, packs = samples.device, samples.lanes, samples.packs
     lane_type = pack_type(lanes, wp.float32)
-    normal = per_pixel(samples, start)
-    cost = wp.empty(packs, dtype=lane_type, device=device)
+    found = search_type(lanes)()
+    found.normal, found.cost = per_pixel(samples, start), wp.empty(packs, dtype=lane_type, device=device)
     drawn = per_pixel(samples, start if prior is None else prior.normal)
     lobes = direction_lobes(lanes) if table is None else tabulated_lobes(lanes, table.shape[2])
-    weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
+    found.weights = wp.empty((lobes.count, packs), dtype=lane_type, device=device)
     table = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
-    scratch, strides = scratch_memory(samples, lobes.held)
+    scratch = scratch_memory(samples, lobes.held)
     survey = None
     for degrees, count in (wide, *fine):
         offsets = wp.array(rings(degrees, count), dtype=wp.vec4, device=device)
-        costs = wp.empty((offsets.shape[0], packs), dtype=lane_type, device=device)
-        survey = costs if survey is None else survey
+        found.costs = wp.empty((offsets.shape[0], packs), dtype=lane_type, device=device)
+        survey = found.costs if survey is None else survey
         radius = math.sin(math.radians(degrees[0])) if len(degrees) == 1 else 0.0
         devices.launch(search_kernel(lanes, lobes, options.reweightings, options.sweeps), packs,
-                       [samples.grey, samples.toward, table, samples.view, offsets, radius, drawn, prior_pull(prior),
-                        *criteria(options, shape), lights, samples.pack_stride, samples.light_stride, *strides],
-                       [scratch, normal, cost, weights, costs], device=device, uneven=True)
-    return Search(to_host(samples, normal), to_host(samples, cost), to_host(samples, weights), survey)
+                       [samples.arrays, table, offsets, radius, drawn, prior_pull(prior), criteria(options, shape)], [scratch, found],
+                       device=device, uneven=True)
+    return Search(*(to_host(samples, values) for values in (found.normal, found.cost, found.weights)), survey)
+
+
+def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+    """Return the readings that mixtures of lobes predict, relative to the level of each pixel.
+
+    Args:
+        samples: directions of lights and viewer.
+        normal: [n, 3] unit normals.
+        weights: [n, lobes] of the mixtures, from search_normals.
+
+    Returns:
+        [n, lights] float32. Waits for the device.
+    """
+    predicted = wp.empty_like(samples.grey)
+    devices.launch(_predict_kernel(samples.lanes), samples.packs,
+                   [samples.arrays, wp.empty((0, 0, 0), dtype=wp.float32, device=samples.device), per_pixel(samples, normal),
+                    per_pixel(samples, weights), criteria(None, shape)],
+                   [scratch_memory(samples, direction_lobes(samples.lanes).held), predicted], device=samples.device)
+    return host_values(samples, predicted)
+
+
+@once
+def _predict_kernel(lanes: int) -> Any:
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
+    mixture, _, _, prepare, fill = direction_lobes(lanes)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def predict_kernel(first: int,
+                       samples: samples_struct,
+                       table: wp.array3d(dtype=float),  # of no use to lights of one direction
+                       normal: wp.array2d(dtype=lane_type),  # [3, P]
+                       weights: wp.array2d(dtype=lane_type),  # [lobes, P]
+                       criteria: Criteria,
+                       # outputs
+                       scratch: scratch_struct,  # what the lobes hold
+                       predicted: wp.array(dtype=lane_type)):  # [P · L]
+        p = first + wp.tid()
+        prepare(samples, p, scratch)
+        fill(samples, table, criteria.form, normal[0, p], normal[1, p], normal[2, p], p, scratch)
+        for light in range(samples.light_count):
+            total = lane_type()
+            for a in range(mixture):
+                f = scratch.values[p * scratch.pack_stride + light * scratch.light_stride + a * scratch.step]
+                x = weights[a, p]
+                for k in range(lanes):
+                    total[k] += f[k] * x[k]
+            predicted[p * samples.pack_stride + light * samples.light_stride] = total
+
+    return predict_kernel

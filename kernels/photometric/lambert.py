@@ -39,7 +39,6 @@ def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_l
     """Estimate normals by least squares on every light with a reading above zero.
 
     Args:
-        band: the stack on the device.
         readings: its grey readings; on return each holds the weight that the light had in the fit: 1 or 0.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
         near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.

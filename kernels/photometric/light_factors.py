@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.descent import COLD, WARM, descend
-from kernels.photometric.hypotheses import Diffuse
-from kernels.photometric.prediction import predict
+from kernels.photometric.hypotheses import Diffuse, predict
 from kernels.photometric.samples import Samples, choose, device_values, host_values
 from kernels.photometric.untold_factors import untold
 
@@ -42,7 +41,7 @@ SURE = 2.5
 
 
 class LightFactors(NamedTuple):
-    """What the object says about the intensities of its lights."""
+    """Intensities of the lights that the object asks for."""
 
     factor: np.ndarray  # [lights] float64: true intensity over the declared one; its logarithm is centred on 0
     gain: float
@@ -60,7 +59,6 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
         start: [n, 3] unit normals to begin from.
         directions: [lights, 3] unit, in the camera frame.
         row, col: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour.
-        shape: of the diffuse lobe.
     """
     half = (row + col) % 2 == 0
     square = np.unique(np.stack([row, col]), axis=1, return_inverse=True)[1].reshape(-1)

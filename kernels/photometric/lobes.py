@@ -9,7 +9,8 @@ import warp as wp
 
 from kernels.device import once
 from kernels.microfacet import INVERSE_PI, diffuse, ggx_seen, masking_root, schlick
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
+from kernels.photometric.samples import samples_type, scratch_type
 
 LOBES = (0.08, 0.15, 0.25, 0.4, 0.6)
 """Widths α of the GGX lobes of the mixture: roughness 0.28 to 0.77, a factor of 1.5 to 2 apart, as wide as the lobes are."""
@@ -38,7 +39,8 @@ class Lobes(NamedTuple):
     prepare: Any
     """Writes what depends on light and view alone."""
     fill: Any
-    """Writes the lobes of every light at a candidate normal. Reads `toward` or `table`, and leaves the other alone."""
+    """Writes the lobes of every light at a candidate normal. Reads the directions of the samples or `table`, and leaves the
+    other alone."""
 
 
 class Reflectance(NamedTuple):
@@ -58,31 +60,29 @@ class Reflectance(NamedTuple):
 @once
 def direction_lobes(lanes: int) -> Lobes:
     """Return the mixture of lobes under lights of one direction each."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     widths = wp.types.vector(length=len(LOBES), dtype=wp.float32)
     roots = wp.types.matrix(shape=(len(LOBES), lanes), dtype=wp.float32)
 
     @wp.func
-    def prepare(toward: wp.array2d(dtype=lane_type), vx: lane_type, vy: lane_type, vz: lane_type, start: int, light_count: int,
-                light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
-        for light in range(light_count):
-            at = base + light * wp.static(MIXTURE + GEOMETRY) * step
-            element = start + light * light_stride
-            wx = toward[0, element]
-            wy = toward[1, element]
-            wz = toward[2, element]
+    def prepare(samples: samples_struct, p: int, scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
+        for light in range(samples.light_count):
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            element = p * samples.pack_stride + light * samples.light_stride
+            wx, wy, wz = vector_at(samples.toward, element)
             inverse, rise = lane_type(), lane_type()
             for k in range(lanes):
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]
                 inverse[k] = 1.0 / wp.sqrt(wp.max(2.0 + 2.0 * lv, 1.0e-6))
                 rise[k] = schlick(wp.sqrt(wp.max(0.5 + 0.5 * lv, 0.0)))
-            scratch[at + wp.static(MIXTURE) * step] = inverse
-            scratch[at + wp.static(MIXTURE + 1) * step] = rise
+            scratch.values[at + wp.static(MIXTURE) * scratch.step] = inverse
+            scratch.values[at + wp.static(MIXTURE + 1) * scratch.step] = rise
 
     @wp.func
-    def fill(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
-             nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-             light_count: int, light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
+             scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
         alphas = widths(wp.static(LOBES[0]), wp.static(LOBES[1]), wp.static(LOBES[2]), wp.static(LOBES[3]), wp.static(LOBES[4]))
         nv, view_root = lane_type(), roots()
         for k in range(lanes):
@@ -90,14 +90,12 @@ def direction_lobes(lanes: int) -> Lobes:
         for a in range(wp.static(len(LOBES))):
             for k in range(lanes):
                 view_root[a, k] = masking_root(nv[k], alphas[a])
-        for light in range(light_count):
-            element = start + light * light_stride
-            lx = toward[0, element]
-            ly = toward[1, element]
-            lz = toward[2, element]
-            at = base + light * wp.static(MIXTURE + GEOMETRY) * step
-            inverse = scratch[at + wp.static(MIXTURE) * step]
-            rise = scratch[at + wp.static(MIXTURE + 1) * step]
+        for light in range(samples.light_count):
+            element = p * samples.pack_stride + light * samples.light_stride
+            lx, ly, lz = vector_at(samples.toward, element)
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            inverse = scratch.values[at + wp.static(MIXTURE) * scratch.step]
+            rise = scratch.values[at + wp.static(MIXTURE + 1) * scratch.step]
             nl, nh, fresnel, lobe = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 cosine = nx[k] * lx[k] + ny[k] * ly[k] + nz[k] * lz[k]
@@ -105,12 +103,12 @@ def direction_lobes(lanes: int) -> Lobes:
                 nh[k] = (cosine + nv[k]) * inverse[k]
                 fresnel[k] = LOBE_SCALE * (MIXTURE_F0 + (1.0 - MIXTURE_F0) * rise[k])
                 lobe[k] = diffuse(nl[k], nv[k], 0.25 / (inverse[k] * inverse[k]), form[0], form[1])
-            scratch[at] = lobe
+            scratch.values[at] = lobe
             for a in range(wp.static(len(LOBES))):
                 width = alphas[a]
                 for k in range(lanes):
                     lobe[k] = fresnel[k] * ggx_seen(nl[k], nv[k], nh[k], width, view_root[a, k])
-                scratch[at + (1 + a) * step] = lobe
+                scratch.values[at + (1 + a) * scratch.step] = lobe
 
     return Lobes(MIXTURE, MIXTURE + GEOMETRY, 1.0, prepare, fill)
 
@@ -118,20 +116,18 @@ def direction_lobes(lanes: int) -> Lobes:
 @once
 def direction_reflectance(lanes: int) -> Reflectance:
     """Return Relit's BRDF under lights of one direction each."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
 
     @wp.func
-    def prepare(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
-                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-                light_count: int, light_stride: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type,
+                p: int, scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
         nv = lane_type()
         for k in range(lanes):
             nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
-        for light in range(light_count):
-            element = start + light * light_stride
-            lx = toward[0, element]
-            ly = toward[1, element]
-            lz = toward[2, element]
+        for light in range(samples.light_count):
+            element = p * samples.pack_stride + light * samples.light_stride
+            lx, ly, lz = vector_at(samples.toward, element)
             fd, nl, nh, rise = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 hv2 = wp.max(0.5 + 0.5 * (lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]), 2.5e-7)
@@ -141,42 +137,39 @@ def direction_reflectance(lanes: int) -> Reflectance:
                 nh[k] = (cosine + nv[k]) * 0.5 / hv
                 rise[k] = schlick(hv)
                 fd[k] = INVERSE_PI * diffuse(nl[k], nv[k], hv2, form[0], form[1])
-            at = base + light * light_step
-            scratch[at] = fd
-            scratch[at + 3 * step] = nl
-            scratch[at + 4 * step] = nh
-            scratch[at + 5 * step] = rise
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            scratch.values[at] = fd
+            scratch.values[at + 3 * scratch.step] = nl
+            scratch.values[at + 4 * scratch.step] = nh
+            scratch.values[at + 5 * scratch.step] = rise
 
     @wp.func
-    def respond(table: wp.array3d(dtype=float),
-                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
-                light_count: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def respond(samples: samples_struct, table: wp.array3d(dtype=float), nx: lane_type, ny: lane_type, nz: lane_type, rough: lane_type,
+                p: int, scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
         nv, view_root = lane_type(), lane_type()
         for k in range(lanes):
             nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
             view_root[k] = masking_root(nv[k], rough[k] * rough[k])
-        for light in range(light_count):
-            at = base + light * light_step
-            nl = scratch[at + 3 * step]
-            nh = scratch[at + 4 * step]
-            rise = scratch[at + 5 * step]
+        for light in range(samples.light_count):
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            nl = scratch.values[at + 3 * scratch.step]
+            nh = scratch.values[at + 4 * scratch.step]
+            rise = scratch.values[at + 5 * scratch.step]
             for k in range(lanes):
                 lobe = ggx_seen(nl[k], nv[k], nh[k], rough[k] * rough[k], view_root[k])
                 rise[k] = rise[k] * lobe
                 nl[k] = lobe - rise[k]
-            scratch[at + step] = nl
-            scratch[at + 2 * step] = rise
+            scratch.values[at + scratch.step] = nl
+            scratch.values[at + 2 * scratch.step] = rise
 
     @wp.func
-    def lambertian(toward: wp.array2d(dtype=lane_type), form: wp.vec2,
-                   nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-                   light_count: int, light_stride: int):
+    def lambertian(samples: samples_struct, form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
+        vx, vy, vz = vector_at(samples.view, p)
         above, below, share = lane_type(), lane_type(), lane_type()
-        for light in range(light_count):
-            at = start + light * light_stride
-            wx = toward[0, at]
-            wy = toward[1, at]
-            wz = toward[2, at]
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
+            wx, wy, wz = vector_at(samples.toward, at)
             for k in range(lanes):
                 nv = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], 1.0e-3)
                 lv = wx[k] * vx[k] + wy[k] * vy[k] + wz[k] * vz[k]

@@ -72,9 +72,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     """Fit the material of sampled pixels.
 
     Args:
-        samples: their readings.
         normal: [n, 3] unit normals.
-        shape: of the diffuse lobe.
         options: noise and shadows, as in the search.
         table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel has a material of its own.
@@ -88,7 +86,6 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     Raises:
         ArrayError: a table of other lights.
     """
-    options = options or SearchOptions()
     tinted = _fit(samples, normal, shape, options, table, TINTED)
     bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole lobe, so that F0 needs no bound
     neutral = _fit(samples, normal, shape, options, table, NEUTRAL, np.full(4, bound))
@@ -98,7 +95,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
     own = _where(metal, tinted, neutral)
     if shared is None or not len(shared):
         return own
-    blend = _blend([fit_given(samples, normal, material, shape=shape, options=options) for material in shared])
+    blend = _blend([fit_given(samples, normal, material, shape=shape) for material in shared])
     explained = explains(blend, own)
     found = _where(explained, blend, own)
     common = np.unique(shared[is_dielectric(shared), 0])
@@ -109,7 +106,7 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
         return found
     few, there = choose(samples, doubtful), normal[doubtful]
     cold = _fit(few, there, shape, options, None, NEUTRAL, np.full(4, BRIGHTEST_DIELECTRIC), anew=True)
-    one_f0 = [fit_given_f0(few, there, f0, shape=shape, options=options) for f0 in common]
+    one_f0 = [fit_given_f0(few, there, f0, shape=shape) for f0 in common]
     again = _reconcile(_pick(own, doubtful), cold, one_f0, _pick(blend, doubtful), common)
     for plane, better in zip(found, again, strict=True):
         plane[doubtful] = better
@@ -131,37 +128,30 @@ def is_dielectric(materials: np.ndarray) -> np.ndarray:
     return np.asarray((np.ptp(materials[:, :3], axis=1) == 0) & (materials[:, 0] <= BRIGHTEST_DIELECTRIC))
 
 
-def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
-    """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost.
-
-    Args:
-        samples, normal, shape, options: as for fit_material.
-    """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, TINTED)
+def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> Material:
+    """Fit the material of sampled pixels with an F0 for each channel: the fit with the most unknowns, and so the least cost."""
+    return _fit(samples, normal, shape, None, None, TINTED)
 
 
-def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse,
-              options: SearchOptions | None = None) -> Material:
+def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse) -> Material:
     """Fit the albedo of sampled pixels to a specular lobe that is given.
 
     Args:
-        samples, normal, shape, options: as for fit_material.
         material: [4] F0 and roughness.
     """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN, material)
+    return _fit(samples, normal, shape, None, None, GIVEN, material)
 
 
-def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse, options: SearchOptions | None = None) -> Material:
+def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse) -> Material:
     """Fit albedo and roughness of sampled pixels to an F0 that is given. Each roughness begins with the weights of readings without misfit.
 
     Args:
-        samples, normal, shape, options: as for fit_material.
         f0: of all channels.
     """
-    return _fit(samples, normal, shape, options or SearchOptions(), None, GIVEN_F0, np.full(4, f0), anew=True)
+    return _fit(samples, normal, shape, None, None, GIVEN_F0, np.full(4, f0), anew=True)
 
 
-def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions, table: wp.array | None, freedom: int,
+def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOptions | None, table: wp.array | None, freedom: int,
          given: np.ndarray | None = None, *, anew: bool = False) -> Material:
     if table is not None and table.shape[1:] != (samples.light_count, COLUMNS):
         raise ArrayError(f"table is {table.shape}, the samples have {samples.light_count} lights: give their response table")
@@ -170,11 +160,9 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
     fitted = wp.empty((8, packs), dtype=pack_type(lanes, wp.float32), device=device)
     responses = wp.empty((0, 0, 0), dtype=wp.float32, device=device) if table is None else table
     known = wp.vec4() if given is None else wp.vec4(*map(float, given))
-    scratch, strides = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
+    scratch = scratch_memory(samples, reflectance.held + WEIGHT_ROWS)
     devices.launch(material_kernel(lanes, reflectance, table is not None), packs,
-                   [samples.colour, samples.toward, responses, samples.level, samples.view, per_pixel(samples, normal),
-                    *criteria(options, shape), freedom, int(anew), known, samples.light_count, samples.pack_stride, samples.light_stride,
-                    *strides],
+                   [samples.arrays, responses, per_pixel(samples, normal), criteria(options, shape), freedom, int(anew), known],
                    [scratch, fitted], device=device)
     values = to_host(samples, fitted)
     return Material(values[:, :3], values[:, 3:6], np.where(values[:, 6] > 0, values[:, 6], 1).astype(np.float32),

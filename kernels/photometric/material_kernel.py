@@ -7,9 +7,10 @@ import warp as wp
 
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.packs import channels_type, pack_type
+from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.lobes import Reflectance
-from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
+from kernels.photometric.robust_weights import LOG_GROUP, Criteria, plain_weights, weigh
+from kernels.photometric.samples import samples_type, scratch_type
 
 ROUGHNESS_FIRST, ROUGHNESS_STEP, ROUGHNESS_COUNT = 0.1, 0.075, 13
 """First value, step and length of the grid of roughness, 0.1 to 1: a lobe below 0.1 is narrower than the spacing of the lights of any
@@ -35,58 +36,56 @@ GIVEN_F0 = wp.constant(3)
 """Fit mode with free roughness and an F0 that is given."""
 
 
+@wp.func
+def common_weight(dd: float, ds: wp.vec3, ss: wp.vec3, rd: wp.vec3, rs: wp.vec3, most: float) -> float:
+    """Return the weight, from 0 to `most`, that three channels share beside an albedo of at least 0 in each.
+
+    It explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others.
+
+    Args: sums over the lights: dd, ds, ss of products of the diffuse lobe and the other, rd, rs of readings and either, by channel.
+    """
+    common = float(0.0)  # a literal could not change inside the loop
+    for _ in range(COMMON_ROUNDS):
+        top, bottom, whole = float(0.0), float(0.0), float(0.0)
+        for c in range(3):
+            shared = wp.where(rd[c] > common * ds[c], ds[c] / wp.max(dd, 1.0e-20), 0.0)
+            top += rs[c] - shared * rd[c]
+            bottom += ss[c] - shared * ds[c]
+            whole += ss[c]
+        common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, most), 0.0)
+    return common
+
+
 @once
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
     """Return the kernel for one width of packs and one kind of light.
 
     Args:
-        lanes: pixels of a pack.
-        reflectance: expected readings.
         bare: whether a surface without any specular lobe is a candidate of its own.
     """
     held, prepare, respond, lambertian = reflectance
     write_weights = plain_weights(lanes)
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     channels = channels_type(lanes)
     bare_trials = int(bare)
     searched = bare_trials + ROUGHNESS_COUNT + 2 * HALVINGS
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def fit_kernel(first: int,
-                   colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
-                   toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                   samples: samples_struct,
                    table: wp.array3d(dtype=float),  # [cells, L, columns]
-                   level: wp.array(dtype=lane_type),  # [P]
-                   view: wp.array2d(dtype=lane_type),  # [3, P]
                    normal: wp.array2d(dtype=lane_type),  # [3, P]
-                   noise: wp.vec2,  # s0, s1
-                   shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                   form: wp.vec2,  # diffuse roughness, slope
+                   criteria: Criteria,
                    freedom: int,
                    anew: int,  # 1: each roughness begins with the weights of readings without misfit
                    known: wp.vec4,  # F0 and roughness, where they are given; else the bound of a common F0, last
-                   light_count: int,
-                   pack_stride: int,
-                   light_stride: int,
-                   scratch_pack: int,
-                   scratch_step: int,
                    # outputs
-                   scratch: wp.array(dtype=lane_type),  # [P · L · (held + WEIGHT_ROWS)]
+                   scratch: scratch_struct,  # held + WEIGHT_ROWS values a light
                    fitted: wp.array2d(dtype=lane_type)):  # [8, P] albedo, F0, roughness, cost
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
-        bright = level[p]
-        start = p * pack_stride
-        base = p * scratch_pack
-        light_step = wp.static(held + WEIGHT_ROWS) * scratch_step
-        weight_rows = base + held * scratch_step
-        prepare(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, light_step, scratch_step, scratch)
-        write_weights(colour, bright, noise, start, light_count, light_stride, weight_rows, light_step, scratch_step, scratch)
+        nx, ny, nz = vector_at(normal, p)
+        prepare(samples, table, criteria.form, nx, ny, nz, p, scratch)
+        write_weights(samples, criteria.noise, p, held, scratch)
         best_cost, best_rough = lane_type(1.0e30), lane_type()
         best_rho, best_f0 = channels(), channels()
         rho, f0 = channels(), channels()
@@ -108,7 +107,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 for k in range(lanes):
                     rho[c, k] = wp.where(late == 0, best_rho[c, k], rho[c, k])
                     f0[c, k] = wp.where(late == 0, best_f0[c, k], f0[c, k])
-            respond(table, nx, ny, nz, vx, vy, vz, rough, light_count, base, light_step, scratch_step, scratch)
+            respond(samples, table, nx, ny, nz, rough, p, scratch)
             cost, product = lane_type(), lane_type()
             cold = wp.where(trial * (1 - anew) * wp.static(int(not bare)) == 0, 1, 0)
             rounds = wp.where(cold == 1, wp.static(REWEIGHTINGS), wp.static(WARM_REWEIGHTINGS))
@@ -117,17 +116,17 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 dd, ds, ss = lane_type(), lane_type(), lane_type()
                 rd, rs = channels(), channels()
                 cost, product = lane_type(), lane_type(1.0)
-                for light in range(light_count):
-                    element = start + light * light_stride
-                    at = base + light * light_step
-                    fd = scratch[at]
-                    fs = scratch[at + scratch_step]
-                    fixed = scratch[at + 2 * scratch_step]
-                    plain = scratch[at + held * scratch_step]
+                for light in range(samples.light_count):
+                    element = p * samples.pack_stride + light * samples.light_stride
+                    at = p * scratch.pack_stride + light * scratch.light_stride
+                    fd = scratch.values[at]
+                    fs = scratch.values[at + scratch.step]
+                    fixed = scratch.values[at + 2 * scratch.step]
+                    plain = scratch.values[at + held * scratch.step]
                     off2, shining, expected, wd, ws = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                     for c in range(3):
-                        y = colour[c, element]
-                        inverse = scratch[at + (held + 1 + c) * scratch_step]
+                        y = samples.colour[c, element]
+                        inverse = scratch.values[at + (held + 1 + c) * scratch.step]
                         for k in range(lanes):
                             predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
                             off = (y[k] - predicted) * inverse[k]
@@ -135,7 +134,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             shining[k] += y[k]
                             expected[k] += predicted
                     for k in range(lanes):
-                        w, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], shadow)
+                        w, factor = weigh(shining[k], expected[k], heeded * off2[k], plain[k], criteria.shadow)
                         product[k] = product[k] * factor
                         wd[k] = w * fd[k]
                         ws[k] = w * fs[k]
@@ -143,7 +142,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                         ds[k] += wd[k] * fs[k]
                         ss[k] += ws[k] * fs[k]
                     for c in range(3):
-                        y = colour[c, element]
+                        y = samples.colour[c, element]
                         for k in range(lanes):
                             left = y[k] - fixed[k]
                             rd[c, k] += wd[k] * left
@@ -174,15 +173,9 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 if turn < rounds and freedom != TINTED:
                     for k in range(lanes):
                         common = float(0.0)
-                        for _ in range(wp.where(freedom == NEUTRAL, COMMON_ROUNDS, 0)):
-                            # F0 explains what the diffuse lobe cannot in channels with albedo above 0, and everything in the others
-                            top, bottom, whole = float(0.0), float(0.0), float(0.0)
-                            for c in range(3):
-                                shared = wp.where(rd[c, k] > common * ds[k], ds[k] / wp.max(dd[k], 1.0e-20), 0.0)
-                                top += rs[c, k] - shared * rd[c, k]
-                                bottom += ss[k] - shared * ds[k]
-                                whole += ss[k]
-                            common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, known[3]), 0.0)
+                        if freedom == NEUTRAL:
+                            common = common_weight(dd[k], wp.vec3(ds[k]), wp.vec3(ss[k]), wp.vec3(rd[0, k], rd[1, k], rd[2, k]),
+                                                   wp.vec3(rs[0, k], rs[1, k], rs[2, k]), known[3])
                         for c in range(3):
                             shine = wp.where(freedom == NEUTRAL, common, known[c])
                             f0[c, k] = shine
@@ -196,7 +189,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 for c in range(3):
                     best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
                     best_f0[c, k] = wp.where(better, f0[c, k], best_f0[c, k])
-        closest = lambertian(toward, form, nx, ny, nz, vx, vy, vz, p * pack_stride, light_count, light_stride)
+        closest = lambertian(samples, criteria.form, nx, ny, nz, p)
         for c in range(3):
             out = lane_type()
             for k in range(lanes):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.photometric.candidates import LEAST_NZ, rings
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import BRIGHTEST_DIELECTRIC, COST_FLOOR, Material, fit_given
 from kernels.photometric.samples import Samples, choose, to_host
 
@@ -51,17 +51,13 @@ def metals_of(shared: np.ndarray, single: Material) -> Metals:
     return Metals(lobes, float(np.percentile(costs, EXPLAINED)) if len(costs) else 0.0)
 
 
-def search_metals(samples: Samples, normal: np.ndarray, material: Material, metals: Metals, *, shape: Diffuse,
-                  options: SearchOptions | None = None) -> np.ndarray:
+def search_metals(samples: Samples, normal: np.ndarray, material: Material, metals: Metals, *, shape: Diffuse) -> np.ndarray:
     """Return the normals, [n, 3] float32, with those of metals replaced that a shared metal explains at less than half of the cost.
 
     Args:
-        samples: readings.
         normal: [n, 3] unit normals found so far.
         material: what they make of each pixel.
         metals: of the object.
-        shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
     """
     tried = np.flatnonzero(SAVED * material.cost > metals.cost + COST_FLOOR)
     if not len(tried) or not len(metals.lobes):
@@ -75,7 +71,7 @@ def search_metals(samples: Samples, normal: np.ndarray, material: Material, meta
         part = choose(few, where)
         for offset in offsets:
             candidate = moved(start[where], offset, view[where])
-            trial = fit_given(part, candidate, lobe, shape=shape, options=options).cost
+            trial = fit_given(part, candidate, lobe, shape=shape).cost
             lower = trial < cost[where]
             better = where[lower]
             found[better], cost[better], metal[better] = candidate[lower], trial[lower], which

@@ -55,7 +55,7 @@ tenths it breaks down with 0.52 and less."""
 
 
 class Misfit(NamedTuple):
-    """What the residuals of an object say about its errors."""
+    """The misfit of an object, measured by its residuals."""
 
     level: float = UNKNOWN_LEVEL  # residual variance of the middle pixel, in |b|²
     residuals: np.ndarray = np.array([UNKNOWN_LEVEL])  # [groups] ascending, residual variance at which the share is known

@@ -58,7 +58,6 @@ def find_modes(samples: Samples, model: Model, view: np.ndarray) -> np.ndarray:
     """Return the candidates of least cost over the visible hemisphere.
 
     Args:
-        samples: of n pixels.
         model: their lobes.
         view: [n, 3] unit directions to the viewer, the middle of the grid.
 

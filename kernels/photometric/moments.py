@@ -45,7 +45,6 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
     one, or one that is not finite in every channel, is not.
 
     Args:
-        band: the stack on the device.
         rows: [lights, 4] mean and dipole of each frame, along one axis at most; 0 for frames that do not take part.
         scale: [lights] radiance of a stored 1.0.
         grey_weights: of the channels, for the residual; they add up to one.

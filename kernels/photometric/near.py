@@ -16,7 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import Band, pack_type
+from kernels.packs import Band, pack_type, vector_at
 from kernels.photometric.readings import Readings
 
 LEAST_LOBE = 0.01
@@ -75,7 +75,6 @@ def see_near(band: Band, readings: Readings, field: NearField) -> NearLights:
     """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff.
 
     Args:
-        band: the stack on the device.
         readings: radiance / strength, of readings.grey_readings; on return b·l, or 0 where the light hardly shines.
         field: places of the band's lights, and the points of its pixels.
 
@@ -174,9 +173,7 @@ def _near_kernel(pack: int) -> Any:
                     toward: wp.array2d(dtype=float_pack),  # [3, P · L]
                     part: wp.array(dtype=float_pack)):  # [P · L]
         p = first + wp.tid()
-        px = points[0, p]
-        py = points[1, p]
-        pz = points[2, p]
+        px, py, pz = vector_at(points, p)
         for light in range(places.shape[0]):
             at = p * pack_stride + light * light_stride
             place = places[light]

@@ -56,7 +56,7 @@ STEP = 0.05
 
 
 class Model(NamedTuple):
-    """What a pixel may reflect: a table of lobes, and how bright each may be."""
+    """Lobes that a pixel may reflect, as a table, and how bright each may be."""
 
     table: wp.array  # [cells, lights, lobes] of response_table.search_table or a reference_table
     bound: np.ndarray  # [lobes] float32, largest weights in the units of the readings

@@ -122,7 +122,6 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
     """Compute the grey readings of a band.
 
     Args:
-        band: the stack on the device.
         factors: [lights, 3], of grey_factors.
 
     Raises:

@@ -20,9 +20,9 @@ from kernels.logarithm import log_of
 from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.candidates import LEAST_NZ, tangents
-from kernels.photometric.hypotheses import Diffuse, SearchOptions, criteria
-from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, plain_weights, weigh
-from kernels.photometric.samples import Samples, per_pixel, scratch_memory, to_host
+from kernels.photometric.hypotheses import Diffuse, criteria
+from kernels.photometric.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
+from kernels.photometric.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 
 LINEAR_TURNS = 2
 """Rounds of the robust linear fit before the first step."""
@@ -48,29 +48,22 @@ class Refinement(NamedTuple):
     cost: np.ndarray  # [n] float32, per light, as of the material fit
 
 
-def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse,
-           options: SearchOptions | None = None) -> Refinement:
+def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse) -> Refinement:
     """Refine the normal and material of sampled pixels under lights of one direction each.
 
     Args:
-        samples: their readings.
         normal: [n, 3] unit normals, within a few degrees of the truth.
         roughness: [n] of the material fit at these normals.
-        shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
 
     Returns:
         The best fit met on the way, never of higher cost than the first. Waits for the device.
     """
-    options = options or SearchOptions()
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     refined = wp.empty((5, packs), dtype=pack_type(lanes, wp.float32), device=device)
     start = np.concatenate([normal, roughness[:, None]], axis=1)
-    scratch, strides = scratch_memory(samples, HELD)
+    scratch = scratch_memory(samples, HELD)
     devices.launch(_refine_kernel(lanes), packs,
-                   [samples.colour, samples.toward, samples.level, samples.view, per_pixel(samples, start), *criteria(options, shape),
-                    samples.light_count, samples.pack_stride, samples.light_stride, *strides],
-                   [scratch, refined], device=device)
+                   [samples.arrays, per_pixel(samples, start), criteria(None, shape)], [scratch, refined], device=device)
     values = to_host(samples, refined)
     return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
 
@@ -101,43 +94,39 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
 @once
 def _refine_kernel(lanes: int) -> Any:
     write_weights = plain_weights(lanes)
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     channels = channels_type(lanes)
     triples = wp.types.matrix(shape=(9, lanes), dtype=wp.float32)  # [3 · channel + unknown]
     squares = wp.types.matrix(shape=(6, lanes), dtype=wp.float32)  # 00 01 02 11 12 22
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def refine_kernel(first: int,
-                      colour: wp.array2d(dtype=lane_type),  # [3, P · L] radiance / irradiance
-                      toward: wp.array2d(dtype=lane_type),  # [3, P · L]
-                      level: wp.array(dtype=lane_type),  # [P]
-                      view: wp.array2d(dtype=lane_type),  # [3, P]
+                      samples: samples_struct,
                       start: wp.array2d(dtype=lane_type),  # [4, P] normal, roughness
-                      noise: wp.vec2,  # s0, s1
-                      shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                      form: wp.vec2,  # diffuse roughness, slope
-                      light_count: int,
-                      pack_stride: int,
-                      light_stride: int,
-                      scratch_pack: int,
-                      scratch_step: int,
+                      criteria: Criteria,
                       # outputs
-                      scratch: wp.array(dtype=lane_type),  # [P · L · HELD]
+                      scratch: scratch_struct,  # HELD values a light
                       refined: wp.array2d(dtype=lane_type)):  # [5, P] normal, roughness, cost
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
+        vx = samples.view[0, p]
+        vy = samples.view[1, p]
+        vz = samples.view[2, p]
         nx = start[0, p]
         ny = start[1, p]
         nz = start[2, p]
         rough = start[3, p]
-        bright = level[p]
-        first_light = p * pack_stride
-        base = p * scratch_pack
-        light_step = HELD * scratch_step
-        write_weights(colour, bright, noise, first_light, light_count, light_stride, base, light_step, scratch_step, scratch)
-        for light in range(light_count):
+        write_weights(samples, criteria.noise, p, 0, scratch)
+        shadow = criteria.shadow
+        form = criteria.form
+        colour = samples.colour
+        toward = samples.toward
+        values = scratch.values
+        light_stride = samples.light_stride
+        light_step = scratch.light_stride
+        step = scratch.step
+        first_light = p * samples.pack_stride
+        base = p * scratch.pack_stride
+        for light in range(samples.light_count):
             element = first_light + light * light_stride
             lx = toward[0, element]
             ly = toward[1, element]
@@ -146,8 +135,9 @@ def _refine_kernel(lanes: int) -> Any:
             for k in range(lanes):
                 hv[k] = wp.sqrt(wp.max(0.5 + 0.5 * (lx[k] * vx[k] + ly[k] * vy[k] + lz[k] * vz[k]), 2.5e-7))
                 rise[k] = schlick(hv[k])
-            scratch[base + light * light_step + WEIGHT_ROWS * scratch_step] = hv
-            scratch[base + light * light_step + wp.static(WEIGHT_ROWS + 1) * scratch_step] = rise
+            at = base + light * light_step
+            values[at + WEIGHT_ROWS * step] = hv
+            values[at + wp.static(WEIGHT_ROWS + 1) * step] = rise
         best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
@@ -175,14 +165,14 @@ def _refine_kernel(lanes: int) -> Any:
             rd, rs = channels(), channels()
             jd, js, jy = triples(), triples(), triples()
             jj = squares()
-            for light in range(light_count):
+            for light in range(samples.light_count):
                 element = first_light + light * light_stride
                 at = base + light * light_step
                 lx = toward[0, element]
                 ly = toward[1, element]
                 lz = toward[2, element]
-                hv = scratch[at + WEIGHT_ROWS * scratch_step]
-                rise = scratch[at + wp.static(WEIGHT_ROWS + 1) * scratch_step]
+                hv = values[at + WEIGHT_ROWS * step]
+                rise = values[at + wp.static(WEIGHT_ROWS + 1) * step]
                 # responses, and their derivatives by the two tilts and the roughness
                 fd, fs, fixed, d0, d1 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
                 s0, s1, s2 = lane_type(), lane_type(), lane_type()
@@ -203,11 +193,11 @@ def _refine_kernel(lanes: int) -> Any:
                     s0[k] = by_h * (la + va[k]) * inverse + by_l * la + by_v * va[k]
                     s1[k] = by_h * (lo + vo[k]) * inverse + by_l * lo + by_v * vo[k]
                     s2[k] = by_a2 * 4.0 * alpha[k] * rough[k]
-                plain = scratch[at]
+                plain = values[at]
                 off2, shining, expected, w = lane_type(), lane_type(), lane_type(), lane_type()
                 for c in range(3):
                     y = colour[c, element]
-                    inverse_sigma = scratch[at + (1 + c) * scratch_step]
+                    inverse_sigma = values[at + (1 + c) * step]
                     for k in range(lanes):
                         predicted = rho[c, k] * fd[k] + f0[c, k] * fs[k] + fixed[k]
                         off = (y[k] - predicted) * inverse_sigma[k]

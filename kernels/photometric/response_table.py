@@ -26,7 +26,7 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI, ggx, schlick
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 
 GRID = 96
 """Nodes along a side of the table: 0.9° apart at the pole and at most 1.7°, so that a lamp 15° across is tabulated to 0.3 % of its peak."""
@@ -69,7 +69,6 @@ def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.nda
         light: [samples] which light the sample belongs to.
         share: [samples] of the light's irradiance, radiance · solid angle / their sum.
         light_count: lights.
-        device: where.
 
     Returns:
         [GRID², light_count, COLUMNS] float32 on the device, node u · GRID + v. Waits for the device.
@@ -152,9 +151,7 @@ def _table_kernel(lanes: int) -> Any:
                      table: wp.array(dtype=lane_type)):  # [P · L · COLUMNS]
         p = first + wp.tid()
         base = p * light_count * COLUMNS
-        nx = normal[0, p]
-        ny = normal[1, p]
-        nz = normal[2, p]
+        nx, ny, nz = vector_at(normal, p)
         for place in range(places.shape[0]):
             lx, ly, lz, solid = places[place][0], places[place][1], places[place][2], places[place][3]
             begin, end = begins[place], begins[place + 1]

@@ -57,7 +57,6 @@ def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near_li
     """Estimate normals from the lights that, at each pixel, are neither shadow nor highlight.
 
     Args:
-        band: the stack on the device.
         readings: its grey readings; on return each holds the weight, 0…1, that the light had in the fit.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
         near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.

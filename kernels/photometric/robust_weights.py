@@ -10,6 +10,7 @@ import warp as wp
 
 from kernels.device import once
 from kernels.packs import pack_type
+from kernels.photometric.samples import samples_type, scratch_type
 
 SHADOW_TRUST = 0.1
 """Weight in the fit of a reading that is zero or far below its prediction: such a reading bounds the radiance and hardly measures it."""
@@ -19,6 +20,15 @@ range."""
 WEIGHT_ROWS = 4
 """Values that scratch memory holds for each light: the weight of a reading without misfit, and 1 / σ of each channel over √3."""
 ROOT_OF_THIRD = 3.0**-0.5
+
+
+@wp.struct
+class Criteria:
+    """Noise, shadows and diffuse lobe by which a fit judges readings; `hypotheses.criteria` makes them."""
+
+    noise: wp.vec2  # s0, s1
+    shadow: wp.vec2  # r²/σ² of equal cost, depth
+    form: wp.vec2  # diffuse roughness, slope
 
 
 @wp.func
@@ -37,25 +47,25 @@ def weigh(shining: float, expected: float, off2: float, plain: float, shadow: wp
 
 @once
 def plain_weights(lanes: int) -> Any:
-    """Return the Warp function that writes the WEIGHT_ROWS of every light of a pack, the first of them at `base`."""
-    lane_type = pack_type(lanes, wp.float32)
+    """Return the Warp function that writes the WEIGHT_ROWS of every light of a pack, as values `row` and those after it."""
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
 
     @wp.func
-    def write_weights(colour: wp.array2d(dtype=lane_type), bright: lane_type, noise: wp.vec2, start: int, light_count: int,
-                      light_stride: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
-        for light in range(light_count):
-            element = start + light * light_stride
-            at = base + light * light_step
+    def write_weights(samples: samples_struct, noise: wp.vec2, p: int, row: int, scratch: scratch_struct):
+        bright = samples.level[p]
+        for light in range(samples.light_count):
+            element = p * samples.pack_stride + light * samples.light_stride
+            at = p * scratch.pack_stride + light * scratch.light_stride + row * scratch.step
             shining, value = lane_type(), lane_type()
             for c in range(3):
-                y = colour[c, element]
+                y = samples.colour[c, element]
                 for k in range(lanes):
                     value[k] = ROOT_OF_THIRD / wp.max(noise[0] * bright[k] + noise[1] * wp.max(y[k], 0.0), 1.0e-20)
                     shining[k] += y[k]
-                scratch[at + (1 + c) * step] = value
+                scratch.values[at + (1 + c) * scratch.step] = value
             for k in range(lanes):
                 relative = bright[k] / wp.max(noise[0] * bright[k] + noise[1] * wp.max(shining[k], 0.0) / 3.0, 1.0e-20)
                 value[k] = wp.where(shining[k] >= 0.0, wp.where(shining[k] > 0.0, 1.0, SHADOW_TRUST), 0.0) * relative * relative
-            scratch[at] = value
+            scratch.values[at] = value
 
     return write_weights

@@ -38,6 +38,48 @@ class Samples(NamedTuple):
     light_stride: int
     device: str
 
+    @property
+    def arrays(self) -> Any:
+        """These samples as kernels take them: an instance of `samples_type`."""
+        arrays = samples_type(self.lanes)()
+        for name in arrays._cls.vars:
+            setattr(arrays, name, getattr(self, name))
+        return arrays
+
+
+@once
+def samples_type(lanes: int) -> Any:
+    """Return the Warp struct of samples in packs of this width; its fields are those of `Samples`."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.struct
+    class PackedSamples:
+        grey: wp.array(dtype=lane_type)
+        colour: wp.array2d(dtype=lane_type)
+        level: wp.array(dtype=lane_type)
+        toward: wp.array2d(dtype=lane_type)
+        view: wp.array2d(dtype=lane_type)
+        light_count: int
+        pack_stride: int
+        light_stride: int
+
+    return PackedSamples
+
+
+@once
+def scratch_type(lanes: int) -> Any:
+    """Return the Warp struct of scratch memory: value v of light l of pack p is at p · pack_stride + l · light_stride + v · step."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.struct
+    class Scratch:
+        values: wp.array(dtype=lane_type)
+        pack_stride: int
+        light_stride: int
+        step: int
+
+    return Scratch
+
 
 def lanes_of(device: str) -> int:
     """Return the number of pixels that one thread takes on this device."""
@@ -59,7 +101,6 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     """Gather the readings of some pixels of a band.
 
     Args:
-        band: the stack on the device.
         pixels: [n] int32 positions in the band, one or more.
         view: [n, 3] unit directions from the surface to the viewer.
         lights: irradiance and scale of each light.
@@ -86,10 +127,12 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     order = np.minimum(np.arange(packs * lanes), last)
     pack_stride, light_stride = (light_count, 1) if device == "cpu" else (1, packs)
     lane_type = pack_type(lanes, wp.float32)
-    grey = wp.empty(packs * light_count, dtype=lane_type, device=device)
-    colour = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
-    toward = wp.empty((3, packs * light_count), dtype=lane_type, device=device)
-    level = wp.empty(packs, dtype=lane_type, device=device)
+    planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
+    samples = Samples(wp.empty(packs * light_count, dtype=lane_type, device=device),
+                      wp.empty((3, packs * light_count), dtype=lane_type, device=device),
+                      wp.empty(packs, dtype=lane_type, device=device), wp.empty((3, packs * light_count), dtype=lane_type, device=device),
+                      wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes, pack_stride, light_stride,
+                      device)
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
     where = wp.array(pixels[order], dtype=wp.int32, device=device)
@@ -101,10 +144,8 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     devices.launch(_gather_kernel(lanes, field is not None), packs,
                    [as_pixels(band.values), as_pixels(band.saturated), where, wp.array(factors, dtype=wp.vec3, device=device),
                     wp.array(per_channel, dtype=wp.vec3, device=device), wp.array(lights.direction, dtype=wp.vec3, device=device),
-                    *near, light_count, pack_stride, light_stride], [grey, colour, toward, level], device=device)
-    planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
-    return Samples(grey, colour, level, toward, wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes,
-                   pack_stride, light_stride, device)
+                    *near], [samples.arrays], device=device)
+    return samples
 
 
 def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
@@ -114,17 +155,19 @@ def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
     return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
 
 
-def scratch_memory(samples: Samples, held: int) -> tuple[wp.array, tuple[int, int]]:
-    """Return memory for some values of each light and sampled pixel, and where they lie: value v of light l of pack p is at
-    p · strides[0] + (l · held + v) · strides[1].
+def scratch_memory(samples: Samples, held: int) -> Any:
+    """Return memory for some values of each light and sampled pixel, as kernels take it: an instance of `scratch_type`.
 
     Args:
         samples: the readings beside which the values lie.
         held: values for each light.
     """
     size = samples.light_count * held
-    scratch = wp.empty(samples.packs * size, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
-    return scratch, (size, 1) if samples.device == "cpu" else (1, samples.packs)
+    scratch = scratch_type(samples.lanes)()
+    scratch.values = wp.empty(samples.packs * size, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    scratch.pack_stride, scratch.step = (size, 1) if samples.device == "cpu" else (1, samples.packs)
+    scratch.light_stride = held * scratch.step
+    return scratch
 
 
 def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
@@ -165,7 +208,6 @@ def choose(samples: Samples, chosen: np.ndarray) -> Samples:
     """Return the samples of some of the sampled pixels.
 
     Args:
-        samples: of n pixels.
         chosen: [n] bool, or positions among them; one or more.
 
     Returns:
@@ -204,7 +246,7 @@ def _planes(samples: Samples) -> tuple[int, int, int]:
 
 @once
 def _gather_kernel(lanes: int, near: bool = False) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def gather_kernel(first: int,
@@ -217,19 +259,13 @@ def _gather_kernel(lanes: int, near: bool = False) -> Any:
                       places: wp.array(dtype=wp.vec4),  # [L padded], if near in place of directions
                       lobes: wp.array(dtype=wp.vec4),  # [L padded], if near
                       points: wp.array2d(dtype=float),  # [3, P · lanes], if near
-                      light_count: int,
-                      pack_stride: int,
-                      light_stride: int,
                       # outputs
-                      grey: wp.array(dtype=lane_type),
-                      colour: wp.array2d(dtype=lane_type),
-                      toward: wp.array2d(dtype=lane_type),
-                      level: wp.array(dtype=lane_type)):
+                      samples: samples_struct):  # its view is given
         p = first + wp.tid()
         padded = grey_factors.shape[0]
         root, given = lane_type(), lane_type()
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
             f, g, way = grey_factors[light], channel_factors[light], directions[light]
             inverse = lane_type()  # 1 / falloff
             if wp.static(near):
@@ -243,15 +279,15 @@ def _gather_kernel(lanes: int, near: bool = False) -> Any:
                     tz[k] = near_way[2]
                     fall = falloff(place, lobes[light], points[0, m], points[1, m], points[2, m])
                     inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
-                toward[0, at] = tx
-                toward[1, at] = ty
-                toward[2, at] = tz
+                samples.toward[0, at] = tx
+                samples.toward[1, at] = ty
+                samples.toward[2, at] = tz
             else:
                 for c in range(3):
                     same = lane_type()
                     for k in range(lanes):
                         same[k] = way[c]
-                    toward[c, at] = same
+                    samples.toward[c, at] = same
             y, red, green, blue = lane_type(), lane_type(), lane_type(), lane_type()
             for k in range(lanes):
                 n = pixels[p * lanes + k]
@@ -273,17 +309,17 @@ def _gather_kernel(lanes: int, near: bool = False) -> Any:
                 blue[k] = wp.where(sound == 1, wp.max(g[2] * b, 0.0), -1.0)
                 root[k] += wp.where(value > 0.0, wp.sqrt(wp.max(y[k], 0.0)), 0.0)
                 given[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
-            grey[at] = y
-            colour[0, at] = red
-            colour[1, at] = green
-            colour[2, at] = blue
+            samples.grey[at] = y
+            samples.colour[0, at] = red
+            samples.colour[1, at] = green
+            samples.colour[2, at] = blue
         # the level: mean root of the lit readings, squared; highlights hardly move it
         first_level, lit_root, lit = lane_type(), lane_type(), lane_type()
         for k in range(lanes):
             mean = root[k] / wp.max(given[k], 1.0)
             first_level[k] = mean * mean
-        for light in range(light_count):
-            y = grey[p * pack_stride + light * light_stride]
+        for light in range(samples.light_count):
+            y = samples.grey[p * samples.pack_stride + light * samples.light_stride]
             for k in range(lanes):
                 shines = wp.where(y[k] > SHADOW_FRACTION * first_level[k], 1.0, 0.0)
                 lit[k] += shines
@@ -292,13 +328,13 @@ def _gather_kernel(lanes: int, near: bool = False) -> Any:
         for k in range(lanes):
             mean = lit_root[k] / wp.max(lit[k], 1.0)
             scale[k] = wp.max(mean * mean, 1.0e-20)
-        level[p] = scale
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
-            y = grey[at]
+        samples.level[p] = scale
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
+            y = samples.grey[at]
             relative = lane_type()
             for k in range(lanes):
                 relative[k] = wp.where(y[k] >= 0.0, y[k] / scale[k], -1.0)
-            grey[at] = relative
+            samples.grey[at] = relative
 
     return gather_kernel

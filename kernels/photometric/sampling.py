@@ -98,16 +98,13 @@ class Found(NamedTuple):
     roughness: np.ndarray  # [n] float32
 
 
-def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None,
-                    options: RingOptions = OPTIONS) -> Found:
+def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None) -> Found:
     """Find the normal and the material of sampled pixels that explain their readings best.
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
-        tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
         start: [n, 3] unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere.
-        options: how candidates are judged.
 
     Returns:
         The best candidates. Waits for the device.
@@ -119,25 +116,22 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
     first, other = find_modes(samples, bounded(tables.search[0], samples), view) if start is None else (start, start)
     near = search_normals(samples, first, shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
                           table=tables.search[0]).normal
-    searches = [search_normals(samples, near, shape=lambert, options=options, wide=FINE[0], fine=FINE[1:], table=table)
+    searches = [search_normals(samples, near, shape=lambert, options=OPTIONS, wide=FINE[0], fine=FINE[1:], table=table)
                 for table in tables.search]
-    materials = [fit_material(samples, search.normal, shape=lambert, options=options, table=tables.responses) for search in searches]
+    materials = [fit_material(samples, search.normal, shape=lambert, options=OPTIONS, table=tables.responses) for search in searches]
     metallic = materials[1].cost < materials[0].cost
     material = Material(*_choose(metallic, *materials))
     normal, cost, weights = _choose(metallic, *((search.normal, search.cost, search.weights) for search in searches))
     return Found(normal, other, metallic, weights, cost, *material[:3])
 
 
-def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None,
-                   options: RingOptions = OPTIONS) -> SamplingFit:
+def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None) -> SamplingFit:
     """Estimate normal, material and regime of sampled pixels.
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
-        tables: of the same lights.
         view: [n, 3] unit directions to the viewer.
         found: of `search_sampling` for these samples; None: it is looked for here.
-        options: how candidates are judged by the search.
 
     Returns:
         The fit. Waits for the device.
@@ -147,7 +141,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
     """
     lambert = Diffuse()
     if found is None:
-        found = search_sampling(samples, tables, view, options=options)
+        found = search_sampling(samples, tables, view)
     metallic = found.metallic
     material = Material(*(values.copy() for values in (found.diffuse_albedo, found.specular, found.roughness, found.cost)))
     kinds = [kind for kind in (False, True) if (metallic == kind).any()]
@@ -162,7 +156,7 @@ def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *
     kept = modes.close_to(found.normal)
     normal = np.where(kept[:, None], found.normal, modes.normal)
     if not kept.all():
-        again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=options, table=tables.responses)
+        again = fit_material(choose(samples, ~kept), normal[~kept], shape=lambert, options=OPTIONS, table=tables.responses)
         for values, better in zip(material, again, strict=True):
             values[~kept] = better
     facing = (normal * view).sum(axis=1)

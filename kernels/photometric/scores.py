@@ -13,10 +13,10 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import candidate_at
 from kernels.photometric.lobes import Lobes
-from kernels.photometric.samples import Samples, per_pixel, to_host
+from kernels.photometric.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 from kernels.photometric.tabulated_lobes import tabulated_lobes
 
 REACH = 6.0
@@ -51,7 +51,6 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
     """Return the cost of candidates around a normal of each sampled pixel.
 
     Args:
-        samples: their readings.
         centre: [n, 3] unit normals.
         offsets: [candidates, 4] of `candidates.rings`; the first is the centre.
         noise: [n, 2] standard deviation of a reading: constant part and part of the reading, both relative to the pixel's level.
@@ -70,65 +69,47 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
     if table.shape[1] != samples.light_count or bound.shape != (table.shape[2],):
         raise ArrayError(f"table is {table.shape}, bound {bound.shape}, the samples have {samples.light_count} lights: "
                          "tabulate those of the samples, and give one bound for each lobe")
-    device, lanes, packs, lights = samples.device, samples.lanes, samples.packs, samples.light_count
+    device, lanes, packs = samples.device, samples.lanes, samples.packs
     lane_type = pack_type(lanes, wp.float32)
     lobes = tabulated_lobes(lanes, table.shape[2])
-    scratch = wp.empty(packs * lights * lobes.held, dtype=lane_type, device=device)
-    strides = (lights * lobes.held, 1) if device == "cpu" else (1, packs)
     cost = wp.empty((len(offsets), packs), dtype=lane_type, device=device)
     misfit = wp.empty((5, packs), dtype=lane_type, device=device)
     devices.launch(_score_kernel(lanes, lobes), packs,
-                   [samples.grey, samples.toward, table, samples.view, samples.level, per_pixel(samples, centre),
-                    per_pixel(samples, noise), wp.array(bound, dtype=wp.float32, device=device),
-                    wp.array(offsets, dtype=wp.vec4, device=device), lights,
-                    samples.pack_stride, samples.light_stride, *strides],
-                   [scratch, cost, misfit], device=device, uneven=True)
+                   [samples.arrays, table, per_pixel(samples, centre), per_pixel(samples, noise),
+                    wp.array(bound, dtype=wp.float32, device=device), wp.array(offsets, dtype=wp.vec4, device=device)],
+                   [scratch_memory(samples, lobes.held), cost, misfit], device=device, uneven=True)
     rest = to_host(samples, misfit)
     return Scores(to_host(samples, cost).T, rest[:, 0], rest[:, 1:3], rest[:, 3:5])
 
 
 @once
 def _score_kernel(lanes: int, lobes: Lobes) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
-    mixture, held, relaxation, _, fill = lobes
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
+    mixture, _, relaxation, _, fill = lobes
     coefficients = wp.types.matrix(shape=(mixture, lanes), dtype=wp.float32)
     gram = wp.types.matrix(shape=(mixture * (mixture + 1) // 2, lanes), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def score_kernel(first: int,
-                     grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                     toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                     samples: samples_struct,
                      table: wp.array3d(dtype=float),  # [cells, L, lobes]
-                     view: wp.array2d(dtype=lane_type),  # [3, P]
-                     level: wp.array(dtype=lane_type),  # [P]
                      centre: wp.array2d(dtype=lane_type),  # [3, P]
                      noise: wp.array2d(dtype=lane_type),  # [2, P]
                      bound: wp.array(dtype=float),  # [lobes]
                      offsets: wp.array(dtype=wp.vec4),  # [candidates]
-                     light_count: int,
-                     pack_stride: int,
-                     light_stride: int,
-                     scratch_pack: int,
-                     scratch_step: int,
                      # outputs
-                     scratch: wp.array(dtype=lane_type),  # [P · L · held]
+                     scratch: scratch_struct,  # what the lobes hold
                      cost: wp.array2d(dtype=lane_type),  # [candidates, P]
                      misfit: wp.array2d(dtype=lane_type)):  # [5, P] lit; bright readings, squares; dim readings, squares
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
-        cx = centre[0, p]
-        cy = centre[1, p]
-        cz = centre[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
+        cx, cy, cz = vector_at(centre, p)
         floor = noise[0, p]
         slope = noise[1, p]
-        unit = level[p]
-        start = p * pack_stride
-        base = p * scratch_pack
+        unit = samples.level[p]
         brightest = lane_type()
-        for light in range(light_count):
-            reading = grey[start + light * light_stride]
+        for light in range(samples.light_count):
+            reading = samples.grey[p * samples.pack_stride + light * samples.light_stride]
             for k in range(lanes):
                 brightest[k] = wp.max(brightest[k], reading[k])
         x = coefficients()
@@ -140,17 +121,17 @@ def _score_kernel(lanes: int, lobes: Lobes) -> Any:
                 nx[k] = n[0]
                 ny[k] = n[1]
                 nz[k] = n[2]
-            fill(toward, table, wp.vec2(), nx, ny, nz, vx, vy, vz, start, light_count, 0, base, scratch_step, scratch)
+            fill(samples, table, wp.vec2(), nx, ny, nz, p, scratch)
             total, lit, bright, bright2, dim, dim2 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             for turn in range(REWEIGHTINGS + 1):
                 g = gram()
                 r = coefficients()
-                for light in range(light_count):
-                    at = base + light * held * scratch_step
-                    reading = grey[start + light * light_stride]
+                for light in range(samples.light_count):
+                    at = p * scratch.pack_stride + light * scratch.light_stride
+                    reading = samples.grey[p * samples.pack_stride + light * samples.light_stride]
                     predicted, w = lane_type(), lane_type()
                     for a in range(mixture):
-                        f = scratch[at + a * scratch_step]
+                        f = scratch.values[at + a * scratch.step]
                         for k in range(lanes):
                             predicted[k] += f[k] * x[a, k]
                     for k in range(lanes):
@@ -174,13 +155,13 @@ def _score_kernel(lanes: int, lobes: Lobes) -> Any:
                                 dim2[k] += (given - shines) * off * off
                     if turn < REWEIGHTINGS:
                         for a in range(mixture):
-                            f = scratch[at + a * scratch_step]
+                            f = scratch.values[at + a * scratch.step]
                             wf = lane_type()
                             for k in range(lanes):
                                 wf[k] = w[k] * f[k]
                                 r[a, k] += wf[k] * wp.max(reading[k], 0.0)
                             for b in range(a + 1):
-                                h = scratch[at + b * scratch_step]
+                                h = scratch.values[at + b * scratch.step]
                                 for k in range(lanes):
                                     g[a * (a + 1) / 2 + b, k] += wf[k] * h[k]
                 if turn < REWEIGHTINGS:

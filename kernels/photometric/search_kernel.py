@@ -6,10 +6,26 @@ import warp as wp
 
 from kernels.device import once
 from kernels.logarithm import log_of
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.candidates import candidate_at, tangents
 from kernels.photometric.lobes import Lobes
-from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST
+from kernels.photometric.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
+from kernels.photometric.samples import samples_type, scratch_type
+
+
+@once
+def search_type(lanes: int) -> Any:
+    """Return the Warp struct of what a search finds."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.struct
+    class SearchArrays:
+        normal: wp.array2d(dtype=lane_type)  # [3, P] in: start, out: best
+        cost: wp.array(dtype=lane_type)  # [P]
+        weights: wp.array2d(dtype=lane_type)  # [lobes, P]
+        costs: wp.array2d(dtype=lane_type)  # [candidates, P]
+
+    return SearchArrays
 
 
 @once
@@ -17,13 +33,12 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
     """Return the kernel for one width of packs and one mixture.
 
     Args:
-        lanes: pixels of a pack.
-        lobes: the mixture.
         reweightings: rounds of the robust fit of each candidate.
         sweeps: coordinate sweeps of each non-negative solve.
     """
-    lane_type = pack_type(lanes, wp.float32)
-    mixture, held, relaxation, prepare, fill = lobes
+    lane_type, samples_struct, scratch_struct, search_struct = (pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes),
+                                                                search_type(lanes))
+    mixture, _, relaxation, prepare, fill = lobes
     coefficients = wp.types.matrix(shape=(mixture, lanes), dtype=wp.float32)
     gram = wp.types.matrix(shape=(mixture * (mixture + 1) // 2, lanes), dtype=wp.float32)
     triples = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
@@ -31,44 +46,29 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def judge_kernel(first: int,
-                     grey: wp.array(dtype=lane_type),  # [P · L] readings / level
-                     toward: wp.array2d(dtype=lane_type),  # [3, P · L]
+                     samples: samples_struct,
                      table: wp.array3d(dtype=float),  # [cells, L, lobes]
-                     view: wp.array2d(dtype=lane_type),  # [3, P]
                      offsets: wp.array(dtype=wp.vec4),  # [candidates]
                      radius: float,  # sine of the only ring's angle, 0 where there are several
                      drawn: wp.array2d(dtype=lane_type),  # [3, P] normal of the prior
                      pull: wp.vec2,  # its strength, and 1 / rad² of its angle
-                     noise: wp.vec2,  # s0, s1
-                     shadow: wp.vec2,  # r²/σ² of equal cost, depth
-                     form: wp.vec2,  # diffuse roughness, slope
-                     light_count: int,
-                     pack_stride: int,
-                     light_stride: int,
-                     scratch_pack: int,
-                     scratch_step: int,
+                     criteria: Criteria,
                      # outputs
-                     scratch: wp.array(dtype=lane_type),  # [P · L · held]
-                     normal: wp.array2d(dtype=lane_type),  # [3, P] in: start, out: best
-                     cost: wp.array(dtype=lane_type),  # [P]
-                     weights: wp.array2d(dtype=lane_type),  # [lobes, P]
-                     costs: wp.array2d(dtype=lane_type)):  # [candidates, P]
+                     scratch: scratch_struct,  # what the lobes hold
+                     found: search_struct):
         p = first + wp.tid()
-        vx = view[0, p]
-        vy = view[1, p]
-        vz = view[2, p]
-        start = p * pack_stride
-        base = p * scratch_pack
-        prepare(toward, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
-        cx = normal[0, p]
-        cy = normal[1, p]
-        cz = normal[2, p]
+        vx, vy, vz = vector_at(samples.view, p)
+        noise = criteria.noise
+        shadow = criteria.shadow
+        light_count = samples.light_count
+        start = p * samples.pack_stride
+        base = p * scratch.pack_stride
+        prepare(samples, p, scratch)
+        cx, cy, cz = vector_at(found.normal, p)
         best, bx, by, bz = lane_type(1.0e30), lane_type(), lane_type(), lane_type()
         centre, ring, slope_x, slope_y = lane_type(), lane_type(), lane_type(), lane_type()
-        ux = drawn[0, p]
-        uy = drawn[1, p]
-        uz = drawn[2, p]
-        found = coefficients()
+        ux, uy, uz = vector_at(drawn, p)
+        x_found = coefficients()
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]
             nx, ny, nz = lane_type(), lane_type(), lane_type()
@@ -77,7 +77,7 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                 nx[k] = n[0]
                 ny[k] = n[1]
                 nz[k] = n[2]
-            fill(toward, table, form, nx, ny, nz, vx, vy, vz, start, light_count, light_stride, base, scratch_step, scratch)
+            fill(samples, table, criteria.form, nx, ny, nz, p, scratch)
             # the robust non-negative mixture
             x_best = coefficients()
             total, product = lane_type(), lane_type(1.0)
@@ -90,11 +90,11 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                     for j in range(3):
                         light = wp.min(3 * triple + j, light_count - 1)
                         inside = wp.where(3 * triple + j < light_count, 1.0, 0.0)
-                        at = base + light * held * scratch_step
-                        reading = grey[start + light * light_stride]
+                        at = base + light * scratch.light_stride
+                        reading = samples.grey[start + light * samples.light_stride]
                         predicted = lane_type()
                         for a in range(mixture):
-                            f = scratch[at + a * scratch_step]
+                            f = scratch.values[at + a * scratch.step]
                             for k in range(lanes):
                                 predicted[k] += f[k] * x_best[a, k]
                         for k in range(lanes):
@@ -113,16 +113,16 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                     if turn < reweightings:
                         second = wp.min(3 * triple + 1, light_count - 1)
                         third = wp.min(3 * triple + 2, light_count - 1)
-                        at0 = base + 3 * triple * held * scratch_step
-                        at1 = base + second * held * scratch_step
-                        at2 = base + third * held * scratch_step
-                        y0 = grey[start + 3 * triple * light_stride]
-                        y1 = grey[start + second * light_stride]
-                        y2 = grey[start + third * light_stride]
+                        at0 = base + 3 * triple * scratch.light_stride
+                        at1 = base + second * scratch.light_stride
+                        at2 = base + third * scratch.light_stride
+                        y0 = samples.grey[start + 3 * triple * samples.light_stride]
+                        y1 = samples.grey[start + second * samples.light_stride]
+                        y2 = samples.grey[start + third * samples.light_stride]
                         for a in range(mixture):
-                            f0 = scratch[at0 + a * scratch_step]
-                            f1 = scratch[at1 + a * scratch_step]
-                            f2 = scratch[at2 + a * scratch_step]
+                            f0 = scratch.values[at0 + a * scratch.step]
+                            f1 = scratch.values[at1 + a * scratch.step]
+                            f2 = scratch.values[at2 + a * scratch.step]
                             for k in range(lanes):
                                 f0[k] = w[0, k] * f0[k]
                                 f1[k] = w[1, k] * f1[k]
@@ -130,9 +130,9 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                                 r[a, k] += f0[k] * y0[k] + f1[k] * y1[k] + f2[k] * y2[k]
                             row = a * (a + 1) / 2
                             for b in range(a + 1):
-                                h0 = scratch[at0 + b * scratch_step]
-                                h1 = scratch[at1 + b * scratch_step]
-                                h2 = scratch[at2 + b * scratch_step]
+                                h0 = scratch.values[at0 + b * scratch.step]
+                                h1 = scratch.values[at1 + b * scratch.step]
+                                h2 = scratch.values[at2 + b * scratch.step]
                                 for k in range(lanes):
                                     g[row + b, k] += f0[k] * h0[k] + f1[k] * h1[k] + f2[k] * h2[k]
                 if turn < reweightings:
@@ -159,7 +159,7 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
             for k in range(lanes):
                 away = 2.0 - 2.0 * (nx[k] * ux[k] + ny[k] * uy[k] + nz[k] * uz[k])
                 total[k] += log_of(product[k]) + pull[0] * log_of(1.0 + pull[1] * wp.max(away, 0.0))
-            costs[candidate, p] = total
+            found.costs[candidate, p] = total
             for k in range(lanes):
                 around = wp.where(candidate > 0, total[k], 0.0)
                 ring[k] += around
@@ -168,7 +168,7 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                 centre[k] = wp.where(candidate == 0, total[k], centre[k])
                 better = total[k] < best[k]
                 for a in range(mixture):
-                    found[a, k] = wp.where(better, x_best[a, k], found[a, k])
+                    x_found[a, k] = wp.where(better, x_best[a, k], x_found[a, k])
                 best[k] = wp.where(better, total[k], best[k])
                 bx[k] = wp.where(better, nx[k], bx[k])
                 by[k] = wp.where(better, ny[k], by[k])
@@ -190,13 +190,13 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                 by[k] = moved[1]
                 bz[k] = moved[2]
             share[k] = best[k] / float(light_count)
-        normal[0, p] = bx
-        normal[1, p] = by
-        normal[2, p] = bz
-        cost[p] = share
+        found.normal[0, p] = bx
+        found.normal[1, p] = by
+        found.normal[2, p] = bz
+        found.cost[p] = share
         for a in range(mixture):
             for k in range(lanes):
-                share[k] = found[a, k]
-            weights[a, p] = share
+                share[k] = x_found[a, k]
+            found.weights[a, p] = share
 
     return judge_kernel

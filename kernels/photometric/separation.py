@@ -53,8 +53,6 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
         parallel: of the parallel-polarised ones.
         grey_weights: of the channels; they add up to one.
         leak: part of a highlight's light that crossed polarisers pass, 0 to below 0.5.
-        pixel_count: pixels of the band.
-        device: where the responses are.
     """
     diffuse = Moments(*(wp.clone(array) for array in cross)) if leak > 0 else cross
     specular = zeros(pixel_count, wp.float32, device, rows=6)
@@ -70,8 +68,6 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
     Args:
         mixed: responses of the unpolarised frames.
         view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
-        pixel_count: pixels of the band.
-        device: where the responses are.
 
     Returns:
         New responses. Where nothing is separated the diffuse ones are the mixed ones, and `tilt` is HIDDEN_TILT.

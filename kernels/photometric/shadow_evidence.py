@@ -93,7 +93,6 @@ def shadow_odds(readings: np.ndarray, toward: np.ndarray, normal: np.ndarray, vi
         normal: [n, 3] unit.
         view: [n, 3] unit directions to the viewer.
         material: [n, 3] grey diffuse albedo, grey F0 (0: no highlight) and roughness.
-        device: where to compute.
 
     Raises:
         ArrayError: numbers of pixels or lights do not fit.

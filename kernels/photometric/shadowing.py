@@ -1,4 +1,5 @@
 """Cast shadows: readings whose light is hidden by the surface, as its height says, are taken out of the samples.
+Readings of wide lights that a surface hides in part are divided by the part of the light that reached the pixel.
 
 Source: photometric stereo without the shadowed lights of a pixel, Barsky and Petrou, "The 4-source photometric stereo technique for
 three-dimensional surfaces in the presence of highlights and shadows", TPAMI 2003; here the shadows are marched over a height map.
@@ -12,9 +13,9 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.near import Places
-from kernels.photometric.samples import Samples
+from kernels.photometric.samples import Samples, per_pixel, samples_type
 from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
 
 
@@ -41,19 +42,17 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     where = wp.array(pixels[order], dtype=wp.int32, device=samples.device)
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
-                   [samples.toward, wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
-                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy())),
-                    samples.light_count, samples.pack_stride, samples.light_stride], [samples.grey, samples.colour],
-                   device=samples.device)
+                   [wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
+                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy()))],
+                   [samples.arrays], device=samples.device)
 
 
 @once
 def _exclude_kernel(lanes: int) -> Any:
-    lane_type = pack_type(lanes, wp.float32)
+    samples_struct = samples_type(lanes)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def exclude_kernel(first: int,
-                       toward: wp.array2d(dtype=lane_type),  # [3, P · L]
                        places: wp.array(dtype=wp.vec4),  # [L or padded] position and 1, or anything and 0
                        pixels: wp.array(dtype=wp.int32),  # [P · lanes]
                        height: wp.array2d(dtype=float),
@@ -63,24 +62,16 @@ def _exclude_kernel(lanes: int) -> Any:
                        centre: wp.vec2,
                        box: wp.vec4i,
                        highest: float,
-                       light_count: int,
-                       pack_stride: int,
-                       light_stride: int,
                        # outputs
-                       grey: wp.array(dtype=lane_type),
-                       colour: wp.array2d(dtype=lane_type)):
+                       samples: samples_struct):
         p = first + wp.tid()
         cols = mask.shape[1]
-        for light in range(light_count):
-            at = p * pack_stride + light * light_stride
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
             place = places[light]
-            lx = toward[0, at]
-            ly = toward[1, at]
-            lz = toward[2, at]
-            y = grey[at]
-            red = colour[0, at]
-            green = colour[1, at]
-            blue = colour[2, at]
+            lx, ly, lz = vector_at(samples.toward, at)
+            y = samples.grey[at]
+            red, green, blue = vector_at(samples.colour, at)
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 row, col = n / cols, n % cols
@@ -92,9 +83,57 @@ def _exclude_kernel(lanes: int) -> Any:
                     red[k] = -1.0
                     green[k] = -1.0
                     blue[k] = -1.0
-            grey[at] = y
-            colour[0, at] = red
-            colour[1, at] = green
-            colour[2, at] = blue
+            samples.grey[at] = y
+            samples.colour[0, at] = red
+            samples.colour[1, at] = green
+            samples.colour[2, at] = blue
 
     return exclude_kernel
+
+
+LEAST_PART = 0.5
+"""Least part of the light of a source, as the pixel reflects it, at which its reading is used: below it, the shape of the shadow's
+edge, which follows from a height that is not exact, decides the reading."""
+
+
+def divide_by_visible(samples: Samples, part: np.ndarray) -> None:
+    """Divide readings by the visible part of their light, and mark those as no readings of which too little is visible.
+
+    Args:
+        samples: changed in place.
+        part: [n, lights] from 0 to 1: what each pixel reflects of each light where the surface hides some of it, over what it would reflect
+            of the whole.
+
+    Raises:
+        ArrayError: parts of other pixels or lights.
+    """
+    if part.shape != (samples.pixel_count, samples.light_count):
+        raise ArrayError(f"part is {part.shape}: give one number for each of {samples.pixel_count} pixels and {samples.light_count} lights")
+    devices.launch(_divide_kernel(samples.lanes), samples.packs,
+                   [per_pixel(samples, part)], [samples.arrays], device=samples.device)
+
+
+@once
+def _divide_kernel(lanes: int) -> Any:
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def divide_kernel(first: int,
+                      part: wp.array2d(dtype=lane_type),  # [L, P]
+                      # outputs
+                      samples: samples_struct):
+        p = first + wp.tid()
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
+            seen = part[light, p]
+            y = samples.grey[at]
+            for k in range(lanes):
+                y[k] = wp.where(seen[k] >= LEAST_PART, y[k] / wp.max(seen[k], LEAST_PART), -1.0)
+            samples.grey[at] = y
+            for c in range(3):
+                channel = samples.colour[c, at]
+                for k in range(lanes):
+                    channel[k] = wp.where(seen[k] >= LEAST_PART, channel[k] / wp.max(seen[k], LEAST_PART), -1.0)
+                samples.colour[c, at] = channel
+
+    return divide_kernel

@@ -12,7 +12,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 
 import numpy as np
 
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import fit_given, fit_material, is_dielectric
 from kernels.photometric.samples import Samples, evenly
 
@@ -29,22 +29,20 @@ F0_GRID, F0_HALVINGS = 5, 4
 times that their step is halved about the best: three per cent from one to the next where the F0 differ by a factor of six."""
 
 
-def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None) -> np.ndarray:
+def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> np.ndarray:
     """Choose the materials that sampled pixels share.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
         normal: [n, 3] unit normals.
-        shape: of the diffuse lobe.
-        options: noise and shadows, as in the search.
 
     Returns:
         [materials, 4] float32: F0 and roughness, in the order in which they were chosen. Waits for the device.
     """
-    own = fit_material(samples, normal, shape=shape, options=options)
+    own = fit_material(samples, normal, shape=shape)
     chosen = evenly(len(normal), CANDIDATES)
     candidates = np.concatenate([own.specular[chosen], own.roughness[chosen, None]], axis=1)
-    costs = np.stack([fit_given(samples, normal, candidate, shape=shape, options=options).cost for candidate in candidates])
+    costs = np.stack([fit_given(samples, normal, candidate, shape=shape).cost for candidate in candidates])
     materials: list[int] = []
     best = np.full(costs.shape[1], np.inf)
     while len(materials) < MOST:
@@ -54,15 +52,14 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse, op
             break
         materials.append(index)
         best = np.minimum(best, costs[index])
-    return _with_one_f0(samples, normal, candidates[materials].astype(np.float32), costs[materials], shape=shape, options=options)
+    return _with_one_f0(samples, normal, candidates[materials].astype(np.float32), costs[materials], shape=shape)
 
 
-def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse,
-                 options: SearchOptions | None) -> np.ndarray:
+def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:
     """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough.
 
     Args:
-        samples, normal, shape, options: as for choose_materials.
+        samples, normal, shape: as for choose_materials.
         materials: [materials, 4] F0 and roughness.
         costs: [materials, n] of every pixel under each of them.
     """
@@ -78,7 +75,7 @@ def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, co
 
     def judge(logarithm: float) -> None:
         if logarithm not in tried:
-            cost = [fit_given(samples, normal, material, shape=shape, options=options).cost for material in _with_f0(alike, logarithm)]
+            cost = [fit_given(samples, normal, material, shape=shape).cost for material in _with_f0(alike, logarithm)]
             tried[logarithm] = float(np.minimum(np.min(cost, axis=0), others).sum(dtype=np.float64))
 
     for logarithm in np.linspace(low, high, F0_GRID):

@@ -4,6 +4,10 @@ Normals come from `normal_search` under the diffuse shape that the object shares
 joint fit of a single lobe; they are averaged, each weighted by how well it explains the pixel, first those of the mixture under all shapes
 and then their mean and that of the single lobe. The material then follows for the normal found.
 
+Towards the rim, and where bounced light fills the shadows, a pixel can trade a tilt of its normal for an F0. Where a tilted normal with the
+F0 that the object's dielectrics share explains a far brighter pixel about as well, the angle between both normals belongs to the standard
+deviation.
+
 Sources: Relit's BRDF is GGX (Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007) with Smith's
 height-correlated masking (Heitz, "Understanding the masking-shadowing function", JCGT 2014), Schlick's Fresnel ("An inexpensive BRDF
 model for physically-based rendering", Computer Graphics Forum 1994) and Burley's diffuse lobe (2012); the cost of normals is
@@ -14,16 +18,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kernels.photometric.candidates import rings
 from kernels.photometric.certainty import assess
 from kernels.photometric.descent import WARM, descend
-from kernels.photometric.f0_doubt import doubt_of_f0
-from kernels.photometric.hypotheses import Diffuse, Prior, SearchOptions
-from kernels.photometric.material import MATT, fit_given, fit_material, fit_tinted
-from kernels.photometric.metal_search import Metals, search_metals
+from kernels.photometric.hypotheses import Diffuse, Prior
+from kernels.photometric.material import (
+    MATT,
+    Material,
+    explains,
+    fit_given,
+    fit_given_f0,
+    fit_material,
+    fit_tinted,
+    is_dielectric,
+    outlying,
+)
+from kernels.photometric.metal_search import Metals, moved, search_metals
 from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.normal_search import find_normals
 from kernels.photometric.refine import refine
-from kernels.photometric.samples import Samples, choose
+from kernels.photometric.samples import Samples, choose, to_host
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A
@@ -51,17 +65,14 @@ class SvbrdfFit(NamedTuple):
 
 
 def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: Diffuse | None = None,
-                 options: SearchOptions | None = None, shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
+                 shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
                  beside: np.ndarray | None = None) -> SvbrdfFit:
     """Estimate the normal and the material of sampled pixels.
 
     Args:
-        samples: their readings.
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
-        shape: of the diffuse lobe under which normals are found, from diffuse_shape.choose_diffuse.
         lobe: the shape under which materials are fitted; None: the same.
-        options: how candidates are judged.
         shared: [materials, 4] of shared_materials.choose_materials; None: every pixel has a material of its own.
         pairs: [pairs, 2, 4] of mixtures.choose_pairs.
         metals: of metal_search.metals_of; None: normals are not searched under shared metals.
@@ -78,38 +89,38 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         ArrayError: shapes that do not fit.
     """
     lobe = shape if lobe is None else lobe
-    found = find_normals(samples, start, shape=shape, options=options, beside=beside, prior=prior)
+    found = find_normals(samples, start, shape=shape, beside=beside, prior=prior)
     normals, costs = [found.best.normal], [found.best.cost]
     for nearby in nearby_shapes(shape):
-        other = descend(samples, found.best.normal, shape=nearby, options=options, weights=found.best.weights, prior=prior, schedule=WARM)
+        other = descend(samples, found.best.normal, shape=nearby, weights=found.best.weights, prior=prior, schedule=WARM)
         normals.append(other.normal)
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
     if single_lobe and prior is None:
         if roughness is None:
-            roughness = fit_tinted(samples, found.best.normal, shape=shape, options=options).roughness
-        single = refine(samples, found.best.normal, roughness, shape=shape, options=options)
+            roughness = fit_tinted(samples, found.best.normal, shape=shape).roughness
+        single = refine(samples, found.best.normal, roughness, shape=shape)
         kinds = np.stack([np.min(costs, axis=0), SINGLE_LOBE_CHARGE * single.cost])
         normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE,
                                          spreads=np.stack([spread, np.zeros_like(spread)]))
     if prior is None:
-        material = fit_material(samples, normal, shape=lobe, options=options, shared=shared)
+        material = fit_material(samples, normal, shape=lobe, shared=shared)
         if metals is not None:
-            better = search_metals(samples, normal, material, metals, shape=lobe, options=options)
+            better = search_metals(samples, normal, material, metals, shape=lobe)
             moved = np.flatnonzero((better != normal).any(axis=1))
             if len(moved):
-                again = fit_material(choose(samples, moved), better[moved], shape=lobe, options=options, shared=shared)
+                again = fit_material(choose(samples, moved), better[moved], shape=lobe, shared=shared)
                 for plane, replaced in zip(material, again, strict=True):
                     plane[moved] = replaced
                 spread = np.hypot(spread, _angles(normal, better))
                 normal = better
     else:
-        material = fit_given(samples, normal, MATT, shape=lobe, options=options)
-        found = find_normals(samples, normal, shape=shape, options=options)  # the readings alone say how sure the normal is
+        material = fit_given(samples, normal, MATT, shape=lobe)
+        found = find_normals(samples, normal, shape=shape)  # the readings alone say how sure the normal is
         spread = np.hypot(spread, _angles(found.best.normal, normal))
-    material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe, options=options)
+    material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
-        spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe, options=options))
+        spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
     certainty = assess(samples, found, normal, spread)
     return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
                      certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)
@@ -147,3 +158,43 @@ def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: floa
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the angles in degrees between unit vectors along the last axis."""
     return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))
+
+
+RINGS = (2.0, 0.8, 0.3, 0.12)
+"""Radii in degrees of the rings of candidates, each about the best so far."""
+RING_COUNT = 6
+"""Candidates on each of them."""
+
+
+def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared: np.ndarray, *, shape: Diffuse) -> np.ndarray:
+    """Return the angle in degrees, [n] float32, to a normal that explains the pixel about as well with the shared F0.
+
+    It is 0 where F0 is not far above the shared ones, and where no such normal was found.
+
+    Args:
+        normal: [n, 3] unit normals.
+        material: of material.fit_material.
+        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
+    """
+    doubt = np.zeros(len(normal), np.float32)
+    common = shared[is_dielectric(shared), 0]
+    if not len(common):
+        return doubt
+    lobes = np.column_stack([material.specular, material.roughness])
+    at = np.flatnonzero(is_dielectric(lobes) & outlying(material.specular, common))
+    if not len(at):
+        return doubt
+    few, best = choose(samples, at), normal[at].astype(np.float64)
+    view = to_host(few, few.view)
+    least = fit_given_f0(few, normal[at], float(common.max()), shape=shape)
+    for degrees in RINGS:
+        middle = best.copy()
+        for offset in rings((degrees,), RING_COUNT)[1:]:
+            candidate = moved(middle, offset, view)
+            trial = fit_given_f0(few, candidate, float(common.max()), shape=shape)
+            lower = trial.cost < least.cost
+            best[lower], least.cost[lower] = candidate[lower], trial.cost[lower]
+    known = Material(*(plane[at] for plane in material))
+    angle = np.degrees(np.arccos(np.clip((best * normal[at]).sum(axis=1), -1, 1)))
+    doubt[at] = np.where(explains(least, known), angle, 0)
+    return doubt

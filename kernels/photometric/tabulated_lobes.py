@@ -10,7 +10,7 @@ import math
 import warp as wp
 
 from kernels.device import once
-from kernels.packs import pack_type
+from kernels.packs import pack_type, vector_at
 from kernels.photometric.lobes import Lobes, Reflectance
 from kernels.photometric.response_table import (
     GRID,
@@ -21,6 +21,7 @@ from kernels.photometric.response_table import (
     WIDTH_RATIO,
     grid_position,
 )
+from kernels.photometric.samples import samples_type, scratch_type
 
 RELAXATION = 1.6
 """Over-relaxation of the non-negative solve: lobes integrated over wide lights are much alike, and plain sweeps would converge slowly."""
@@ -60,18 +61,17 @@ def width_position(roughness: float) -> float:
 @once
 def tabulated_lobes(lanes: int, count: int) -> Lobes:
     """Return the mixture of a search table of `count` lobes."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     pairs = wp.types.matrix(shape=(4, lanes), dtype=wp.float32)
 
     @wp.func
-    def prepare(toward: wp.array2d(dtype=lane_type), vx: lane_type, vy: lane_type, vz: lane_type, start: int, light_count: int,
-                light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def prepare(samples: samples_struct, p: int, scratch: scratch_struct):
         pass
 
     @wp.func
-    def fill(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
-             nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-             light_count: int, light_stride: int, base: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def fill(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int,
+             scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
         places = pairs()
         for k in range(lanes):
             n = wp.vec3(nx[k], ny[k], nz[k])
@@ -81,16 +81,16 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
             places[1, k] = plain[1]
             places[2, k] = turned[0]
             places[3, k] = turned[1]
-        for light in range(light_count):
-            at = base + light * count * step
+        for light in range(samples.light_count):
+            at = p * scratch.pack_stride + light * scratch.light_stride
             lobe = lane_type()
             for k in range(lanes):
                 lobe[k] = look_up(table, wp.vec2(places[0, k], places[1, k]), light, 0)
-            scratch[at] = lobe
+            scratch.values[at] = lobe
             for a in range(1, count):
                 for k in range(lanes):
                     lobe[k] = look_up(table, wp.vec2(places[2, k], places[3, k]), light, a)
-                scratch[at + a * step] = lobe
+                scratch.values[at + a * scratch.step] = lobe
 
     return Lobes(count, count, RELAXATION, prepare, fill)
 
@@ -98,28 +98,27 @@ def tabulated_lobes(lanes: int, count: int) -> Lobes:
 @once
 def tabulated_reflectance(lanes: int) -> Reflectance:
     """Return Relit's BRDF from a response table; a roughness of 0 stands for a surface without a specular lobe."""
-    lane_type = pack_type(lanes, wp.float32)
+    lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     pairs = wp.types.matrix(shape=(2, lanes), dtype=wp.float32)
 
     @wp.func
-    def prepare(toward: wp.array2d(dtype=lane_type), table: wp.array3d(dtype=float), form: wp.vec2,
-                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-                light_count: int, light_stride: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def prepare(samples: samples_struct, table: wp.array3d(dtype=float), form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type,
+                p: int, scratch: scratch_struct):
         places = pairs()
         for k in range(lanes):
             place = grid_position(wp.vec3(nx[k], ny[k], nz[k]))
             places[0, k] = place[0]
             places[1, k] = place[1]
-        for light in range(light_count):
+        for light in range(samples.light_count):
             fd = lane_type()
             for k in range(lanes):
                 fd[k] = look_up(table, wp.vec2(places[0, k], places[1, k]), light, 0)
-            scratch[base + light * light_step] = fd
+            scratch.values[p * scratch.pack_stride + light * scratch.light_stride] = fd
 
     @wp.func
-    def respond(table: wp.array3d(dtype=float),
-                nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, rough: lane_type,
-                light_count: int, base: int, light_step: int, step: int, scratch: wp.array(dtype=lane_type)):
+    def respond(samples: samples_struct, table: wp.array3d(dtype=float), nx: lane_type, ny: lane_type, nz: lane_type, rough: lane_type,
+                p: int, scratch: scratch_struct):
+        vx, vy, vz = vector_at(samples.view, p)
         places = pairs()
         width = lane_type()
         for k in range(lanes):
@@ -127,7 +126,7 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
             places[0, k] = place[0]
             places[1, k] = place[1]
             width[k] = width_position(rough[k])
-        for light in range(light_count):
+        for light in range(samples.light_count):
             fs, fixed = lane_type(), lane_type()
             for k in range(lanes):
                 place = wp.vec2(places[0, k], places[1, k])
@@ -139,14 +138,12 @@ def tabulated_reflectance(lanes: int) -> Reflectance:
                                   + part * look_up(table, place, light, column + 2))
                 fixed[k] = shines * ((1.0 - part) * look_up(table, place, light, column + 1)
                                      + part * look_up(table, place, light, column + 3))
-            at = base + light * light_step
-            scratch[at + step] = fs
-            scratch[at + 2 * step] = fixed
+            at = p * scratch.pack_stride + light * scratch.light_stride
+            scratch.values[at + scratch.step] = fs
+            scratch.values[at + 2 * scratch.step] = fixed
 
     @wp.func
-    def lambertian(toward: wp.array2d(dtype=lane_type), form: wp.vec2,
-                   nx: lane_type, ny: lane_type, nz: lane_type, vx: lane_type, vy: lane_type, vz: lane_type, start: int,
-                   light_count: int, light_stride: int):
+    def lambertian(samples: samples_struct, form: wp.vec2, nx: lane_type, ny: lane_type, nz: lane_type, p: int):
         one = lane_type()
         for k in range(lanes):
             one[k] = 1.0

@@ -49,7 +49,7 @@ class Solve(Protocol):
 
 
 class Breaks(NamedTuple):
-    """Where a surface may break."""
+    """The places at which a surface may break."""
 
     lowered: Slopes  # with lower weights for edges across contradictions
     noise: float  # of loop_noise
@@ -136,7 +136,6 @@ def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
     Args:
         slopes: of all pairs of neighbours.
         noise: of loop_noise.
-        grid: the layout of the slopes.
     """
     lowered = slopes._replace(weights=grid.no_edges())
     run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
@@ -148,8 +147,6 @@ def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: floa
 
     Args:
         slopes: of all pairs of neighbours.
-        surface: the normals.
-        grid: the layout of the slopes.
         spacing: distance of neighbouring pixels in the plane of x and y.
 
     Convention:
@@ -167,7 +164,6 @@ def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
 
     Args:
         breaks: of find_breaks.
-        grid: the layout of the slopes.
         solve: integrates slopes, improving the heights that it is given; the last time it may overwrite the slopes.
 
     Convention:

@@ -61,7 +61,6 @@ def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid
     """Cut a surface wherever its normals turn abruptly or contradict each other around a loop.
 
     Args:
-        surface: the normals.
         slope: of the edges to the right and of those down, each [size], in units of the spacing.
         weight: of these edges before loops are looked at; 0 is no edge.
         left: weights that the loops leave.
@@ -114,7 +113,6 @@ def _turned(surface: NormalMap, there: np.ndarray, grid: Grid) -> np.ndarray:
     """Return [2, size] bool, the edges at which the normals turn abruptly, and not as a thin round rod does.
 
     Args:
-        surface: the normals.
         there: [2, size] bool, the edges.
         grid: the layout of the edges.
     """

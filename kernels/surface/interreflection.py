@@ -103,7 +103,6 @@ def gather_light(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cel
         height: [rows, cols] float32 camera-frame z.
         mask: [rows, cols] uint8.
         projection: of the camera.
-        device: where.
         opening: of groups, in place of OPENING; 0: every patch sends on its own.
 
     Returns:

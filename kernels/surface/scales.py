@@ -1,4 +1,4 @@
-"""What a noisy map says about the error of a smooth one, scale by scale.
+"""The error of a smooth map, estimated scale by scale from a noisy one.
 
 The difference of the two maps is averaged over cells of 2^l pixels, from the largest scale to the smallest. What cells differ by beyond
 the noise of the noisy map, which is known, is the error of the other at that scale; each cell is corrected by the part of its
@@ -24,7 +24,7 @@ SURROUNDINGS = 3
 
 
 class Correction(NamedTuple):
-    """What the smooth map has to be corrected by."""
+    """The correction of the smooth map."""
 
     value: np.ndarray  # [rows, cols]
     variance: np.ndarray  # [rows, cols] of the error that is left

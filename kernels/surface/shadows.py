@@ -32,7 +32,7 @@ class Projection(NamedTuple):
 
 
 class Extent(NamedTuple):
-    """Where a surface is: beyond it the march to a light meets nothing."""
+    """The extent of a surface, beyond which the march to a light meets nothing."""
 
     box: wp.vec4i  # first row and column of the mask, and the last of each
     highest: float  # camera-frame z

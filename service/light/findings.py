@@ -46,6 +46,8 @@ class FrameFindings:
     clipped_frame: int | None = None
     clipped_pixels: float = 0.0
     """Share of the object's pixels that have clipped readings in that capture."""
+    doubts: list[str] = field(default_factory=list)
+    """Sentences of maps of which nothing tells whether they were solved from the images of their capture."""
     negative: dict[str, int] = field(default_factory=dict)
     """Pixels with a value that was set to 0 because it was negative beyond noise, by the names of the images that were read."""
 
@@ -62,6 +64,11 @@ class FrameFindings:
                 self.clipped, self.clipped_frame = tuple(float(share) for share in shares), number
                 self.clipped_pixels = clipping.pixels
 
+    def add_doubt(self, sentence: str | None) -> None:
+        """Take in what is to be said of the maps that guide a capture."""
+        if sentence is not None and sentence not in self.doubts:
+            self.doubts.append(sentence)
+
     @property
     def sentences(self) -> tuple[str, ...]:
         """What does not fit, and what to try."""
@@ -75,7 +82,7 @@ class FrameFindings:
             found.append(f"{red} of the red, {green} of the green and {blue} of the blue of {_picture(self.clipped_frame)} is from "
                          "readings that are clipped in every frame of their light, at "
                          f"{_percent(self.clipped_pixels)} of the object's pixels: it is {known}")
-        return (*found, *clipping_sentences(self.negative))
+        return (*self.doubts, *found, *clipping_sentences(self.negative))
 
 
 @dataclass

@@ -35,6 +35,7 @@ from service.light.near_light import NearLights
 from service.light.range_light import RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
+from service.reporting.provenance import other_inputs
 from stage.errors import ResultError
 from stage.maps import SurfaceMaps
 from stage.point_lights import DistantLights
@@ -68,8 +69,8 @@ class Guide:
             ResultError: maps of other images or another colour space, or without the layers that a model needs; fewer than four
                 lights, or all in one plane.
         """
-        if maps.provenance.get("relit:inputs", stack.key) != stack.key:
-            raise ResultError(f"{where}: was solved from other images than the capture has: solve it again")
+        self.doubt = other_inputs(maps.provenance, stack.key, where)
+        """The sentence for maps of another version, of which nothing tells whether they are of these images; None: they are."""
         if maps.color_space != space:
             raise ResultError(f"{where}: is in {maps.color_space}, the capture in {space}: solve it again")
         maps = maps.with_lobes(partial(seen_lobes, direction=lights.direction))

@@ -150,6 +150,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
             guide = Guide(maps, opened.maps, stack, opened.lights, clipping, space=opened.space, device=device,
                           progress=None if plan.is_sequence else timings)
             stack = guide.stack
+        findings.add_doubt(guide.doubt)
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     form = FrameFormat.of(request, opened.capture.camera, opened.space, written, layers, matte)

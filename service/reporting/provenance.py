@@ -12,10 +12,14 @@ from typing import Any
 from service import __version__
 from service.requests.base import Options, Role
 from service.requests.options import role_of
+from stage.errors import ResultError
+from stage.ingest import LAYOUT
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""
 REPORT_FILE = "report.json"
+HASHING = "relit:hashing"
+"""Attribute of maps with the version of the stack cache by which `relit:inputs` was hashed: each version hashes otherwise."""
 
 _names: ContextVar[dict[str, str] | None] = ContextVar("names of places", default=None)
 
@@ -56,6 +60,25 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
     if near_lights:
         found["relit:lights"] = f"{near_lights} near lights taken as distant, as the object's centre sees them"
     return found
+
+
+def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str | None:
+    """Return the sentence for maps of which nothing tells whether they were solved from some images; None where they were.
+
+    Args:
+        provenance: attributes of the maps.
+        inputs: content hash of the images.
+        maps: their file, for the sentence.
+
+    Raises:
+        ResultError: the maps were solved from other images.
+    """
+    if provenance.get("relit:inputs", inputs) == inputs:
+        return None
+    if provenance.get(HASHING) == str(LAYOUT):
+        raise ResultError(f"{maps}: was solved from other images than the capture has, or with other alignment: solve it again")
+    return (f"{maps}: was solved by another version of relit ({HASHING} {provenance.get(HASHING, 'is missing')}, here {LAYOUT}), which "
+            "hashed images otherwise, so that nothing tells whether they are those of the capture: solve it again if in doubt")
 
 
 def export_metadata(request: Options, contents: Mapping[str, str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from service.reporting.progress import Progress
 from service.requests.depth import DepthRequest
 from service.requests.solve import Intensities, LightsKnown, SolveRequest
 from service.sequences.steps import ALONE, StepProgress, capture_digest, check_outputs, do_step, left_by
-from service.solve.lights_over_time import LightsOverTime
+from service.solve.intensities import LightsOverTime
 from service.solve.sharing import SharedSolve
 from service.solve.solve import help_solve, solve
 from stage.capture import Capture

@@ -10,8 +10,7 @@ from kernels.photometric.near import NearField, NearLights, see_near
 from kernels.photometric.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.samples import Samples, gather
 from kernels.status import Status
-from service.solve.several_devices import deal
-from service.solve.sharing import Results
+from service.solve.sharing import Results, deal
 from service.solve.solution import SolveInput
 from stage.camera import Camera
 from stage.colour import GREY_WEIGHTS
@@ -56,7 +55,6 @@ def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int,
     """Do the pixel ranges of the image that touch the mask on the devices, and say how far it is.
 
     Args:
-        given: the images.
         bytes_per_pixel: what the work allocates for each pixel beside the stack.
         work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
         results: where it stores it.
@@ -88,9 +86,6 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
     """Do the image band by band on the devices, without the bands that lie outside the mask, and say how far it is.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, where some light is near.
         work: stores what it finds in a band.
         results: where it stores it, and what it follows from besides the arguments.
     """
@@ -113,14 +108,11 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
     """Do pixels of the images batch by batch on the devices, and say how far it is.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
         view: directions to the viewer.
         pixels: [n] positions, ascending.
         work: stores what it finds at the pixels of a batch.
         results: where it stores it, and what it follows from besides the arguments.
         lobes: values that the solver keeps for each light and pixel.
-        field: where the lights are, where some light is near.
         done: pixels of the stage that are done before.
     """
     stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
@@ -151,11 +143,8 @@ def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarra
     """Return the readings of a few pixels, wherever they lie in the image.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
         view: directions to the viewer.
         pixels: [n] positions.
-        field: where the lights are, where some light is near.
     """
     band = packs.upload(*given.stack.pick(pixels), device=given.device)
     return gather(band, np.arange(len(pixels)), view(pixels), lights, grey_factors(lights, GREY_WEIGHTS), given.stack.light_count,

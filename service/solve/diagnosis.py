@@ -1,4 +1,4 @@
-"""What is wrong with the manifest of a capture, from what was solved with it: encoding, brightness, order and axes of the lights.
+"""Faults of the manifest of a capture, found from what was solved with it: encoding, brightness, order and axes of the lights.
 
 A wrong manifest seldom stops a solver: it finds normals that are wrong everywhere, and as sure as right ones. Every finding here is a
 sentence that names the field, and raises the standard error of every normal by the angle that the finding asks for.
@@ -32,8 +32,6 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
 
     Args:
-        given: the images.
-        capture: the manifest.
         lights: the lights with which the normals were solved; readings are examined under distant ones.
         declared: the lights of the manifest, which may have other intensities.
         solution: its warnings, standard errors, confidence and suspect lights are changed.

@@ -20,9 +20,6 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     """Solve every pixel of the mask for normal and diffuse albedo.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near.
         fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
     """
     given.timings.stage("normals", given.stack.shape[2])

@@ -25,7 +25,7 @@ LARGEST_ALBEDO = 0.98
 
 
 class DirectLight(NamedTuple):
-    """What hides the lights from the pixels of an object, and what it throws on itself."""
+    """Shadows and interreflection of an object, to be taken out of readings."""
 
     given: SolveInput
     lights: Lights
@@ -87,13 +87,9 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     """Find what the object does to its own light, or return None when no pixel is solved.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, where some light is near.
         normal: [3, pixels] float32, found so far.
         material: of the same.
         bouncing: [3, pixels] albedo of the light that other surfaces send.
-        solved: [rows, cols] bool.
         shadows: whether cast shadows are taken out.
         interreflection: whether interreflection is taken out.
         parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.

@@ -46,12 +46,7 @@ TABLES_KEPT = 4
 
 
 def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
-    """Solve every pixel of the mask for normal, diffuse albedo, F0, roughness and regime.
-
-    Args:
-        given: the images.
-        lights: lights of the stack.
-    """
+    """Solve every pixel of the mask for normal, diffuse albedo, F0, roughness and regime."""
     walk = _Walk(given, lights)
     walk.search()
     walk.refine()

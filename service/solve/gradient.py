@@ -1,11 +1,15 @@
-"""Diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness from spherical gradient frames, band by band."""
+"""Diffuse and specular normals, albedo and, behind polarisers, F₀ and roughness from spherical gradient frames, band by band.
+
+Occlusion makes the response to a gradient longer, interreflection shorter. Where one goes over into the other both are present, and the
+length is that of an open surface: such a pixel is as doubtful as those around it.
+"""
 
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from kernels import packs
-from kernels.photometric.cancellation import neighbours_doubt
 from kernels.photometric.gradient import diffuse_normals
 from kernels.photometric.highlight import fit_highlights, specular_normals
 from kernels.photometric.moments import Moments, fit_moments
@@ -33,7 +37,6 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     """Solve every pixel of the mask from gradient frames.
 
     Args:
-        given: the images.
         frames: which frames of the stack measure what.
     """
     stack, inside = given.stack, given.mask.reshape(-1)
@@ -140,3 +143,28 @@ def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:
     padded = np.zeros((band.frame_count, 4))
     padded[: len(rows)] = rows
     return fit_moments(band, padded, stack.scale, GREY_WEIGHTS)
+
+
+PART = 16
+"""Neighbours are the pixels within one part in this many of the object's longer side: dents and grooves are wider."""
+LEAST = 3
+"""Least number of pixels of a 3 × 3 neighbourhood that are this doubtful: a groove one pixel wide has three, noise seldom."""
+
+
+def neighbours_doubt(doubt: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    """Return the largest doubt in the neighbourhood of each pixel that LEAST pixels beside each other share.
+
+    Args:
+        doubt: [rows, cols] not negative, 0 outside the mask.
+        inside: [rows, cols] bool, the mask.
+
+    Returns:
+        [rows, cols] float32, at least `doubt`; 0 outside the mask.
+    """
+    if not inside.any():
+        return np.zeros(doubt.shape, np.float32)
+    rows, cols = np.nonzero(inside)
+    reach = max(1, (int(max(np.ptp(rows), np.ptp(cols))) + 1) // PART)
+    spread = ndimage.rank_filter(doubt.astype(np.float32), -LEAST, size=3, mode="constant")
+    spread = ndimage.maximum_filter(spread, 2 * reach + 1, mode="constant")
+    return np.where(inside, np.maximum(spread, doubt), 0).astype(np.float32)

@@ -4,6 +4,9 @@ Directions of lights are often known and their intensities not: RTI data declare
 images determine them, up to one factor. Those that one half of the object asks for are judged on the other half, by the spread of its
 readings about a robust Lambertian fit.
 
+The lights of a rig do not change between the steps of a sequence, and intensities that each step finds for itself would make its surface
+flicker: the first step's are shared unless the images of a step contradict.
+
 Sources: lights of unknown intensity and known directions, Cho, Matsushita, Tai and Kweon, "Semi-calibrated photometric stereo", TPAMI
 2020; choice by left-out data, Stone, "Cross-validatory choice and assessment of statistical predictions", JRSS B 1974.
 """
@@ -45,21 +48,16 @@ LEAST_LIT = 5
 
 
 class ChosenIntensities(NamedTuple):
-    """What the images say about the intensities of their lights."""
+    """Intensities of the lights after comparison with the images."""
 
     lights: DistantLights
     """The lights, with the intensities that explain the images better."""
     facts: dict[str, Any]
-    """What the report says."""
+    """Facts for the report."""
 
 
 def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntensities:
-    """Return the lights with the declared intensities, or with those that the images ask for.
-
-    Args:
-        given: the images.
-        lights: lights of the stack, as declared.
-    """
+    """Return the lights with the declared intensities, or with those that the images ask for."""
     if len(lights.direction) < LEAST_LIGHTS:
         return _declared(lights, f"fewer than {LEAST_LIGHTS} lights")
     inside = np.flatnonzero(given.mask)
@@ -98,12 +96,7 @@ def choose_intensities(given: SolveInput, lights: DistantLights) -> ChosenIntens
 
 
 def lambertian_misfit(given: SolveInput, lights: DistantLights) -> float:
-    """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object.
-
-    Args:
-        given: the images.
-        lights: lights of the stack.
-    """
+    """Return how far diffuse reflection under these lights is from the readings of pixels spread over the object."""
     inside = np.flatnonzero(given.mask)
     radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     return fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction).misfit()
@@ -134,3 +127,51 @@ def _cost(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> n
     count = fit.lit.sum(axis=0)
     total = np.where(fit.lit, np.log1p((fit.residual / NOISE) ** 2), 0).sum(axis=0)
     return np.where(count >= LEAST_LIT, total / np.maximum(count, 1), 0.0)
+
+
+CONTRADICTED = 0.8
+"""Misfit under a step's own intensities, over that under the shared ones, below which the step takes its own."""
+
+
+class LightsOverTime:
+    """The intensities of the first step, for those after it."""
+
+    def __init__(self, *, shared: bool) -> None:
+        """Args: shared: whether intensities are chosen at all; else every step has those of its manifest."""
+        self._shared = shared
+        self._first: dict[str, Any] | None = None
+
+    def choose(self, given: SolveInput, lights: DistantLights) -> ChosenIntensities:
+        """Return the lights of a step with the shared intensities, or its own where its images contradict them."""
+        own = choose_intensities(given, lights)
+        declared = {"direction": lights.direction.tolist(), "irradiance": lights.irradiance.tolist()}
+        if self._first is None:
+            factor = np.divide(own.lights.irradiance, lights.irradiance, out=np.ones_like(lights.irradiance), where=lights.irradiance > 0)
+            self._first = declared | {"factor": factor.max(axis=1).tolist()}
+            return own
+        if any(declared[name] != self._first[name] for name in declared):
+            return _said(own, "its own: the lights of the manifest are not those of the first step")
+        factor = np.array(self._first["factor"])
+        if (factor == 1).all() and own.lights is lights:
+            return own
+        common = lights._replace(irradiance=lights.irradiance * factor[:, None])
+        if lambertian_misfit(given, own.lights) < CONTRADICTED * lambertian_misfit(given, common):
+            return _said(own, "its own: the images contradict those of the first step")
+        return ChosenIntensities(common, {"light_intensities": {"used": "those of the first step"}})
+
+    def left(self) -> dict[str, Any]:
+        """Return what a step leaves for those after it."""
+        return {"lights": self._first}
+
+    def take(self, left: dict[str, Any]) -> None:
+        """Take what a step has left, which was perhaps done before."""
+        if self._first is None and isinstance(left.get("lights"), dict):
+            self._first = left["lights"]
+
+    def plain(self) -> Any:
+        """Return what a step follows from beside its capture, as plain data."""
+        return self._first
+
+
+def _said(own: ChosenIntensities, why: str) -> ChosenIntensities:
+    return own._replace(facts={"light_intensities": {**own.facts.get("light_intensities", {}), "over_time": why}})

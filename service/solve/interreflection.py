@@ -64,11 +64,8 @@ def arriving_light(given: SolveInput, lights: Lights, normal: np.ndarray, height
     """Return the light that the object throws on itself, or None when the solved pixels cover fewer than two patches.
 
     Args:
-        given: the images.
-        lights: distant lights of the stack, padded.
         normal: [3, pixels] float32.
         height: [rows, cols] float32 on the device.
-        solved: [rows, cols] bool.
     """
     camera, projection = given.camera, projection_of(given.camera)
     rows, cols = solved.shape

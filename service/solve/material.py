@@ -19,8 +19,7 @@ from kernels.photometric.metal_search import Metals, metals_of
 from kernels.photometric.misfit import LARGEST_ERROR
 from kernels.photometric.mixtures import HELD, NO_PAIRS, choose_pairs
 from kernels.photometric.near import NearField
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.propagation import neighbours
+from kernels.photometric.normal_search import find_normals, neighbours
 from kernels.photometric.readings import Lights, grey_factors, grey_readings
 from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import Samples, evenly
@@ -80,9 +79,6 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
     """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near.
         options: the steps that are left out.
     """
     walk = _Walk(given, lights, field, options)
@@ -98,8 +94,6 @@ def refine_material(given: SolveInput, lights: Lights, field: NearField, before:
     """Solve again from a solution: shadows and interreflection follow from its surface, and no first search is needed.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
         field: where the lights are, and the surface point of each pixel.
         before: of `solve_material`, or of this function.
     """

@@ -6,12 +6,11 @@ from typing import Any, NamedTuple
 
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.near import NearField
-from kernels.photometric.readings import Lights
+from kernels.photometric.readings import Lights, pad_lights
 from kernels.photometric.robust import solve_robust
 from service.requests.solve import SVBRDF_LIGHTS, Method
 from service.solve.diffuse import solve_diffuse
-from service.solve.distant import solve_distant
-from service.solve.near import MATERIAL_ROUNDS, Rounds, solve_near
+from service.solve.near import MATERIAL_ROUNDS, NormalSolver, Rounds, solve_near
 from service.solve.solution import Solution, SolveInput
 from stage.capture import Capture
 from stage.extended_lights import ExtendedLights
@@ -25,7 +24,7 @@ Solver = Callable[[SolveInput, Any], Solution]
 
 
 class MethodEntry(NamedTuple):
-    """What one method needs of a capture, and the functions that solve it."""
+    """One method: what it needs of a capture, and the functions that solve it."""
 
     read_lights: Callable[..., Any]
     """Returns the lights or frames that the method works with. Takes the capture, and that of the reference ball where there is one;
@@ -33,7 +32,7 @@ class MethodEntry(NamedTuple):
     solvers: Mapping[type, Solver]
     """One function for each kind of lights; a kind that is not here is refused."""
     residual: str
-    """What the residual of a pixel is, as the report says it."""
+    """The meaning of the residual of a pixel, for the report."""
     is_default: Callable[[Capture], bool] = lambda capture: False
     """Whether a capture is solved by this method when the request names none."""
 
@@ -44,9 +43,14 @@ def _suits_svbrdf(capture: Capture) -> bool:
     return bool(capture.lit_by(ExtendedLight)) or len(places) >= SVBRDF_LIGHTS  # exposures of one light are one
 
 
+def _solve_distant(given: SolveInput, lights: DistantLights, *, solver: NormalSolver) -> Solution:
+    """Solve every pixel of the mask under distant lights."""
+    return solver(given, pad_lights(lights.direction, lights.irradiance, given.stack.scale))
+
+
 def _single_lights(*series: Rounds) -> dict[type, Solver]:
     """Return the functions for lights of one direction each: distant lights are solved by the last solver of those for near ones."""
-    return {DistantLights: partial(solve_distant, solver=series[-1].solver), PlacedLights: partial(solve_near, series=series)}
+    return {DistantLights: partial(_solve_distant, solver=series[-1].solver), PlacedLights: partial(solve_near, series=series)}
 
 
 # solvers that few captures need are imported, with their kernels, when they are called: all of them take a tenth of a second

@@ -24,9 +24,6 @@ def object_misfit(given: SolveInput, lights: Lights, field: NearField | None = N
     """Return the misfit of an object, from fits to pairs of its pixels.
 
     Args:
-        given: the images.
-        lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near.
         fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
     """
     first = np.zeros(given.mask.shape, dtype=bool)

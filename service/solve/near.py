@@ -7,7 +7,7 @@ interreflection are those of a surface that was solved without them.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from kernels.photometric.near import NearField, pad_places
 from kernels.photometric.readings import Lights, pad_lights
 from kernels.status import Status
 from service.requests.solve import Method
-from service.solve.distant import NormalSolver
 from service.solve.solution import Solution, SolveInput, mark_not_facing
 from service.solve.surface import integrate, mean_height, whole_surface
 from stage.point_lights import PlacedLights
@@ -35,6 +34,13 @@ MATERIAL_ROUNDS = 4
 the object throws much light on itself a half. A round after the first is two thirds of its work."""
 
 
+class NormalSolver(Protocol):
+    """Solves the normals of every pixel of the mask from frames with one light each: `solve_diffuse` or `solve_material`."""
+
+    def __call__(self, given: SolveInput, lights: Lights, field: NearField | None = None) -> Solution:
+        """Return the solution."""
+
+
 class Rounds(NamedTuple):
     """Rounds in which one solver finds the normals."""
 
@@ -49,7 +55,6 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     """Solve every pixel of the mask under lights of which some are near, and its height with it.
 
     Args:
-        given: the images, of a camera with a scale.
         lights: lights of the stack, distant and near.
         series: the rounds of each solver; a solver begins with the surface on which the one before it has settled.
 

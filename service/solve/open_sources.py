@@ -1,4 +1,4 @@
-"""What an object does to the light of wide sources: how much of each source a pixel sees, and the light that the object throws on itself.
+"""The light of wide sources that reaches an object: how much of each source a pixel sees, and the light that the object throws on itself.
 
 From the normals so far follows a height. From every pixel, lines to places that are spread over the sources are followed over it. What the
 pixel reflects of the visible places, over what it would reflect of all, is the part of the source that it sees: of a source that is
@@ -18,7 +18,7 @@ from kernels.photometric.bounce import subtract_bounce
 from kernels.photometric.readings import Lights, channel_weights
 from kernels.photometric.samples import Samples
 from kernels.photometric.sampling import SHARP, Found
-from kernels.photometric.visible_part import LEAST_PART, divide_by_visible
+from kernels.photometric.shadowing import LEAST_PART, divide_by_visible
 from kernels.relight.occlusion import see_lights
 from kernels.status import Status
 from service.solve.batches import View
@@ -44,7 +44,7 @@ LEAST_FACING = 0.02
 
 
 class OpenSources(NamedTuple):
-    """What hides sources from the pixels of an object, and what it throws on itself."""
+    """The parts of sources that pixels of an object see, and the light that the object throws on itself."""
 
     touched: np.ndarray  # [n] ascending positions of the pixels whose light changes
     part: np.ndarray  # [n, lights] uint8: visible part of each source at these pixels, 255 for all
@@ -86,9 +86,7 @@ def open_sources(given: SolveInput, lights: ExtendedLights, padded: Lights, stat
     """Find what the object does to its own light, or return None when it does nothing to any pixel.
 
     Args:
-        given: the images.
-        lights: lights of the stack.
-        padded: the same, with their irradiance.
+        padded: the lights, padded, with their irradiance.
         status: [pixels] of kernels.status.
         found: normals and materials of all pixels of the image.
         view: directions to the viewer.

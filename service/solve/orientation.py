@@ -50,7 +50,7 @@ INVERSE = np.diag([-1.0, -1.0, 1.0])
 
 
 class LightAxes(NamedTuple):
-    """What is wrong with the axes of the lights."""
+    """A fault of the axes of the lights."""
 
     sentence: str
     matrices: tuple[np.ndarray, ...] = ()
@@ -71,8 +71,6 @@ def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | Non
     """Return which axes of the lights are exchanged, mirrored or turned, or None.
 
     Args:
-        given: the images.
-        solution: the normals.
         lights: the distant lights; None: other lights, whose readings are not fitted again.
         fit: the fit of some pixels under these lights, or None.
     """
@@ -92,8 +90,6 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
     """Say whether the surface is inverted, as by lights that are turned by 180 degrees about the view axis.
 
     Args:
-        given: the images.
-        solution: the normals.
         lights: the distant lights; None: other lights, whose shadows are not compared.
     """
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)

@@ -14,8 +14,7 @@ import warp as wp
 from kernels.photometric.readings import Lights, pad_lights
 from kernels.photometric.samples import evenly, readings_of
 from kernels.photometric.shadow_evidence import shadow_odds
-from kernels.surface.offsets import GROUPS, Offset, choose_offset, weigh_offsets
-from kernels.surface.part_shadows import march_part
+from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection
 from kernels.surface.slopes import STEEPEST
 from service.solve.batches import View, pick_pixels, view_directions
@@ -99,7 +98,7 @@ class Placement(NamedTuple):
 
 
 class Material(NamedTuple):
-    """What pixels reflect; F0 and roughness are None where the method estimates no highlight."""
+    """The material of all pixels; F0 and roughness are None where the method estimates no highlight."""
 
     albedo: np.ndarray  # [3, pixels]
     specular: np.ndarray | None = None  # [3, pixels]
@@ -118,8 +117,6 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images.
 
     Args:
-        given: the images.
-        lights: distant lights of the stack, padded.
         normal: [3, pixels] float32.
         material: of every pixel.
         height: [rows, cols] float32, camera-frame z, 0 outside.
@@ -158,8 +155,6 @@ def place_solution(given: SolveInput, lights: DistantLights, solution: Solution)
     """Return the surface of a solution with its parts in depth, or None where there is none.
 
     Args:
-        given: the images.
-        lights: lights of the stack.
         solution: with a height.
     """
     if solution.integration is None or solution.height is None or solution.integration.part is None:

@@ -88,8 +88,6 @@ def solve_pairs(given: SolveInput, lights: Lights, field: NearField | None, diff
 
     Args:
         given: the diffuse images, and the others as its `pairs`.
-        lights: lights of the stack, padded.
-        field: where the lights are, and the surface point of each pixel, where some light is near.
         diffuse: solution of the diffuse images; completed in place.
         solver: `solve_material`, which solves the sums at metals.
     """

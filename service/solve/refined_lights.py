@@ -23,7 +23,7 @@ class RefinedLights(NamedTuple):
     lights: DistantLights
     left_degrees: float
     facts: dict[str, Any]
-    """What the report says."""
+    """Facts for the report."""
     warnings: tuple[str, ...]
 
     def doubt(self, normal: np.ndarray) -> np.ndarray:
@@ -40,7 +40,6 @@ def refine_lights(given: SolveInput, lights: DistantLights) -> RefinedLights:
 
     Args:
         given: the images; where it keeps the declared intensities, only the directions change.
-        lights: lights of the stack, as declared.
 
     Raises:
         CalibrationError: the images do not determine the directions.

@@ -4,13 +4,17 @@ What a pass finds at the pixels of a piece is stored under the number of the pas
 read it. So all have the same arrays when a pass ends, and the next begins. What looks at the whole object is done by every worker: kernels
 add nothing up in the order in which threads happen to end, so workers on devices of one kind find the same. A digest of what a pass follows
 from is part of its name; a worker that finds something else shares nothing any more.
+
+A device gets the next piece when it is done with one. How the image is cut does not depend on the number of devices, every piece has
+pixels of its own, and no piece reads what another found: so results are the same to the last bit on one device and on several of its kind.
 """
 
 import dataclasses
 import hashlib
 import io
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,19 +24,56 @@ from kernels import device as devices
 from kernels.relight import cublas
 from service.reporting.provenance import versions
 from service.solve.piece_store import LOOK_S, PieceStore, agree, opened, sealed
-from service.solve.several_devices import deal
 
 Piece = TypeVar("Piece")
+
+
+def deal(devices: Sequence[str], pieces: Iterable[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None]) -> None:
+    """Do the work of every piece.
+
+    Args:
+        devices: names of one or more; one that is named twice works on two pieces at a time.
+        pieces: are taken one by one in the thread of the caller.
+        work: does a piece on a device, and stores what it finds at the piece's own pixels; called in several threads at once.
+        done: is told each piece when it is done, on several devices not in their order; called in the thread of the caller.
+
+    Raises:
+        BaseException: what a piece or `done` raised, or an interruption; no piece is begun after it, and those of all devices have ended.
+    """
+    left = iter(pieces)
+    if len(devices) == 1:
+        for piece in left:
+            work(piece, devices[0])
+            done(piece)
+        return
+    with ThreadPoolExecutor(len(devices), thread_name_prefix="relit-device") as pool:
+        running: dict[Future[None], tuple[Piece, str]] = {}
+
+        def begin(device: str) -> None:
+            for piece in left:
+                running[pool.submit(work, piece, device)] = piece, device
+                return
+
+        for device in devices:
+            begin(device)
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                piece, device = running.pop(future)
+                future.result()
+                begin(device)
+                done(piece)
+
+
 LEAST_PIECES = 2
 """A pass of fewer pieces is done by every worker."""
 
 
 class Results(NamedTuple):
-    """What a pass over the image makes, and what it follows from."""
+    """The results of a pass over the image, and the values that they follow from."""
 
     arrays: Sequence[np.ndarray]  # each [..., pixels]: where the work of a piece stores what it finds, at the pixels of the piece
     follows_from: object = None
-    """What the work reads besides the images and what earlier passes have stored: numbers, strings, arrays, and tuples of these."""
+    """Values that the work reads besides the images and the results of earlier passes: numbers, strings, arrays, and tuples of these."""
 
 
 class SharedSolve:
@@ -58,7 +99,7 @@ class SharedSolve:
         """Do the pieces of a pass that no other worker does, and read those of the others.
 
         Args:
-            names, pieces, work, done: as of several_devices.deal; `done` is told the pieces of other workers too.
+            names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
             waiting: called now and then while pieces of other workers are waited for.
             pixels_of: returns the place of a piece on the last axis of the arrays.
             results: where the work stores what it finds.
@@ -99,7 +140,7 @@ class SharedSolve:
 
 
 class _Pass:
-    """What the workers have found in one pass."""
+    """The results of all workers in one pass."""
 
     def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
         self._store, self._name, self._leads, self._arrays = store, name, leads, arrays

@@ -1,4 +1,4 @@
-"""What every solver takes and returns, and what is said about a solution afterwards: pixels in doubt, lights that do not fit."""
+"""The input and the solution of every solver, and the judgement of a solution: pixels in doubt, lights that do not fit."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,7 +75,7 @@ class SuspectLight(NamedTuple):
 
 @dataclass
 class Solution:
-    """What a solver found at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
+    """The solution at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
 
     normal: np.ndarray  # [3, pixels] float32
     albedo: np.ndarray  # [3, pixels] float16
@@ -99,7 +99,7 @@ class Solution:
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What the report says under `found`."""
+    """Facts for the report, under `found`."""
     contents: dict[str, str] = field(default_factory=dict)
     """Content hash of each capture that was read beside the images, by the name of its option."""
 
@@ -154,7 +154,6 @@ def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_c
 
     Args:
         solution: of the whole image; its status is changed.
-        stack: the images.
         max_sigma: largest standard error of a solved normal, degrees.
         least_confidence: least confidence of a solved normal.
     """
@@ -174,8 +173,6 @@ def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[Sus
 
     Args:
         solution: normals that were solved under these lights.
-        stack: the images.
-        lights: distant lights of the stack, padded.
     """
     solved = np.flatnonzero(solution.status == Status.OK)
     if len(solved) < 2 * LEAST_PIXELS:

@@ -2,49 +2,36 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kernels import device as devices
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
-from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.solve import MAX_SIGMA, SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
+from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
+from service.requests.solve import MAX_SIGMA, Method, SolveRequest
 from service.solve import integrability
 from service.solve.diagnosis import diagnose, raise_error
-from service.solve.distance import Distance, find_distance
-from service.solve.intensities import choose_intensities
-from service.solve.methods import METHODS, Solver
-from service.solve.parts import numbered, place_solution
+from service.solve.intensities import LightsOverTime
+from service.solve.methods import METHODS
+from service.solve.opening import Opened, open_solve
+from service.solve.parts import Placement, numbered, place_solution
 from service.solve.sharing import SharedSolve
 from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.surface import guessed_part, height_warnings, integrate
-from stage.brackets import merge_brackets, one_frame_a_light
 from stage.capture import Capture
 from stage.colour_spaces import linear_space
-from stage.errors import ManifestError
 from stage.files import write_text
-from stage.ingest import open_stack
-from stage.lighting import check_surface, distant_lights
-from stage.manifest import FILE_NAME
+from stage.ingest import LAYOUT
 from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.motion.tracking import tracking_frames
-from stage.point_lights import DistantLights, PlacedLights, distance_is_missing
+from stage.point_lights import DistantLights
 from stage.radiance import clipping_sentences
-from stage.stack import Stack
-
-if TYPE_CHECKING:
-    from service.solve.lights_over_time import LightsOverTime
-    from service.solve.polarised import Separated
-    from service.solve.refined_lights import RefinedLights
-    from service.solve.unknown_lights import UnknownLights
 
 
 class SolveResult(NamedTuple):
-    """What a solve made."""
+    """The files and findings of a solve."""
 
     maps: SurfaceMaps
     maps_path: Path
@@ -57,27 +44,8 @@ class SolveResult(NamedTuple):
     """A sentence for each thing that does not fit on the whole object."""
 
 
-class _Opened(NamedTuple):
-    """A capture that is ready to be solved."""
-
-    capture: Capture
-    method: Method
-    lights: Any
-    """With the intensities that the solve uses."""
-    declared: Any
-    """As the manifest has them."""
-    solver: Solver
-    given: SolveInput
-    facts: dict[str, Any]
-    """What the report says of the lights."""
-    found: "UnknownLights | RefinedLights | None" = None
-    """How the lights were found, where they are those of the images."""
-    distance: Distance | None = None
-    """How the distance of the surface was found, where the manifest does not say it."""
-
-
 def solve(request: SolveRequest, progress: Progress | None = None, *, capture: Capture | None = None,
-          sharing: SharedSolve | None = None, over_time: "LightsOverTime | None" = None) -> SolveResult:
+          sharing: SharedSolve | None = None, over_time: LightsOverTime | None = None) -> SolveResult:
     """Solve a capture, and write its maps and a report.
 
     Args:
@@ -91,48 +59,86 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
         StageError, KernelError: the input is wrong; nothing is written.
         StorageError: the results cannot be written; nothing is left half-written.
     """
-    timings = Timings(progress)
-    capture, method, lights, declared, solver, given, facts, found, distance = _open(request, capture, timings, sharing, over_time)
-    stack, mask = given.stack, given.mask
-    solution = solver(given, lights)
-    solution.facts = facts | solution.facts
-    mark_not_facing(capture.camera, solution)
+    opened = open_solve(request, capture, Timings(progress), sharing, over_time)
+    judged = _judge(request, opened, opened.solver(opened.given, opened.lights))
+    return _write(request, opened, judged)
+
+
+def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: LightsOverTime | None = None) -> None:
+    """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
+
+    Args:
+        request: that of the other process, on a device of the same kind.
+        progress: told how far the solve is; it ends the help by an exception.
+        sharing: the part of this process.
+        over_time: as for solve.
+
+    Raises:
+        StageError, KernelError: the input is wrong.
+        DivergedError: this process finds something else than the other.
+    """
+    opened = open_solve(request, None, Timings(progress), sharing, over_time)
+    opened.solver(opened.given, opened.lights)
+
+
+class _Judged(NamedTuple):
+    """A solution with its height, and what it is worth."""
+
+    solution: Solution
+    placement: Placement | None
+    """Parts of the object in depth; None: the height has no break, or shadows were not looked at."""
+    estimated: np.ndarray  # [rows, cols] bool, pixels with values
+    guessed: float
+    """Part of the surface whose height rests on normals that are hardly known."""
+
+
+def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged:
+    """Find the height of a solution, how sure it is, and what does not fit; the solution is changed."""
+    given, shape = opened.given, opened.given.mask.shape
+    solution.facts = opened.facts | solution.facts
+    mark_not_facing(opened.capture.camera, solution)
     if given.pairs is not None:
-        _say_of_pairs(given, method, solution)
-    timings.stage("diagnosis", 1)
-    diagnose(given, capture, lights, declared, solution)
-    if found is not None:
-        solution.warnings += found.warnings
-        raise_error(solution, found.doubt(solution.normal))
-    if distance is not None:
-        solution.facts |= distance.facts
-        solution.warnings.append(distance.warning)
-        raise_error(solution, distance.normal_degrees)
-    estimated = np.isin(solution.status, ESTIMATED).reshape(mask.shape)
+        _say_of_pairs(given, opened.method, solution)
+    given.timings.stage("diagnosis", 1)
+    diagnose(given, opened.capture, opened.lights, opened.declared, solution)
+    if opened.found is not None:
+        solution.warnings += opened.found.warnings
+        raise_error(solution, opened.found.doubt(solution.normal))
+    if opened.distance is not None:
+        solution.facts |= opened.distance.facts
+        solution.warnings.append(opened.distance.warning)
+        raise_error(solution, opened.distance.normal_degrees)
+    estimated = np.isin(solution.status, ESTIMATED).reshape(shape)
     sigma = solution.standard_error() if solution.sigma is None else solution.sigma  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
-    placed = place_solution(given, lights, solution) if isinstance(lights, DistantLights) else None
-    if placed is not None:
-        solution.height = placed.height
-        solution.warnings += placed.warnings()
+    placement = place_solution(given, opened.lights, solution) if isinstance(opened.lights, DistantLights) else None
+    if placement is not None:
+        solution.height = placement.height
+        solution.warnings += placement.warnings()
     if solution.judged_by_surface and solution.height is not None:
-        normal = np.moveaxis(solution.normal.reshape(3, *mask.shape), 0, -1)
-        factor = integrability.doubt(sigma.astype(np.float32).reshape(mask.shape), normal, solution.height, estimated, capture.camera)
+        normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
+        factor = integrability.doubt(sigma.astype(np.float32).reshape(shape), normal, solution.height, estimated, opened.capture.camera)
         solution.confidence = (solution.confidence * factor.reshape(-1)).astype(np.float16)
-    refine_status(solution, stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
+    refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)
+    return _Judged(solution, placement, estimated, guessed_part(sigma, estimated))
+
+
+def _write(request: SolveRequest, opened: Opened, judged: _Judged) -> SolveResult:
+    """Write the maps and the report of a solution."""
+    capture, method, given, solution = opened.capture, opened.method, opened.given, judged.solution
+    stack, mask, timings = given.stack, given.mask, given.timings
     status = solution.status.reshape(mask.shape)
     solved = np.isin(status, SOLVED)
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
-    guessed = guessed_part(sigma, estimated)
-    solution.warnings += height_warnings(guessed, method)
+    solution.warnings += height_warnings(judged.guessed, method)
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
-    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents)
-    maps = _maps(solution, solved, estimated, method, capture, sources)
+    sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents) | {HASHING: str(LAYOUT)}
+    maps = _maps(solution, solved, judged.estimated, method, capture, sources)
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
     maps.write(maps_path)
@@ -150,97 +156,11 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
         pixels={"mask": int(mask.sum()), **counts},
         residual={**_residual_statistics(solution.residual.reshape(mask.shape)[solved]), "meaning": METHODS[method].residual},
         albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
-        height=_height_report(solution.integration, guessed, capture),
-        **({} if placed is None else {"parts": [part.facts() for part in placed.parts]}),
+        height=_height_report(solution.integration, judged.guessed, capture),
+        **({} if judged.placement is None else {"parts": [part.facts() for part in judged.placement.parts]}),
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
-
-
-def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: "LightsOverTime | None" = None) -> None:
-    """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
-
-    Args:
-        request: that of the other process, on a device of the same kind.
-        progress: told how far the solve is; it ends the help by an exception.
-        sharing: the part of this process.
-        over_time: as for solve.
-
-    Raises:
-        StageError, KernelError: the input is wrong.
-        DivergedError: this process finds something else than the other.
-    """
-    opened = _open(request, None, Timings(progress), sharing, over_time)
-    opened.solver(opened.given, opened.lights)
-
-
-def _open(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
-          over_time: "LightsOverTime | None" = None) -> _Opened:
-    """Open the capture of a request, if it is not open, and read its images into a stack."""
-    chosen = devices.resolve_all(request.device)
-    timings.stage("open", 1)
-    capture = capture or Capture.open(request.capture, request.pixels)
-    unknown = request.lights is LightsKnown.UNKNOWN
-    method = request.method or (_method_of_unknown(capture) if unknown else
-                                next(method for method, entry in METHODS.items() if entry.is_default(capture)))
-    if (method is Method.REFERENCE) != (request.reference_ball is not None):
-        raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
-    if unknown and DistantLights not in METHODS[method].solvers:
-        raise RequestError(f"--lights unknown: --method {method} is not for distant lights: take svbrdf, robust or lambert")
-    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, request.pixels._replace(crop=None))]
-    if unknown:
-        _check_known(capture)
-        check_surface(capture)
-    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
-    distance = None
-    alone = over_time is None and not capture.is_polarised  # steps would find distances of their own; pairs are no lights of their own
-    if alone and not unknown and method in (Method.LAMBERT, Method.ROBUST, Method.SVBRDF) and distance_is_missing(capture):
-        timings.stage("distance", len(capture.sources()))
-        distance = find_distance(capture, open_stack(capture, cache=request.cache, tracking=tracking,
-                                                     progress=lambda done, _: timings.advance(done)), chosen[0])
-        capture = distance.capture
-    lights = distant_lights(capture) if unknown else METHODS[method].read_lights(capture, *balls)
-    solver = METHODS[method].solvers.get(type(lights))
-    if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
-                            f"{method} needs lights of one direction each")
-    mask = capture.mask()
-    pairs = None
-    timings.stage("ingest", len(capture.sources()))
-    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
-    if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
-        if capture.is_polarised:
-            stack, lights, pairs = _separated(stack, capture, lights, mask)
-        else:
-            stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
-    if sharing is not None:
-        sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
-    given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
-                       relative=unknown or capture.manifest.irradiance_scale == "relative",
-                       refine_intensities=request.intensities is Intensities.CHOSEN, pairs=pairs)
-    if request.lights is not LightsKnown.DECLARED:
-        timings.stage("lights", 1)
-        found = _find_lights(request.lights, given, lights, capture)
-        return _Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, distance)
-    used: Any = lights
-    facts: dict[str, Any] = {}
-    if isinstance(lights, DistantLights) and given.refine_intensities:
-        timings.stage("intensities", 1)
-        used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
-    return _Opened(capture, method, used, lights, solver, given, facts, distance=distance)
-
-
-def _check_known(capture: Capture) -> None:
-    """Refuse polarised pairs whose lights are to be found from the images."""
-    if capture.is_polarised:
-        raise RequestError(f"--lights unknown: {capture.folder} has polarised pairs: their lights must be known, because a pair is the "
-                           "images of one light")
-
-
-def _separated(stack: Stack, capture: Capture, lights: DistantLights | PlacedLights, mask: np.ndarray) -> "Separated":
-    from service.solve.polarised import separate_pairs
-
-    return separate_pairs(stack, capture, lights, mask)
 
 
 def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None:
@@ -251,23 +171,6 @@ def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None
         from service.solve.polarised import doubt_metals
 
         doubt_metals(given, solution)
-
-
-def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":
-    """Return the lights that the images ask for; their kernels and methods are imported for captures that need them."""
-    if known is LightsKnown.UNKNOWN:
-        from service.solve.unknown_lights import find_lights
-
-        return find_lights(given)
-    if not isinstance(lights, DistantLights):
-        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant lights alone")
-    from service.solve.refined_lights import refine_lights
-
-    return refine_lights(given, lights)
-
-
-def _method_of_unknown(capture: Capture) -> Method:
-    return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
 
 
 def _maps(solution: Solution, solved: np.ndarray, estimated: np.ndarray, method: Method, capture: Capture,

@@ -2,8 +2,8 @@
 
 import numpy as np
 import warp as wp
+from scipy import ndimage
 
-from kernels.surface.components import label_runs
 from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
 from kernels.surface.shadows import Projection
 from service.requests.solve import Method
@@ -27,7 +27,6 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     Args:
         given: the camera and the device.
         normal: [3, pixels] float32.
-        solved: [rows, cols] bool.
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
         stage: what the progress calls this work.
 
@@ -125,10 +124,7 @@ def whole_surface(height: np.ndarray, solved: np.ndarray, mask: np.ndarray, *, m
 
 def _labels(mask: np.ndarray) -> np.ndarray:
     """Return [rows, cols] the number of the connected part of each pixel; 0 outside too."""
-    runs = label_runs(mask)
-    out = np.zeros(mask.shape, dtype=np.int64)
-    out[mask] = np.repeat(runs.label, runs.end_col - runs.first_col)  # runs lie in the order of pixels
-    return out
+    return np.maximum(ndimage.label(mask)[0].astype(np.int64) - 1, 0)
 
 
 def _fill(height: np.ndarray, known: np.ndarray, mask: np.ndarray) -> np.ndarray:

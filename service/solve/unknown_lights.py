@@ -43,7 +43,7 @@ class UnknownLights(NamedTuple):
     least_degrees: float
     """Standard error of every normal that the quarters do not show."""
     facts: dict[str, Any]
-    """What the report says."""
+    """Facts for the report."""
     warnings: tuple[str, ...]
 
     def doubt(self, normal: np.ndarray) -> np.ndarray:

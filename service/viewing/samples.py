@@ -12,11 +12,11 @@ from kernels.relight.shading import shade
 from kernels.relight.sources import NEVER, Sources
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
+from service.reporting.provenance import other_inputs
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import step_within
 from service.viewing.result_layers import ResultLayers
 from service.viewing.row_bands import row_bands
-from stage.errors import ResultError
 from stage.ingest import TOP_EXPONENT
 from stage.maps import LOBES, SurfaceMaps
 from stage.point_lights import DistantLights, PlacedLights
@@ -53,7 +53,7 @@ class PixelGrid(NamedTuple):
 
 
 def write_samples(stack: Stack, shape: tuple[int, int], found: ResultLayers, lights: DistantLights | PlacedLights | None, file: BlockFile,
-                  *, device: str, timings: Timings) -> dict[str, Any]:
+                  *, doubts: list[str], device: str, timings: Timings) -> dict[str, Any]:
     """Write the samples of a solve, and return what view.json says of them.
 
     Args:
@@ -62,6 +62,7 @@ def write_samples(stack: Stack, shape: tuple[int, int], found: ResultLayers, lig
         found: the maps.
         lights: that the maps were solved with; None: they are of a kind that the model does not have, and there is no model.
         file: for the samples.
+        doubts: gets a sentence where nothing tells whether the maps were solved from these images.
         device: where the model is lit.
         timings: told of every stage.
 
@@ -69,8 +70,8 @@ def write_samples(stack: Stack, shape: tuple[int, int], found: ResultLayers, lig
         ResultError: the maps were solved from other images.
         OSError: the file cannot be written.
     """
-    if found.provenance.get("relit:inputs", stack.key) != stack.key:
-        raise ResultError(f"{found.path}: was solved from other images than the capture has, or with other alignment: solve it again")
+    if (doubt := other_inputs(found.provenance, stack.key, found.path)) is not None:
+        doubts.append(doubt)
     count, (rows, cols) = stack.light_count, shape
     step = step_within(rows * cols, max(1, MOST_BYTES // (count * (MEASURED_BYTES + MODEL_BYTES + USED_BYTES))))
     grid = PixelGrid(-(-rows // step), -(-cols // step), step)

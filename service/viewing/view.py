@@ -96,7 +96,8 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
             sections["relight"] = _attempt(findings, lambda: _relight(readings, request, file, device, timings))
             if result is not None and not result.of_depth:
                 sections["samples"] = _attempt(findings, lambda: write_samples(
-                    readings.stack, mask.shape, result, readings.model_lights(report.factors), file, device=device, timings=timings))
+                    readings.stack, mask.shape, result, readings.model_lights(report.factors), file, doubts=findings, device=device,
+                    timings=timings))
         timings.stage("write", 1)
         target.unlink(missing_ok=True)  # it would describe other blocks
     findings += clipping_sentences(capture.clipped)

@@ -8,8 +8,7 @@ from kernels.errors import ArrayError
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope
 from kernels.photometric.descent import COLD, WARM, Schedule, descend
 from kernels.photometric.hypotheses import Diffuse, Prior, RingOptions, search_normals
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.propagation import STEPS, neighbours, propagate
+from kernels.photometric.normal_search import STEPS, find_normals, neighbours, propagate
 from kernels.photometric.samples import host_values
 from kernels.photometric.survey import CLOSE, survey
 from tests.kernels.photometric.test_svbrdf import COLOUR, LIGHTS, VIEW, degrees, render, sample, tilted

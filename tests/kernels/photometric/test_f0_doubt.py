@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from kernels.photometric.f0_doubt import RINGS, doubt_of_f0
 from kernels.photometric.hypotheses import Diffuse
 from kernels.photometric.material import Material
+from kernels.photometric.svbrdf import RINGS, doubt_of_f0
 from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
 
 COUNT = 40

@@ -5,7 +5,7 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.photometric.samples import readings_of
-from kernels.photometric.visible_part import LEAST_PART, divide_by_visible
+from kernels.photometric.shadowing import LEAST_PART, divide_by_visible
 from tests.kernels.photometric.test_svbrdf import sample
 
 

@@ -6,8 +6,7 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.shadow_evidence import LARGEST_ODDS, shadow_odds
-from kernels.surface.offsets import GROUPS, choose_offset, weigh_offsets
-from kernels.surface.part_shadows import march_part
+from kernels.surface.offsets import GROUPS, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection
 
 SIDE = 40

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from kernels.surface.support import supported_normals
+from kernels.surface.normal_map import supported_normals
 from tests.kernels.surface import shapes
 from tests.kernels.surface.test_integrate import solve, worst
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from service.reporting.provenance import HASHING
 from stage import exr
+from stage.ingest import LAYOUT
 from tests.scenes.captures import write_exr
 from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
 
@@ -114,9 +116,18 @@ def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, t
 
 def test_maps_of_other_images_are_refused(relit, scene, tmp_path):
     folder, _ = scene
-    maps = write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "of something else"})
+    maps = write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "of something else", HASHING: str(LAYOUT)})
     outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
     assert outcome.code == 2 and "solved from other images" in outcome.err and str(maps) in outcome.err
+
+
+def test_maps_of_a_version_that_hashed_otherwise_guide_with_a_warning(relit, scene, tmp_path):
+    folder, _ = scene
+    words = ("relight", folder / "cap", "--environment", folder / "sky.exr")
+    for name, provenance in (("one", {}), ("other", {"relit:inputs": "of something else"})):
+        outcome = relit(*words, "--out", tmp_path / f"{name}.#.exr", "--maps", write_maps(tmp_path / name, SURFACE, provenance=provenance))
+        assert outcome.code == 0 and (HASHING in outcome.out) == (name == "other")
+    assert np.array_equal(rgb(tmp_path / "one.1.exr"), rgb(tmp_path / "other.1.exr"))
 
 
 def test_maps_with_holes_are_refused(relit, scene, tmp_path):

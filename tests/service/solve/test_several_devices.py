@@ -11,7 +11,7 @@ from kernels import device as devices
 from kernels.errors import DeviceError
 from service.requests.solve import SolveRequest
 from service.solve import batches, material
-from service.solve.several_devices import deal
+from service.solve.sharing import deal
 from service.solve.solve import solve
 from stage import stack
 from tests.reference.gradient import ggx, lambert

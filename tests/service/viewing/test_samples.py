@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from service.reporting.provenance import HASHING
 from service.requests.view import ViewRequest
 from service.viewing import samples
 from service.viewing.view import view
 from stage.camera import Camera
 from stage.capture import Capture
+from stage.ingest import LAYOUT
 from stage.maps import SurfaceMaps
 from tests.reference import shading
 from tests.reference.view import View
@@ -138,7 +140,7 @@ def test_saturated_readings_are_told_and_bright_ones_fit(tmp_path):
 
 def test_maps_of_other_images_give_no_samples(tmp_path):
     write_dome(tmp_path / "cap", SURFACE, lights=8)
-    write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "another"})
+    write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "another", HASHING: str(LAYOUT)})
     found = show(tmp_path)
     assert found.facts["samples"] is None
     assert any("was solved from other images than the capture has" in finding for finding in found.facts["findings"])

@@ -1,0 +1,133 @@
+"""Open a capture for a solve: its method, its lights, and its images as a stack."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from kernels import device as devices
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
+from service.solve.distance import Distance, find_distance
+from service.solve.intensities import LightsOverTime, choose_intensities
+from service.solve.methods import METHODS, Solver
+from service.solve.sharing import SharedSolve
+from service.solve.solution import SolveInput
+from stage.brackets import merge_brackets, one_frame_a_light
+from stage.capture import Capture
+from stage.errors import ManifestError
+from stage.ingest import open_stack
+from stage.lighting import check_surface, distant_lights
+from stage.manifest import FILE_NAME
+from stage.motion.tracking import tracking_frames
+from stage.point_lights import DistantLights, PlacedLights, distance_is_missing
+
+if TYPE_CHECKING:
+    from service.solve.refined_lights import RefinedLights
+    from service.solve.unknown_lights import UnknownLights
+
+
+class Opened(NamedTuple):
+    """A capture that is ready to be solved."""
+
+    capture: Capture
+    method: Method
+    lights: Any
+    """With the intensities that the solve uses."""
+    declared: Any
+    """As the manifest has them."""
+    solver: Solver
+    given: SolveInput
+    facts: dict[str, Any]
+    """Facts about the lights for the report."""
+    found: "UnknownLights | RefinedLights | None" = None
+    """How the lights were found, where they are those of the images."""
+    distance: Distance | None = None
+    """How the distance of the surface was found, where the manifest does not say it."""
+
+
+def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
+               over_time: LightsOverTime | None = None) -> Opened:
+    """Open the capture of a request, and read its images into a stack.
+
+    Args:
+        capture: that of the request with its pixels; None: it is opened here.
+        timings: told of every stage.
+        sharing: the part of this process where several share the solve.
+        over_time: what the captures of a sequence share.
+
+    Raises:
+        StageError: the input is wrong.
+    """
+    chosen = devices.resolve_all(request.device)
+    timings.stage("open", 1)
+    capture = capture or Capture.open(request.capture, request.pixels)
+    unknown = request.lights is LightsKnown.UNKNOWN
+    method = request.method or _default_method(capture, unknown=unknown)
+    if (method is Method.REFERENCE) != (request.reference_ball is not None):
+        raise RequestError("--method reference and --reference-ball CAPTURE go together: give both or neither")
+    if unknown and DistantLights not in METHODS[method].solvers:
+        raise RequestError(f"--lights unknown: --method {method} is not for distant lights: take svbrdf, robust or lambert")
+    balls = [] if request.reference_ball is None else [Capture.open(request.reference_ball, request.pixels._replace(crop=None))]
+    if unknown:
+        if capture.is_polarised:
+            raise RequestError(f"--lights unknown: {capture.folder} has polarised pairs: their lights must be known, because a pair is the "
+                               "images of one light")
+        check_surface(capture)
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    distance = None
+    alone = over_time is None and not capture.is_polarised  # steps would find distances of their own; pairs are no lights of their own
+    if alone and not unknown and method in (Method.LAMBERT, Method.ROBUST, Method.SVBRDF) and distance_is_missing(capture):
+        timings.stage("distance", len(capture.sources()))
+        distance = find_distance(capture, open_stack(capture, cache=request.cache, tracking=tracking,
+                                                     progress=lambda done, _: timings.advance(done)), chosen[0])
+        capture = distance.capture
+    lights = distant_lights(capture) if unknown else METHODS[method].read_lights(capture, *balls)
+    solver = METHODS[method].solvers.get(type(lights))
+    if solver is None:  # only extended lights can be missing here: every method takes distant and near ones
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: some are extended: --method svbrdf solves these, "
+                            f"{method} needs lights of one direction each")
+    mask = capture.mask()
+    pairs = None
+    timings.stage("ingest", len(capture.sources()))
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
+        if capture.is_polarised:
+            from service.solve.polarised import separate_pairs
+
+            stack, lights, pairs = separate_pairs(stack, capture, lights, mask)
+        else:
+            stack, lights = one_frame_a_light(merge_brackets(stack, capture.sources(), lights), lights)
+    if sharing is not None:
+        sharing.identify(chosen[0], str(method), stack.key, mask, stack.scale, capture.manifest.model_dump_json())
+    given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
+                       relative=unknown or capture.manifest.irradiance_scale == "relative",
+                       refine_intensities=request.intensities is Intensities.CHOSEN, pairs=pairs)
+    if request.lights is not LightsKnown.DECLARED:
+        timings.stage("lights", 1)
+        found = _find_lights(request.lights, given, lights, capture)
+        return Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, distance)
+    used: Any = lights
+    facts: dict[str, Any] = {}
+    if isinstance(lights, DistantLights) and given.refine_intensities:
+        timings.stage("intensities", 1)
+        used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
+    return Opened(capture, method, used, lights, solver, given, facts, distance=distance)
+
+
+def _default_method(capture: Capture, *, unknown: bool) -> Method:
+    """Return the method that solves a capture for which the request names none."""
+    if unknown:
+        return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
+    return next(method for method, entry in METHODS.items() if entry.is_default(capture))
+
+
+def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":
+    """Return the lights that the images ask for; their kernels and methods are imported for captures that need them."""
+    if known is LightsKnown.UNKNOWN:
+        from service.solve.unknown_lights import find_lights
+
+        return find_lights(given)
+    if not isinstance(lights, DistantLights):
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant lights alone")
+    from service.solve.refined_lights import refine_lights
+
+    return refine_lights(given, lights)
