@@ -12,9 +12,9 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
+from kernels.stereo.census import sliding
 from kernels.stereo.cost import CHANCE, Labels, Margins
 from kernels.stereo.paths import FAR
-from kernels.stereo.windows import sliding
 
 SPREAD = 2
 """Distance in pixels between the nine places around a pixel whose costs are added to compare rivals. With the window of the census they

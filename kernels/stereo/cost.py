@@ -8,8 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import BITS, census
-from kernels.stereo.windows import sliding
+from kernels.stereo.census import BITS, census, sliding
 
 SCALE = 4
 """Units of cost for one differing bit of the 62, so that the mean over frames keeps a fraction and fits eight bits."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.tof.continuous import decode
-from kernels.tof.noise import estimate_noise
+from service.depth.continuous_wave import estimate_noise
 from service.depth.tof import solve_tof, z_per_range
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings

@@ -19,8 +19,7 @@ from kernels.tof.modulation import common_range_m, require_span
 from kernels.tof.unwrap import END_SIGMAS
 from service.depth.continuous_wave import solve_correlations
 from service.depth.histograms import solve_histograms
-from service.depth.range_image import RangeImage
-from service.depth.solution import DepthSolution
+from service.depth.solution import DepthSolution, RangeImage
 from service.reporting.progress import Timings
 from service.requests.depth import TofFilter, TofOptions
 from stage.camera import Camera

@@ -18,9 +18,9 @@ from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
 from stage.importers.opencv_gray import gray_order
+from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
 from stage.importers.plane_table import NAMES as PLANES
 from stage.importers.plane_table import read_planes
-from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of

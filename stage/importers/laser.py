@@ -7,10 +7,9 @@ import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
-from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_names, image_resolution, write_capture
 from stage.importers.plane_table import PlaneTable, read_planes
-from stage.importers.view import AMBIENT_WORDS, Selection, View, only_image, select, view_of_file
+from stage.importers.view import AMBIENT_WORDS, Axes, Selection, View, camera_from_table, describe, only_image, select, view_of_file
 from stage.manifest import SCHEMA
 
 OFF_WORDS = AMBIENT_WORDS | {"background", "off", "nolaser"}

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
-from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
 from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import LightTable
 from stage.importers.olat import find_table, match
-from stage.importers.view import Selection, View, select, view_of_file
+from stage.importers.view import Axes, Selection, View, camera_from_table, describe, select, view_of_file
 from stage.manifest import SCHEMA
 
 

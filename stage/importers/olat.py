@@ -7,10 +7,9 @@ import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
-from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, natural_order, write_capture
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
-from stage.importers.view import Selected, Selection, View, select
+from stage.importers.view import Axes, Selected, Selection, View, camera_from_table, describe, select
 from stage.manifest import FILE_NAME, SCHEMA
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from stage.errors import ManifestError
 from stage.importers.layout import image_names, image_resolution, write_capture
-from stage.importers.procam_file import camera_and_projector
+from stage.importers.patterns import camera_and_projector
 from stage.importers.sequences import GrayStack
 from stage.manifest import SCHEMA
 
