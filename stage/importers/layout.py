@@ -1,6 +1,7 @@
 """The common parts of the importers: reading tables of numbers, placing images and arrays, and writing the manifest."""
 
 import io
+import json
 import os
 import re
 import shutil
@@ -74,6 +75,19 @@ def read_table(path: Path, columns: int) -> np.ndarray:
             raise ManifestError(f"{path}: line {number}: {line.strip()[:60]!r} is not {columns} numbers")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ManifestError: the file is no JSON.
+        StorageError: the file cannot be read.
+    """
+    try:
+        return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"{path}: is not JSON") from error
 
 
 def image_resolution(path: Path) -> tuple[int, int]:

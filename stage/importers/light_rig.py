@@ -4,16 +4,15 @@ The names S, Dir, Phi, mu and K are those of Quéau, Durix, Wu, Cremers, Lauze a
 Calibration and Numerical Solution", JMIV 2018, and of its program near_ps, whose file is `light.mat`.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import inputs
 from stage.calibration.opencv_file import lens, read_matrices
 from stage.camera import Distortion
 from stage.errors import ManifestError
+from stage.importers.layout import read_json
 from stage.mat_file import read_mat_arrays
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
@@ -107,10 +106,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
 
 
 def _from_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if isinstance(data, dict) and isinstance(data.get("lights"), list):
         data = data["lights"]
     if isinstance(data, list):

@@ -1,16 +1,15 @@
 """Planes of light in files: rows of coefficients or of a point and a normal, and entries of calibration files."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import inputs
 from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError, storage
 from stage.images import SUFFIXES as IMAGE_SUFFIXES
+from stage.importers.layout import read_json
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
 
@@ -108,10 +107,7 @@ def _from_text(path: Path) -> PlaneTable:
 
 def _objects(path: Path) -> PlaneTable | None:
     """Return the planes of a list of objects in a JSON file; None where it holds something else."""
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if isinstance(data, dict):
         data = next((data[name] for name in NAMES if isinstance(data.get(name), dict | list)), data)
     planes: list[Any] = [data] if isinstance(data, dict) else data if isinstance(data, list) else []
