@@ -51,7 +51,6 @@ def census(images: np.ndarray, *, before: int = 0, after: int = 0, device: str) 
     Args:
         images: [images, rows, cols] float32; pixels beyond the border are those at the border.
         before, after: columns without a meaning that are put before the first column and after the last.
-        device: where.
 
     Returns:
         [images, rows, before + cols + after or more] uint64.

@@ -75,7 +75,6 @@ def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels:
         right: [frames, rows, right cols] float32.
         seen: [rows, right cols] bool, False where the right camera sees nothing.
         labels: the disparities.
-        device: where.
 
     Returns:
         [rows, cols, packs] packs of uint8: `SCALE` units for each differing bit, the mean over the frames.

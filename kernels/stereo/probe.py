@@ -34,7 +34,6 @@ def probe(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels,
         seen: [rows, right cols] bool, False where the right camera sees nothing.
         labels: the disparities that are compared.
         step: distance between sampled places, in rows and columns; the first lies half a step from the corner.
-        device: where.
 
     Returns:
         Arrays on the device, not synchronised on CUDA.

@@ -62,7 +62,6 @@ def refine(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, *, device
         left: [frames, rows, cols] float32, rectified.
         right: [frames, rows, right cols] float32.
         disparity: [rows, cols] float32, good to a pixel or so; NaN where there is none.
-        device: where.
 
     Returns:
         Arrays on the device, not synchronised on CUDA.

@@ -176,7 +176,6 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
         crosstalk: [3, 3] camera channels from projector channels, for colours; None: each channel sees its own.
-        noise: of a reading.
 
     Returns:
         Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame of the code is. SHADOWED: white is not above

@@ -92,9 +92,7 @@ def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, refe
     Args:
         images: [M, pixel] float32 readings, in any order.
         modulation_hz, reference_phase_rad, scale: [M] as `weights` takes them.
-        noise: of a reading.
         saturation: readings at or above it are none; the frequency is then not usable at that pixel. None: none saturates.
-        device: where to run.
 
     Returns:
         The phases, on the device; not synchronised on CUDA. Readings that are not finite count as saturated ones.

@@ -54,7 +54,6 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
         solution: of projected patterns.
         residual_px: [rows, cols] of both axes; None with one axis.
         camera, projector: their geometry.
-        device: where to run.
 
     Returns:
         [rows, cols] float32, 0…1; 0 where there is no depth.

@@ -157,7 +157,6 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
         near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
         limit: saturation, in recorded values.
         usable: [rows, cols] bool mask.
-        device: where to run.
 
     Raises:
         ArrayError: the phases or frequencies cannot give the range that is asked for.

@@ -86,7 +86,6 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
 
     Args:
         request: what to measure and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input; nothing is written.

@@ -142,7 +142,6 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         near_m, far_m: the span of half paths; None: that of the histogram.
         limit: counts at or above it are a full counter.
         usable: [rows, cols] bool mask: the others decide on nothing.
-        device: where to run.
 
     Raises:
         ArrayError: the histograms hold nothing.

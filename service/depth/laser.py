@@ -58,8 +58,6 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         capture: with laser frames; `off` or `black` frames of it are its ambient light.
         mask: [rows, cols] bool.
         request: its span of depths; depths outside are OUT_OF_RANGE.
-        device: where to run.
-        timings: told of every stage.
 
     Raises:
         StageError: a laser stands where it cannot, a frame is unreadable, or no frame shows a spot or stripe.

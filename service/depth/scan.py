@@ -51,7 +51,6 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
 
     Args:
         request: what to read and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input; nothing is written.

@@ -71,8 +71,6 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
         capture: with stereo frames.
         mask: [rows, cols] bool.
         request: its noise and its span of depths; depths outside are OUT_OF_RANGE.
-        device: where to run.
-        timings: told of every stage.
 
     Raises:
         StageError: a calibration that cannot be, swapped images, nothing that matches, an unreadable frame.

@@ -193,7 +193,6 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
         laser: its plane.
         sweep: of the frames whose stripes cross the same lines.
         camera: perspective.
-        device: where to run.
         near_m, far_m: span of depths; others are OUT_OF_RANGE.
     """
     along = along_of(laser)

@@ -40,8 +40,6 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         near_m: nearest range; None: 0, pulsed: where the histogram begins.
         far_m: farthest range; None: as far as the frequencies tell apart, or the histogram reaches.
         calibration: in place of that file.
-        device: where to run.
-        timings: told of the stages.
 
     Returns:
         Depth, range, standard deviations of the depth, amplitude (mean over the frequencies; pulsed: photons of the return), confidence

@@ -1,1 +1,4 @@
-"""Import of captures in other layouts: one module for each format, with `import_folder(source, destination)`."""
+"""Import of captures in other layouts: a module for each format or family of formats, whose `import_…` functions write a capture.json.
+
+Every function that reads or writes a file raises StorageError where the file system refuses.
+"""

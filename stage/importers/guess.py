@@ -46,7 +46,6 @@ def guess(source: Path) -> Guess:
 
     Raises:
         ManifestError: nothing fits, or the folder is a capture already.
-        StorageError: the folder cannot be read.
     """
     with storage("read", source):
         names = tuple(natural_order(path.name for path in source.iterdir() if path.is_file() and not path.name.startswith(".")))

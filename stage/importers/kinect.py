@@ -49,7 +49,6 @@ def import_folder(source: Path, destination: Path, *, packet: Path | None = None
 
     Raises:
         ManifestError: packet or tables are not there, or have another size; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     packet = packet or _only(source, "depth packet", "--packet", lambda path: path.stat().st_size in PACKET_BYTES)
     p0 = p0 or _only(source, "file of P0 tables", "--p0", lambda path: "p0" in path.name.lower() and path.stat().st_size >= P0_BYTES)
@@ -91,7 +90,6 @@ def decode(path: Path) -> np.ndarray:
 
     Raises:
         ManifestError: the file has another size than a packet.
-        StorageError: the file cannot be read.
     """
     content = inputs.read_bytes(path)
     if len(content) not in PACKET_BYTES:
@@ -114,7 +112,6 @@ def read_p0(path: Path) -> np.ndarray:
 
     Raises:
         ManifestError: the file is too short.
-        StorageError: the file cannot be read.
     """
     content = inputs.read_bytes(path)
     if len(content) < P0_BYTES:

@@ -37,7 +37,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
 
     Raises:
         ManifestError: the camera is not known, planes cannot be read or do not fit the images; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     given = selection or Selection()
     off = only_image(source, image_names(source), given.ambient, OFF_WORDS, "ambient")

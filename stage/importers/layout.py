@@ -41,11 +41,7 @@ def natural_order(names: Iterable[str]) -> list[str]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of the images in a folder, in natural order; hidden files are left out.
-
-    Raises:
-        StorageError: the folder cannot be read.
-    """
+    """Return the names of the images in a folder, in natural order; hidden files are left out."""
     with storage("read", folder):
         return natural_order(path.name for path in folder.iterdir()
                              if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
@@ -59,7 +55,6 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 
     Raises:
         ManifestError: a row has another count of numbers, or a number is not finite; the message names file and line.
-        StorageError: the file cannot be read.
     """
     with storage("read", path):
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -82,7 +77,6 @@ def read_json(path: Path) -> Any:
 
     Raises:
         ManifestError: the file is no JSON.
-        StorageError: the file cannot be read.
     """
     try:
         return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))

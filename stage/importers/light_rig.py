@@ -59,7 +59,6 @@ def read_rig(path: Path) -> LightRig:
 
     Raises:
         ManifestError: the file holds no positions, or its arrays do not fit each other.
-        StorageError: the file cannot be read.
     """
     fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
@@ -82,7 +81,6 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
 
     Raises:
         ManifestError: the file holds no matrix of a camera.
-        StorageError: the file cannot be read.
     """
     matlab = path.suffix.lower() == ".mat"
     matrices = read_mat_arrays(path) if matlab else read_matrices(path)

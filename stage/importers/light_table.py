@@ -52,7 +52,6 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
 
     Raises:
         ManifestError: the file holds no table of lights, or its shape leaves open where the lights are; the message names file and line.
-        StorageError: the file cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix == ".mat":
@@ -75,7 +74,6 @@ def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
 
     Raises:
         ManifestError: the file holds something else.
-        StorageError: the file cannot be read.
     """
     if path.suffix.lower() == ".mat":
         name, values = _variable(path, read_mat_arrays(path), variable,

@@ -44,7 +44,6 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
 
     Raises:
         ManifestError: there is no table or more than one, images and lights do not fit, or a value is wrong; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     path = lights or find_table(source)
     table = read_light_table(path, variable=variable, run=run)
@@ -80,7 +79,6 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
 
     Raises:
         ManifestError: the rig or the camera cannot be read, images and lights do not fit, or a value is wrong; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     path = lights or find_table(source)
     rig = read_rig(path)
@@ -119,7 +117,6 @@ def import_photos(source: Path, destination: Path, *, selection: Selection | Non
 
     Raises:
         ManifestError: there are fewer than three images; the message names the folder.
-        StorageError: a file cannot be read or written.
     """
     chosen = select(source, selection or Selection())
     names = chosen.frames
@@ -153,7 +150,6 @@ def find_table(source: Path) -> Path:
 
     Raises:
         ManifestError: there is none, or more than one.
-        StorageError: the folder cannot be read.
     """
     with storage("read", source):
         found = natural_order(path.name for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.name != FILE_NAME

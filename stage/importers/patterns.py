@@ -60,7 +60,6 @@ def projector_size(path: Path) -> tuple[int, int] | None:
 
     Raises:
         ManifestError: the file cannot be parsed.
-        StorageError: the file cannot be read.
     """
     return _size(read_matrices(path), PROJECTOR_SIZE)
 
@@ -112,7 +111,6 @@ def import_gray(source: Path, destination: Path, *, pictures: PatternImages, gra
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     return _write(source, destination, pictures, gray.entries(pictures.projector), ())
 
@@ -134,7 +132,6 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     extra: list[tuple[str, Entry]] = []
     if gray_images is not None:
@@ -168,7 +165,6 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     size = projector or projector_size(calibration)
     if size is None:

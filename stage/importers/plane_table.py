@@ -62,7 +62,6 @@ def read_planes(path: Path) -> PlaneTable:
 
     Raises:
         ManifestError: there are no planes, or a row is no four or six numbers.
-        StorageError: the file cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:

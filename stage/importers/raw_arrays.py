@@ -40,7 +40,6 @@ class ArrayFiles:
 
         Raises:
             ManifestError: there is none.
-            StorageError: the folder cannot be read.
         """
         with storage("read", folder):
             found = natural_order(
@@ -57,7 +56,6 @@ class ArrayFiles:
         Raises:
             ManifestError: the file lacks a variable, holds several, or needs a type and a size; the message names the file.
             ImageError: a .npy file is damaged.
-            StorageError: the file cannot be read.
         """
         suffix = path.suffix.lower()
         if suffix == ".npy":

@@ -34,7 +34,6 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
 
     Raises:
         ManifestError: the file cannot be read, an image has no light, or lights and images do not fit; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     path = _find(source)
     data = _read(path)

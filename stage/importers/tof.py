@@ -51,7 +51,7 @@ def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequ
 
     Raises:
         ManifestError: there are more or fewer images than frequencies times phases, or they differ in size; the message names the file.
-        ImageError, StorageError: a file cannot be read or written.
+        ImageError: a file cannot be read.
     """
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
@@ -108,7 +108,7 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
 
     Raises:
         ManifestError: an array is no histogram of pixels, or sizes differ; the message names the file.
-        ImageError, StorageError: a file cannot be read or written.
+        ImageError: a file cannot be read.
     """
     arrays = arrays or ArrayFiles()
     folder, names = (source.parent, [source.name]) if source.is_file() else (source, arrays.names(source))

@@ -104,7 +104,6 @@ def select(folder: Path, selection: Selection) -> Selected:
 
     Raises:
         ManifestError: there is no image, an image that was named does not exist, or more than one could be the mask.
-        StorageError: the folder cannot be read.
     """
     names = image_names(folder)
     mask = only_image(folder, names, selection.mask, MASK_WORDS, "mask")

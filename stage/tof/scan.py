@@ -13,6 +13,11 @@ from stage.model import Count, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.frames import read_array
 
+FILE_NAME = "scan.json"
+SCHEMA = "relit.scan/1"
+IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+COLUMNS = "time_s, azimuth_rad, elevation_rad"
+
 
 class Pose(Strict):
     """The pose of the platform at one time."""
@@ -53,47 +58,15 @@ def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, 
         raise CalibrationError("a shot has a time that is not finite")
     known = np.array([pose.time_s for pose in track])
     matrices = np.array([pose.world_from_platform for pose in track], dtype=np.float64)
-    turns = np.array([_quaternion(matrix[:3, :3]) for matrix in matrices])
     if len(track) == 1:
         return (np.broadcast_to(matrices[0, :3, :3], (len(times_s), 3, 3)), np.broadcast_to(matrices[0, :3, 3], (len(times_s), 3)),
                 np.ones(len(times_s), dtype=bool))
-    after = np.clip(np.searchsorted(known, times_s, side="right"), 1, len(known) - 1)
-    part = np.clip((times_s - known[after - 1]) / (known[after] - known[after - 1]), 0, 1)[:, None]
-    translation = matrices[after - 1, :3, 3] * (1 - part) + matrices[after, :3, 3] * part
-    one, two = turns[after - 1], turns[after]
-    cosine = (one * two).sum(axis=1, keepdims=True)
-    two, cosine = np.where(cosine < 0, -two, two), np.clip(np.abs(cosine), 0, 1)
-    angle = np.arccos(cosine)
-    tiny = angle < 1e-6  # interpolated linearly, because the sines vanish
-    sine = np.where(tiny, 1.0, np.sin(angle))
-    first = np.where(tiny, 1 - part, np.sin((1 - part) * angle) / sine)
-    second = np.where(tiny, part, np.sin(part * angle) / sine)
-    return _matrix(first * one + second * two), translation, (times_s >= known[0]) & (times_s <= known[-1])
+    from scipy.spatial.transform import Rotation, Slerp  # the API reads scans, and needs no poses
 
-
-def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return the quaternion [4] w x y z of a rotation: an eigenvector of Bar-Itzhack's matrix, which is stable at all angles."""
-    m = rotation
-    k = np.array([[m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-                  [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-                  [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-                  [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]]])
-    return np.linalg.eigh(k)[1][:, -1]
-
-
-def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotations [n, 3, 3] of quaternions [n, 4] w x y z of any length."""
-    w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
-    return np.stack([
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-        np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-        np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)], axis=1)
-
-
-FILE_NAME = "scan.json"
-SCHEMA = "relit.scan/1"
-IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-COLUMNS = "time_s, azimuth_rad, elevation_rad"
+    turns = Rotation.from_matrix(matrices[:, :3, :3])
+    within = np.clip(times_s, known[0], known[-1])
+    translation = np.stack([np.interp(within, known, values) for values in matrices[:, :3, 3].T], axis=1)
+    return Slerp(known, turns)(within).as_matrix(), translation, within == times_s
 
 
 class Waveforms(Strict):
@@ -149,7 +122,6 @@ def read_scan(path: str | Path) -> Shots:
     Raises:
         ManifestError: scan.json is missing or wrong; the message names the field.
         ImageError: an array is unreadable or has the wrong shape; the message names the file.
-        StorageError: a file cannot be read.
     """
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given
