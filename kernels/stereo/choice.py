@@ -24,7 +24,7 @@ APART = 2
 
 
 class Choice(NamedTuple):
-    """What was chosen at each pixel of a band of rows."""
+    """The choice at each pixel of a band of rows."""
 
     label: wp.array  # [rows, cols] int32, the best label
     fraction: wp.array  # [rows, cols] float32, by which the minimum of the path costs lies beyond the label, -0.5…0.5

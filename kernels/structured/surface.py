@@ -44,7 +44,7 @@ EMPTY = 1.0e30
 
 
 class Agreement(NamedTuple):
-    """What the tests found, on the device."""
+    """The findings of the tests, on the device."""
 
     turned: wp.array  # [pixels] uint8: 1 where the projector would see the back of the surface
     alone: wp.array  # [pixels] uint8: 1 where no neighbour of the row, or none of the column, can belong to its surface

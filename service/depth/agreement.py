@@ -42,7 +42,7 @@ ADVICE = {
     Status.ILL_POSED: "the projected coordinate hardly changes with depth: project columns from beside the camera, rows from above it",
     Status.UNSURE: "neighbours contradict each other, as in mirrors and where frames are declared wrongly: check the frames' patterns",
 }
-"""What most often is the cause of the commonest status."""
+"""The most frequent cause of each status, and what to do about it."""
 ENOUGH = 200
 """Number of solved pixels from which a usual residual is taken."""
 

@@ -19,10 +19,10 @@ HALF_SURE = 1e-3
 
 @dataclass(kw_only=True)
 class PixelSolution:
-    """What every way of measuring says of each pixel, and of the whole scene."""
+    """The findings that every way of measuring has of each pixel, and of the whole scene."""
 
     method: str
-    """What was decoded, in words for the report."""
+    """The code or the kind of frames that was decoded, in words for the report."""
     status: np.ndarray  # [rows, cols] uint8
     confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
     least_confidence: float = 0.0
@@ -30,7 +30,7 @@ class PixelSolution:
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole scene: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What was found out on the way, for the report."""
+    """Facts that were found out on the way, for the report."""
 
     @property
     def solved(self) -> np.ndarray:

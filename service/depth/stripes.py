@@ -147,7 +147,7 @@ def along_of(laser: LaserPlane) -> str:
 
 
 class Sweep:
-    """What the frames of planes that cross the same lines tell of the surfaces: their albedo."""
+    """The albedo of surfaces, from the frames of planes that cross the same lines."""
 
     def __init__(self) -> None:
         self.energy: SweepEnergy | None = None
@@ -172,7 +172,7 @@ class Sweep:
 
 
 class Stripes(NamedTuple):
-    """What one frame shows."""
+    """The stripes of one frame."""
 
     samples: StripeSamples
     curve: np.ndarray

@@ -1,4 +1,4 @@
-"""What the files of a folder seem to be, and the command that imports them; what files do not say stands in the command in capitals."""
+"""Guesses the layout of a folder and the command that imports it; what the files do not say stands in the command in capitals."""
 
 import shlex
 from collections import Counter

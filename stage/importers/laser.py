@@ -24,8 +24,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
     """Write a capture.json for images under one laser plane each.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
         view: the camera, as far as options say it.
         camera: a file with its matrix; None: as `view` says.
         planes: the file of the planes; None: every frame gets a placeholder.
@@ -33,7 +31,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.
         unit_m: the metres in one unit of the planes; needed with `planes`.
         selection: which images are frames; None: all but the mask and the one without the laser.
-        color_space: of the images; None: sRGB of 8-bit images, scene-linear of others.
 
     Raises:
         ManifestError: the camera is not known, planes cannot be read or do not fit the images; the message names the file.

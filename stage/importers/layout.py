@@ -22,11 +22,11 @@ from stage.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
 from stage.records import describe
 
 PREVIOUS_NAME = "capture.previous.json"
-"""What a capture.json that an import replaces by another is kept as."""
+"""The name under which a capture.json is kept that an import replaces by another."""
 
 
 class Imported(NamedTuple):
-    """What an importer wrote, and how it understood the folder."""
+    """The capture that an importer wrote, and how it understood the folder."""
 
     path: Path
     """The manifest."""

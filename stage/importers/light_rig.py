@@ -24,7 +24,7 @@ IMAGES = ("image", "file", "filename", "name")
 CAMERA_MATRIX = ("K", "camera_matrix", "cameraMatrix", "mtx", "cam_K", "Kc", "M1", "K1", "cameraMatrix1")
 CAMERA_LENS = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "dist", "cam_kc", "kc", "D1", "distCoeffs1")
 MATLAB_CENTRE, OPENCV_CENTRE = -0.5, 0.5
-"""What is added to image coordinates of MATLAB, where the centre of the first pixel is 1, and of OpenCV, where it is 0."""
+"""Offsets that are added to image coordinates of MATLAB, where the centre of the first pixel is 1, and of OpenCV, where it is 0."""
 
 
 class LightRig(NamedTuple):

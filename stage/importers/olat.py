@@ -30,17 +30,12 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     """Write a capture.json for images under one far light each.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
         axes: where x, y and z of the table point, as seen by the camera.
         to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
         lights: the table; None: the only one in the folder.
         variable: of a .mat or JSON table, as `read_light_table` takes it.
         run: whether lights are rows or columns, as `read_light_table` takes it.
         strengths: a file with the strength of each light; None: that in the table, else equal.
-        selection: which images are frames; None: all but mask and ambient light.
-        view: the camera; None: orthographic, of unknown scale.
-        color_space: of the images; None: sRGB of 8-bit images, scene-linear of others.
 
     Raises:
         ManifestError: there is no table or more than one, images and lights do not fit, or a value is wrong; the message names the file.
@@ -71,7 +66,6 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
     """Write a capture.json for images under one near light each.
 
     Args:
-        source, destination, selection, view, color_space: as `import_folder` takes them.
         axes: where x, y and z of the rig point, as seen by the camera, whose centre is their origin.
         unit_m: the metres in one unit of the positions.
         lights: the file of the rig; None: the only table in the folder.
@@ -113,7 +107,7 @@ def _entries(rig: LightRig, positions: np.ndarray, matrix: np.ndarray) -> list[d
 
 def import_photos(source: Path, destination: Path, *, selection: Selection | None = None, view: View | None = None,
                   color_space: ColorSpaceName | None = None) -> Imported:
-    """Write a capture.json for images whose lights are yet to be measured; the arguments are those of `import_folder`.
+    """Write a capture.json for images whose lights are yet to be measured.
 
     Raises:
         ManifestError: there are fewer than three images; the message names the folder.

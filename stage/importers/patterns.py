@@ -120,8 +120,6 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         pictures: the frames of the phases, and the rig.
         phase: how they were taken.
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
@@ -154,8 +152,6 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
     """Write a capture.json for the images of a scanning program, with the calibration that it wrote.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         calibration: its calibration file.
         codec: one of CODECS.
         axes: column, row or both: what was coded.
@@ -179,7 +175,6 @@ def import_opencv_gray(source: Path, destination: Path, *, projector: tuple[int,
 
     Args:
         source: the folder of the images, which are taken in the natural order of their names: 2 before 10.
-        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         projector: the width and height of the projector in pixels, which determine the count of bits.
         calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`, and
             the manifest has the size of the projector alone.

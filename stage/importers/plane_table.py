@@ -19,7 +19,7 @@ NORMALS, DISTANCES, POINTS = ("normal", "normals", "n"), ("distance", "d", "offs
 """Names of the parts of one plane, or of all."""
 TEXT = (".csv", ".txt", ".tsv", ".dat")
 FORMS = {"zero": "a x + b y + c z + d = 0", "equals": "a x + b y + c z = d"}
-"""What four coefficients of a plane mean."""
+"""Meanings of the four coefficients of a plane."""
 
 
 class PlaneTable(NamedTuple):

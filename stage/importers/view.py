@@ -1,4 +1,4 @@
-"""What an importer is told of the camera and of the images, and the entries of the manifest that follow from it."""
+"""The options of importers about camera, axes and images, and the entries of the manifest that follow from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -159,7 +159,7 @@ def only_image(folder: Path, names: list[str], given: str | None, words: frozens
 
 WAYS: dict[str, tuple[int, int, int]] = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0),
                                          "towards": (0, 0, 1), "away": (0, 0, -1)}
-"""Where an axis points as seen by the camera → its unit vector in the camera frame; `away` is where the camera looks."""
+"""The direction of an axis as seen by the camera → its unit vector in the camera frame; `away` is where the camera looks."""
 
 Axes = tuple[str, str, str]
 """Where x, y and z of a table point, each one of WAYS."""
