@@ -72,7 +72,7 @@ def find_spot(signal: np.ndarray) -> Spot:
     middle = float(np.median(sample))
     noise = max(MAD_TO_SIGMA * float(np.median(np.abs(sample - middle))), 1e-7 * float(np.abs(values).max()))
     values = np.where(valid, signal - middle, 0)
-    row, col = np.unravel_index(int(np.argmax(_blurred(values))), values.shape)
+    row, col = (int(at) for at in np.unravel_index(int(np.argmax(_blurred(values))), values.shape))
     if values[row, col] <= 0 or _blurred(values[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]).max() < NOISE_FACTOR * noise / 3:
         return none
     top, left = max(row - REACH_PX, 0), max(col - REACH_PX, 0)
