@@ -27,10 +27,9 @@ from stage.maps import SurfaceMaps
 from stage.radiance import check_radiance
 from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization
-from stage.tof.calibration import read_calibration
+from stage.tof.calibration import read_calibration, read_sweep
 from stage.tof.frames import read_array
 from stage.tof.scan import read_scan
-from stage.tof.sweep import read_sweep
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_image
 from tests.stage.test_maps import make_maps
 

@@ -12,9 +12,9 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
+from kernels.stereo.census import sliding
 from kernels.stereo.cost import CHANCE, Labels, Margins
 from kernels.stereo.paths import FAR
-from kernels.stereo.windows import sliding
 
 SPREAD = 2
 """Distance in pixels between the nine places around a pixel whose costs are added to compare rivals. With the window of the census they
@@ -24,7 +24,7 @@ APART = 2
 
 
 class Choice(NamedTuple):
-    """What was chosen at each pixel of a band of rows."""
+    """The choice at each pixel of a band of rows."""
 
     label: wp.array  # [rows, cols] int32, the best label
     fraction: wp.array  # [rows, cols] float32, by which the minimum of the path costs lies beyond the label, -0.5…0.5

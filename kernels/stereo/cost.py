@@ -8,8 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import BITS, census
-from kernels.stereo.windows import sliding
+from kernels.stereo.census import BITS, census, sliding
 
 SCALE = 4
 """Units of cost for one differing bit of the 62, so that the mean over frames keeps a fraction and fits eight bits."""
@@ -76,7 +75,6 @@ def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels:
         right: [frames, rows, right cols] float32.
         seen: [rows, right cols] bool, False where the right camera sees nothing.
         labels: the disparities.
-        device: where.
 
     Returns:
         [rows, cols, packs] packs of uint8: `SCALE` units for each differing bit, the mean over the frames.

@@ -12,10 +12,10 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
+from kernels.stereo.census import sliding
 from kernels.stereo.choice import APART, SPREAD
 from kernels.stereo.cost import CHANCE, SCALE, Labels, census_pair
 from kernels.stereo.paths import FAR
-from kernels.stereo.windows import sliding
 
 
 class Probe(NamedTuple):
@@ -34,7 +34,6 @@ def probe(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels,
         seen: [rows, right cols] bool, False where the right camera sees nothing.
         labels: the disparities that are compared.
         step: distance between sampled places, in rows and columns; the first lies half a step from the corner.
-        device: where.
 
     Returns:
         Arrays on the device, not synchronised on CUDA.

@@ -16,7 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.windows import sliding
+from kernels.stereo.census import sliding
 
 LANES_CPU, LANES_CUDA = 16, 1
 """Columns of the window that a thread takes together: on the CPU all nine, as SIMD."""
@@ -62,7 +62,6 @@ def refine(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, *, device
         left: [frames, rows, cols] float32, rectified.
         right: [frames, rows, right cols] float32.
         disparity: [rows, cols] float32, good to a pixel or so; NaN where there is none.
-        device: where.
 
     Returns:
         Arrays on the device, not synchronised on CUDA.

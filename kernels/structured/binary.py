@@ -61,7 +61,6 @@ def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | N
         white, black: frames of the projector full on and black.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
-        noise: of a reading.
 
     Returns:
         Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame that decides a bit is. SHADOWED: the contrast

@@ -49,7 +49,6 @@ def confirm_stripes(decoded: Decoded, frames: Band, bits: Sequence[int], inverse
         inverses: frame of each inverse in the same order.
         columns: pixels of an image row.
         stripe_px: width of the finest stripe.
-        noise: of a reading.
 
     Returns:
         A new result, in which UNDECIDED and MULTIPATH pixels that are confirmed are OK with a deviation of their own; coordinate and

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import warp as wp
 
-from kernels.packs import unwritten
+from kernels.errors import ArrayError
+from kernels.packs import unwritten, zeros
 from kernels.status import OK, Status
 
 STRIPE_DEVIATION = 1.0 / sqrt(12.0)
@@ -32,6 +33,21 @@ class Decoded(NamedTuple):
 def unwritten_decoded(pixels: int, device: str) -> Decoded:
     """Return the arrays of a result, for a kernel to write."""
     return Decoded(*(unwritten(pixels, dtype, device) for dtype in (wp.float32, wp.float32, wp.float32, wp.uint8)))
+
+
+def cropped(decoded: Decoded, first: int, count: int, *, device: str) -> Decoded:
+    """Return a copy of `count` pixels from `first` on, padded to whole packs.
+
+    Raises:
+        ArrayError: there are not as many.
+    """
+    have = decoded.coordinate.shape[0]
+    if first < 0 or count < 1 or first + count > have:
+        raise ArrayError(f"pixels {first} to {first + count} are asked for, there are {have}")
+    parts = [zeros(count, array.dtype, device) for array in decoded]
+    for part, array in zip(parts, decoded, strict=True):
+        wp.copy(part, array, src_offset=first, count=count)
+    return Decoded(*parts)
 
 
 @wp.func

@@ -43,7 +43,6 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
         down: whether the coordinate changes from row to row (a row code) rather than along a row.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
-        noise: of a reading.
 
     Returns:
         A new result; amplitude and status are those given; not synchronised on CUDA.

@@ -54,7 +54,6 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
     Args:
         values: [frames, pixels] or [frames, channels, pixels] float32, linear.
         saturated: [⌈frames / 8⌉, pixels] uint8 bits: frame f is bit f % 8 of byte f // 8; None when no reading saturates.
-        device: where.
 
     Returns:
         The frames. On the CPU nothing is copied when the pixels divide into packs and lie without gaps.

@@ -53,7 +53,6 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         extent: projector pixels along the axis.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
         wave_error_px: error of the place beyond noise, added to its deviation.
-        noise: of a reading.
 
     Returns:
         The coordinate on the device; not synchronised on CUDA. UNDECIDED: another wrap fits about as well. MULTIPATH: none fits;

@@ -31,7 +31,6 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
         period_px: of the phase.
         offset_rad: phase of the wave at place 0 in the first step.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
-        noise: of a reading.
 
     Returns:
         The phase as decode_phase gives it; amplitude and offset are those of the direct light; ambient light has cancelled.

@@ -62,7 +62,6 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         black: frame of the ambient light, or None: then it counts as light of the projector in telling SHADOWED pixels.
         response: the projector's light at even levels from 0 to 1, rising, which bends the waves; None: linear.
         wave_errors: of each period's phase beyond noise, radians, in order of first appearance; None: none.
-        noise: of a reading.
 
     Returns:
         Phases on the device, periods in order of first appearance; not synchronised on CUDA. SATURATED: a frame of the period
@@ -100,6 +99,29 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
     if wave is not None or wave_errors is not None:
         straighten(rows, bends, wave_errors or [0.0] * len(periods), device=device)
     return WrappedPhase(*rows, periods, frames.pixel_count, device)
+
+
+def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
+    """Return all periods of several phases of the same pixels, in the order given.
+
+    Raises:
+        ArrayError: nothing is given, or the pixels differ.
+    """
+    if not parts:
+        raise ArrayError("no phase is given: give one or more")
+    first = parts[0]
+    other = next((part.pixel_count for part in parts if part.pixel_count != first.pixel_count), None)
+    if other is not None:
+        raise ArrayError(f"one phase has {first.pixel_count} pixels, another {other}: decode the same frames")
+    periods = tuple(period for part in parts for period in part.periods_px)
+    joined = []
+    for field in ("phase", "amplitude", "offset", "sigma", "status"):
+        rows = [getattr(part, field)[row] for part in parts for row in range(len(part.periods_px))]
+        plane = unwritten(first.pixel_count, rows[0].dtype, first.device, rows=len(periods))
+        for row, values in enumerate(rows):
+            wp.copy(plane[row], values)
+        joined.append(plane)
+    return WrappedPhase(*joined, periods, first.pixel_count, first.device)
 
 
 def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:

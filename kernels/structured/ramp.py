@@ -47,7 +47,6 @@ def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None,
         black: frame of the ambient light; None: the images hold none.
         extent: projector pixels along the axis.
         response: [n] the projector's light at n even levels from 0 to 1, rising; None: linear.
-        noise: of a reading.
 
     Returns:
         The coordinate on the device; amplitude is half of the light; not synchronised on CUDA. SATURATED: a frame that is used

@@ -149,7 +149,6 @@ def straighten(rows: Sequence[wp.array], tables: Sequence[np.ndarray | None], er
         rows: phase, amplitude, offset, sigma and status, [periods, pixels] each, as in WrappedPhase.
         tables: of `phase_table`, one a period; None leaves the phases as they are.
         errors: of each period's phase beyond noise, radians, added to its deviation.
-        device: where.
     """
     plain = np.tile([0.0, 1.0, 1.0, 0.0], (BINS + 1, 1))
     given = np.stack([plain if table is None else table for table in tables])

@@ -77,7 +77,6 @@ def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str, al
         signal: [rows, cols] float32, the frame less its background; 0 where it is not to be looked at.
         along: "row": one centre a row, a u; "column": one a column, a v.
         noise: standard deviation of the signal where there is no stripe.
-        device: where.
         albedo: [rows, cols] float32, the root of the energy Σ signal² of each pixel over a sweep that this frame is part of, in
             proportion to its albedo; 0 where it is not known; None: nowhere.
         rival: part of the peak from which a second bright place on the line makes the stripe UNDECIDED; inf: it never does.

@@ -44,7 +44,7 @@ EMPTY = 1.0e30
 
 
 class Agreement(NamedTuple):
-    """What the tests found, on the device."""
+    """The findings of the tests, on the device."""
 
     turned: wp.array  # [pixels] uint8: 1 where the projector would see the back of the surface
     alone: wp.array  # [pixels] uint8: 1 where no neighbour of the row, or none of the column, can belong to its surface
@@ -63,7 +63,6 @@ def check_surface(depth: np.ndarray, sigma: np.ndarray, amplitude: np.ndarray, s
         solved: [rows, cols] bool, which of them count.
         x, y: [rows, cols] lines of sight (x, y, -1) of the camera frame, x right, y up.
         projector_from_camera: [3, 4], x right, y down, z forward of the projector.
-        device: where.
 
     Returns:
         The findings; not synchronised on CUDA. Pixels that are not solved have 0.

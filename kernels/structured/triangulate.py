@@ -186,7 +186,6 @@ def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Dec
         projector: size, lens and pose.
         near_m, far_m: range of depths outside which a result is OUT_OF_RANGE.
         max_residual_px: with both axes, how far the decoded place may lie from the point's; beyond, it is OUT_OF_RANGE.
-        device: where.
 
     Returns:
         Depth on the device; not synchronised on CUDA. OUT_OF_RANGE: behind camera or projector, outside the projector's image, or the

@@ -8,8 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import as_packs, pack_type
 from kernels.status import Status
-from kernels.tof.chi_squared import quantile, signal_limits
-from kernels.tof.continuous import Correlation
+from kernels.tof.continuous import Correlation, quantile, signal_limits
 from kernels.tof.modulation import radians_per_metre
 from kernels.tof.unwrap import Hypotheses
 

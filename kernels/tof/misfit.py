@@ -1,4 +1,4 @@
-"""What returns leave unexplained in their own bins: how much larger the residuals are than photon noise."""
+"""The misfit of returns: how much larger the residuals in their bins are than photon noise."""
 
 import numpy as np
 import warp as wp

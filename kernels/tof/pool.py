@@ -15,8 +15,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.tof.chi_squared import signal_limits
-from kernels.tof.continuous import Correlation
+from kernels.tof.continuous import Correlation, signal_limits
 from kernels.tof.modulation import radians_per_metre
 
 REACHES = (1, 2, 3)

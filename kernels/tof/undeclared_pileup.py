@@ -61,7 +61,6 @@ def estimate_pulses(counts: np.ndarray, pulse: Pulse, device: str, shape_of: Cal
     Args:
         counts: [pixel, bin] photons.
         pulse: shape of a return, if there is no pile-up.
-        device: where to run.
         shape_of: gives the pulse for histograms with pile-up and their counts.
         declared: number of pulses where it is known; it is tried alone.
 

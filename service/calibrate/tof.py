@@ -8,7 +8,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.tof.continuous import decode
-from kernels.tof.noise import estimate_noise
+from service.depth.continuous_wave import estimate_noise
 from service.depth.tof import solve_tof, z_per_range
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
@@ -16,10 +16,19 @@ from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
 from stage.capture import Capture
 from stage.files import resolved
-from stage.tof.calibration import Harmonics, TofCalibration, fit_harmonics, fit_line, fit_temperature, write_calibration
+from stage.tof.calibration import (
+    Harmonics,
+    Sweep,
+    SweepDistance,
+    TofCalibration,
+    fit_harmonics,
+    fit_line,
+    fit_temperature,
+    read_sweep,
+    write_calibration,
+)
 from stage.tof.frames import is_pulsed, read_correlations, read_source
 from stage.tof.source import SourcePath
-from stage.tof.sweep import Sweep, SweepDistance, read_sweep
 
 STEP_PIXELS = 400
 """Pixels of each step, evenly chosen: more do not improve the harmonics, which the number of steps limits."""

@@ -79,10 +79,10 @@ def _lp(request: LpImport) -> None:
 
 
 def _opencv_gray(request: OpencvGrayImport) -> None:
-    from stage.importers import opencv_gray
+    from stage.importers.patterns import import_opencv_gray
 
-    _print_path(opencv_gray.import_folder(request.source, request.folder, projector=request.projector, calibration=request.calibration,
-                                          unit_m=request.unit_m))
+    _print_path(import_opencv_gray(request.source, request.folder, projector=request.projector, calibration=request.calibration,
+                                   unit_m=request.unit_m))
 
 
 def _olat(request: OlatImport) -> None:
@@ -95,16 +95,16 @@ def _olat(request: OlatImport) -> None:
 
 
 def _photos(request: PhotosImport) -> None:
-    from stage.importers import photos
+    from stage.importers.olat import import_photos
 
-    _print(photos.import_folder(request.source, request.folder, selection=_selection(request), view=_view(request),
-                                color_space=request.color_space))
+    _print(import_photos(request.source, request.folder, selection=_selection(request), view=_view(request),
+                         color_space=request.color_space))
 
 
 def _near_lights(request: NearLightsImport) -> None:
-    from stage.importers import near_lights
+    from stage.importers.olat import import_near_lights
 
-    _print(near_lights.import_folder(
+    _print(import_near_lights(
         request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
         selection=_selection(request), view=_view(request), color_space=request.color_space))
 

@@ -42,7 +42,7 @@ ADVICE = {
     Status.ILL_POSED: "the projected coordinate hardly changes with depth: project columns from beside the camera, rows from above it",
     Status.UNSURE: "neighbours contradict each other, as in mirrors and where frames are declared wrongly: check the frames' patterns",
 }
-"""What most often is the cause of the commonest status."""
+"""The most frequent cause of each status, and what to do about it."""
 ENOUGH = 200
 """Number of solved pixels from which a usual residual is taken."""
 
@@ -54,7 +54,6 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
         solution: of projected patterns.
         residual_px: [rows, cols] of both axes; None with one axis.
         camera, projector: their geometry.
-        device: where to run.
 
     Returns:
         [rows, cols] float32, 0…1; 0 where there is no depth.

@@ -43,7 +43,7 @@ from stage.patterns.ramp import ramp_patterns
 
 
 class CodeRow(NamedTuple):
-    """What the commands need to know about one code."""
+    """The properties of one code that the commands need."""
 
     decoder: Callable[[AxisCodes], AxisDecoder | None]
     """Returns the decoder of an axis's frames, or None if they hold no such code."""

@@ -15,11 +15,10 @@ from kernels.structured.confirm import AROUND, confirm_stripes
 from kernels.structured.decoded import Decoded
 from kernels.structured.edges import REACH, refine_edges
 from kernels.structured.frames import NoiseModel
-from kernels.structured.join import join_periods
 from kernels.structured.kary import decode_kary
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
-from kernels.structured.phase import WrappedPhase, decode_phase, weights
+from kernels.structured.phase import WrappedPhase, decode_phase, join_periods, weights
 from kernels.structured.ramp import decode_ramp
 from kernels.structured.response import light_of, wave_error
 from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly, unwrap_range

@@ -17,8 +17,7 @@ from kernels.status import Status, refuse_unsure
 from service.depth.coordinates import DecodedSolution
 from service.depth.laser import solve_laser
 from service.depth.patterns import solve_patterns
-from service.depth.points import point_cloud
-from service.depth.solution import DepthSolution
+from service.depth.solution import DepthSolution, point_cloud
 from service.depth.stereo import solve_stereo
 from service.depth.tof import solve_tof
 from service.depth.two_cameras import solve_two_cameras
@@ -87,7 +86,6 @@ def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResul
 
     Args:
         request: what to measure and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input; nothing is written.

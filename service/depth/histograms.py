@@ -4,11 +4,9 @@ import math
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from kernels.status import SOLVED, Status
-from kernels.tof.count_scale import CountScale, estimate_count_scale
-from kernels.tof.fixed_pattern import pattern_bins, without_bins
-from kernels.tof.interlaced import interlaced
 from kernels.tof.misfit import misfit
 from kernels.tof.pileup import LiveCounts, correct_pileup, place, without_pileup
 from kernels.tof.pulse import Pulse, gaussian, measured
@@ -16,12 +14,110 @@ from kernels.tof.pulse_width import PulseShape, estimate_pulse
 from kernels.tof.returns import Returns, find_returns
 from kernels.tof.rivals import vote_on_returns
 from kernels.tof.undeclared_pileup import PulseCount, estimate_pulses
-from service.depth.range_image import RangeImage
+from service.depth.count_scale import CountScale, estimate_count_scale
+from service.depth.solution import RangeImage
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
 from stage.tof.calibration import TofCalibration
 from stage.tof.frames import Histograms
 from stage.tof.light_time import range_of_delay_m
+
+SAME_BIN = 1
+"""Bins by which the highest bin of a pixel may be off that of the pattern."""
+MOST_PIXELS = 0.95
+"""Part of the pixels whose highest bin is the pattern's."""
+EVEN = 0.3
+"""Largest robust relative deviation of the pattern's height over the pixels: surfaces differ more, in albedo and distance."""
+HIDDEN = 0.5
+"""Least part of the pixels that show a return elsewhere: without one, a single flat wall is all there is."""
+RETURN_SIGMAS = 6.0
+"""Standard deviations above the background from which a bin elsewhere is a return."""
+VARIED_BINS = 2.0
+"""Least standard deviation of the bins of these returns: what follows the pattern at one distance belongs to it."""
+RAISED = 1.1
+"""Ratio of the median pixel's count to the background up to which a bin is free of the pattern."""
+
+
+def pattern_bins(counts: np.ndarray) -> np.ndarray:
+    """Return the bins that hold a pattern which all pixels share, [bin] bool; none where there is no such pattern.
+
+    Args:
+        counts: [pixel, bin] photons.
+    """
+    bins = counts.shape[1]
+    none = np.zeros(bins, dtype=bool)
+    bright = counts[counts.sum(axis=1) > 0]
+    if len(bright) == 0:
+        return none
+    highest = bright.argmax(axis=1)
+    place = int(np.median(highest))
+    if (np.abs(highest - place) <= SAME_BIN).mean() < MOST_PIXELS:
+        return none
+    height = bright[:, max(place - SAME_BIN, 0) : place + SAME_BIN + 1].sum(axis=1)
+    low, middle, high = np.quantile(height, [0.16, 0.5, 0.84])
+    if 0.5 * (high - low) > EVEN * middle:
+        return none
+    typical = np.median(bright, axis=0)
+    level = np.median(typical)
+    raised = typical > RAISED * level
+    inside = none.copy()
+    inside[max(place - SAME_BIN, 0) : place + SAME_BIN + 1] = True
+    for step in (-1, 1):
+        i = place + step * (SAME_BIN + 1)
+        while 0 <= i < bins and raised[i]:
+            inside[i] = True
+            i += step
+    if inside.sum() > bins // 2:
+        return none
+    rest = np.where(inside, 0, bright)
+    background = np.median(bright[:, ~inside], axis=1)
+    there = rest.max(axis=1) > background + RETURN_SIGMAS * np.sqrt(np.maximum(background, 1))
+    if there.mean() < HIDDEN or rest[there].argmax(axis=1).std() < VARIED_BINS:
+        return none
+    return inside
+
+
+def without_bins(histograms: LiveCounts, bins: np.ndarray) -> LiveCounts:
+    """Return histograms in which these bins, [bin] bool, count as never open; waits for the device."""
+    device = str(histograms.counts.device)
+    kept = [np.where(bins[:, None], 0, array.numpy()) for array in (histograms.counts, histograms.live)]
+    return LiveCounts(*(wp.array(values, dtype=wp.float32, device=device) for values in kept), histograms.pulses)
+
+
+SAME_WIDTHS, OTHER_WIDTHS = 1.0, 2.0
+"""Differences of time, in pulse widths (and bins, where these are wider), up to which two pixels agree and from which they disagree."""
+LEAST_PART = 0.02
+"""Part of the pixels from which alternation is no chance and no thin object."""
+
+
+def interlaced(position: np.ndarray, there: np.ndarray, width: float) -> np.ndarray:
+    """Return where a pixel agrees with the second pixels on both sides and the ones between agree with each other alone, [rows, cols] bool.
+
+    Args:
+        position: [rows, cols] times in bins.
+        there: [rows, cols] bool, where there is one.
+        width: of the pulse, in bins.
+
+    Returns:
+        The pixels of both kinds, along rows or columns; none at all where fewer than LEAST_PART of the pixels are.
+    """
+    unit = max(width, 1.0)
+    found = np.zeros(position.shape, dtype=bool)
+    for axis in (0, 1):
+        times, present = np.moveaxis(position, axis, 0), np.moveaxis(there, axis, 0)
+        if len(times) < 5:
+            continue
+        shown = np.moveaxis(found, axis, 0)
+        near = [times[k : len(times) - 4 + k] for k in range(5)]
+        all_there = np.logical_and.reduce([present[k : len(times) - 4 + k] for k in range(5)])
+        same = ((np.abs(near[0] - near[2]) < SAME_WIDTHS * unit) & (np.abs(near[4] - near[2]) < SAME_WIDTHS * unit)
+                & (np.abs(near[1] - near[3]) < SAME_WIDTHS * unit))
+        other = (np.abs(near[1] - near[2]) > OTHER_WIDTHS * unit) & (np.abs(near[3] - near[2]) > OTHER_WIDTHS * unit)
+        comb = all_there & same & other
+        for k in range(1, 4):
+            shown[k : len(times) - 4 + k] |= comb
+    return found if found[there].size and found[there].mean() > LEAST_PART else np.zeros_like(found)
+
 
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
@@ -46,7 +142,6 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         near_m, far_m: the span of half paths; None: that of the histogram.
         limit: counts at or above it are a full counter.
         usable: [rows, cols] bool mask: the others decide on nothing.
-        device: where to run.
 
     Raises:
         ArrayError: the histograms hold nothing.

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.status import Status
-from kernels.structured.spot import find_spot, nearest_points
 from service.depth.solution import HALF_SURE, DepthSolution
-from service.depth.stripe_conflicts import contradicted
+from service.depth.spot import find_spot, nearest_points
 from service.depth.stripe_curves import WHOLE
-from service.depth.stripe_map import StripeSamples, stripe_map
+from service.depth.stripe_map import StripeSamples, contradicted, stripe_map
 from service.depth.stripes import Sweep, along_of, measure_stripe, stripe_signal
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -59,8 +58,6 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         capture: with laser frames; `off` or `black` frames of it are its ambient light.
         mask: [rows, cols] bool.
         request: its span of depths; depths outside are OUT_OF_RANGE.
-        device: where to run.
-        timings: told of every stage.
 
     Raises:
         StageError: a laser stands where it cannot, a frame is unreadable, or no frame shows a spot or stripe.

@@ -1,4 +1,4 @@
-"""What a sample of pixels tells of a whole capture under patterns: frames that are declared wrongly, and waves that the projector bends."""
+"""Checks of a capture under patterns by a sample of its pixels: frames that are declared wrongly, and waves that the projector bends."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -79,7 +79,7 @@ class Reading(NamedTuple):
     """One way to understand the frames."""
 
     words: str
-    """What would have to be so, and what to check."""
+    """The mistake that would explain it, and what to check."""
     patterns: Callable[[list[Pattern]], list[Pattern]]
     """Returns what the frames would show then."""
     mirrored: bool = False

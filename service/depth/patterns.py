@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
-from kernels.structured.decoded import Decoded
+from kernels.structured.decoded import Decoded, cropped
 from kernels.structured.frames import NoiseModel
-from kernels.structured.join import cropped
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
 from service.depth.codes import choose_decoder
@@ -72,8 +71,6 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         capture: with pattern frames.
         mask: [rows, cols] bool.
         request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
-        device: where to run.
-        timings: told of every stage.
 
     Returns:
         Depth; or the decoded coordinates alone, where the capture is not calibrated or where no decoded pixel has a depth.

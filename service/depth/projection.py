@@ -36,7 +36,6 @@ def make_patterns(request: PatternsRequest, progress: Progress | None = None) ->
 
     Args:
         request: code, projector, options, folder.
-        progress: told of every image.
 
     Raises:
         RequestError: an option that does not belong to the code, or that the code refuses.

@@ -93,7 +93,6 @@ class Readings(NamedTuple):
             saturated: [frames, pixels] bool; None when no reading saturates.
             columns: pixels of an image row.
             made: how white and black are made; None to leave them out.
-            device: where.
             exposure: [pixels] by which the values were multiplied; None: all by the same.
         """
         grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))

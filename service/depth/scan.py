@@ -7,13 +7,13 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
-from kernels.tof.count_scale import estimate_count_scale
 from kernels.tof.pileup import correct_pileup, place, without_pileup
 from kernels.tof.pulse_width import estimate_pulse
 from kernels.tof.returns import find_returns
 from kernels.tof.undeclared_pileup import estimate_pulses
+from service.depth.count_scale import estimate_count_scale
 from service.depth.histograms import pile_up_warning, scale_warnings
-from service.depth.points import srgb_bytes, white_of
+from service.depth.solution import srgb_bytes, white_of
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
@@ -51,7 +51,6 @@ def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
 
     Args:
         request: what to read and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input; nothing is written.

@@ -85,7 +85,6 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
 
     Args:
         request: what to separate and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: the capture has no frames for it, or they are not what they must be; nothing is written.

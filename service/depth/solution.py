@@ -7,7 +7,11 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from stage.camera import Camera
+from stage.colour import convert
+from stage.colour_spaces import linear_space
 from stage.depth_maps import DepthMaps
+from stage.depth_normals import depth_normals
+from stage.ply import PointCloud
 
 HALF_SURE = 1e-3
 """Standard deviation of the depth over the depth, at which confidence is one half."""
@@ -15,10 +19,10 @@ HALF_SURE = 1e-3
 
 @dataclass(kw_only=True)
 class PixelSolution:
-    """What every way of measuring says of each pixel, and of the whole scene."""
+    """The findings that every way of measuring has of each pixel, and of the whole scene."""
 
     method: str
-    """What was decoded, in words for the report."""
+    """The code or the kind of frames that was decoded, in words for the report."""
     status: np.ndarray  # [rows, cols] uint8
     confidence: np.ndarray | None = None  # [rows, cols] 0…1; None: from sigma
     least_confidence: float = 0.0
@@ -26,7 +30,7 @@ class PixelSolution:
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole scene: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What was found out on the way, for the report."""
+    """Facts that were found out on the way, for the report."""
 
     @property
     def solved(self) -> np.ndarray:
@@ -94,3 +98,70 @@ def statistics(values: np.ndarray) -> dict[str, float]:
         return {}
     low, middle, high = np.percentile(values.astype(np.float64), [5, 50, 95])
     return {"p05": float(f"{low:.6g}"), "median": float(f"{middle:.6g}"), "p95": float(f"{high:.6g}")}
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """Ranges along the rays, before correction and filters; pixels with a status of kernels.status.ESTIMATED have values that count."""
+
+    method: str
+    range_m: np.ndarray  # [pixel] float32
+    sigma_m: np.ndarray  # [pixel] float32
+    amplitude: np.ndarray  # [pixel] float32
+    confidence: np.ndarray  # [pixel] float32
+    status: np.ndarray  # [pixel] int32
+    facts: dict[str, Any]
+    least_confidence: float = 0.0
+    """Least confidence of a range that counts as solved, where the request names none."""
+    warnings: tuple[str, ...] = ()
+    """A sentence for each thing that does not fit on the whole scene."""
+
+
+WHITE_PERCENTILE = 99.0
+"""Percentile of the brightest channel that is shown as full white, so that a few highlights do not darken the cloud."""
+
+
+def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, normals: bool) -> PointCloud:
+    """Return one point for each solved pixel, row by row; or the measured places between pixels, if the method has them.
+
+    Args:
+        solution: of the whole image.
+        camera: of the capture.
+        color_space: of the capture's images.
+        normals: fit them too.
+    """
+    solved = solution.solved
+    if solution.points is not None and solution.pixels is not None:
+        kept = solved[tuple(solution.pixels.T)]
+        rows, cols = solution.pixels[kept].T
+        points = solution.points[kept]
+    else:
+        rows, cols = np.nonzero(solved)
+        x, y = camera.plane_coordinates()
+        depth = solution.depth[rows, cols].astype(np.float64)
+        spread = depth if camera.projection == "perspective" else 1.0
+        points = np.stack([x[rows, cols] * spread, y[rows, cols] * spread, -depth], axis=-1)
+    colours = display_colours(solution, color_space)[rows, cols]
+    found = depth_normals(solution.depth, solved, camera, sigma=solution.sigma)[rows, cols] if normals else None
+    return PointCloud(points.astype(np.float32), colours, found)
+
+
+def display_colours(solution: DepthSolution, color_space: str) -> np.ndarray:
+    """Return what the scene looks like under even light, its brightest one per cent white: [rows, cols, 3] uint8, sRGB."""
+    linear = solution.colour
+    if linear is None:
+        grey = np.zeros(solution.depth.shape, np.float32) if solution.amplitude is None else solution.amplitude
+        linear = np.repeat(grey[..., None], 3, axis=-1)
+    return srgb_bytes(linear, white_of(linear[solution.solved].max(axis=-1, initial=0.0)), linear_space(color_space))
+
+
+def white_of(seen: np.ndarray) -> float:
+    """Return the light that is shown as full white; 0 where nothing is seen."""
+    return float(np.percentile(seen, WHITE_PERCENTILE)) if seen.size else 0.0
+
+
+def srgb_bytes(linear: np.ndarray, white: float, color_space: str) -> np.ndarray:
+    """Return linear colours for display, [rows, cols, 3] uint8, sRGB, `white` as 255; middle grey if white is 0."""
+    shown = np.clip(linear / white, 0, 1) if white > 0 else np.full_like(linear, 0.5)
+    encoded = convert(np.ascontiguousarray(shown, dtype=np.float32), color_space, "srgb_texture")
+    return np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)

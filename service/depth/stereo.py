@@ -51,11 +51,11 @@ ADVICE = {
     Status.OUT_OF_RANGE: "the disparities reach the end of the range: check --near-m and --far-m",
     Status.UNSURE: "the two images differ too much: check the focus, the calibration, and that both images are of the same moment",
 }
-"""What most often is the cause of the commonest status."""
+"""The most frequent cause of each status, and what to do about it."""
 
 
 class PairDepth(NamedTuple):
-    """What one other camera says of the pixels of the camera."""
+    """Depths at the pixels of the camera, from one other camera."""
 
     depth: np.ndarray  # [rows, cols] float32 metres, 0 where there is none
     sigma: np.ndarray  # [rows, cols] float32 metres
@@ -71,8 +71,6 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
         capture: with stereo frames.
         mask: [rows, cols] bool.
         request: its noise and its span of depths; depths outside are OUT_OF_RANGE.
-        device: where to run.
-        timings: told of every stage.
 
     Raises:
         StageError: a calibration that cannot be, swapped images, nothing that matches, an unreadable frame.

@@ -143,7 +143,6 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
         images: of both cameras.
         least, most: the disparities that are considered.
         noise: of a reading before smoothing.
-        device: where to run.
 
     Yields:
         The count of rows that are done, and the disparity of the whole image, of which those rows are final.

@@ -19,8 +19,7 @@ from kernels.tof.modulation import common_range_m, require_span
 from kernels.tof.unwrap import END_SIGMAS
 from service.depth.continuous_wave import solve_correlations
 from service.depth.histograms import solve_histograms
-from service.depth.range_image import RangeImage
-from service.depth.solution import DepthSolution
+from service.depth.solution import DepthSolution, RangeImage
 from service.reporting.progress import Timings
 from service.requests.depth import TofFilter, TofOptions
 from stage.camera import Camera
@@ -41,8 +40,6 @@ def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = N
         near_m: nearest range; None: 0, pulsed: where the histogram begins.
         far_m: farthest range; None: as far as the frequencies tell apart, or the histogram reaches.
         calibration: in place of that file.
-        device: where to run.
-        timings: told of the stages.
 
     Returns:
         Depth, range, standard deviations of the depth, amplitude (mean over the frequencies; pulsed: photons of the return), confidence

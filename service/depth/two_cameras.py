@@ -38,8 +38,6 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
         beside: folder of the capture of the second camera, under the same patterns of the same projector.
         mask: [rows, cols] bool, of the first camera.
         request: its noise and its span of depths.
-        device: where to run.
-        timings: told of every stage.
 
     Raises:
         StageError: a pose is missing or the cameras stand at one place, or a code is incomplete.

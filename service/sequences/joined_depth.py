@@ -7,8 +7,7 @@ import numpy as np
 
 from stage.depth_maps import DepthMaps
 from stage.ply import PointCloud
-from stage.temporal.agreement import agree, noise_share
-from stage.temporal.recursion import Track, advance, begin
+from stage.temporal.agreement import Track, advance, agree, begin, noise_share
 
 
 @dataclass

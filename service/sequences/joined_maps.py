@@ -7,8 +7,7 @@ import numpy as np
 
 from stage.maps import SurfaceMaps
 from stage.spread import MAD_TO_SIGMA
-from stage.temporal.agreement import agree, noise_share
-from stage.temporal.recursion import Track, advance, begin
+from stage.temporal.agreement import Track, advance, agree, begin, noise_share
 
 LEAST_ALBEDO = 0.02
 """Reflectance below which the noise of albedo is that of this reflectance."""

@@ -1,1 +1,12 @@
-"""Import of captures in other layouts: one module for each format, with `import_folder(source, destination)`."""
+"""Import of captures in other layouts: a module for each format or family of formats, whose `import_…` functions write a capture.json.
+
+The functions share these arguments, and say only where they take them otherwise:
+
+    source       the folder of the images or arrays
+    destination  the folder of the capture; another folder than the source gets links to, or copies of, the images
+    selection    which images are frames; None: all but mask and ambient light
+    view         the camera; None: orthographic, of unknown scale
+    color_space  of the images; None: sRGB of 8-bit images, scene-linear of others
+
+Every function that reads or writes a file raises StorageError where the file system refuses.
+"""

@@ -17,7 +17,6 @@ def import_folder(source: Path, destination: Path) -> Path:
 
     Args:
         source: the folder of the object.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
 
     Returns:
         The path of the manifest.

@@ -19,13 +19,13 @@ T = TypeVar("T")
 
 
 class Guess(NamedTuple):
-    """What a folder seems to be."""
+    """The probable layout of a folder."""
 
     layout: str
     """In words: `an object of the DiLiGenT benchmark`."""
     reason: str
     assumed: tuple[str, ...]
-    """What the files do not say and the command assumes."""
+    """Assumptions of the command that the files do not tell."""
     command: str
     """The command to run; words in capitals are to be replaced."""
     then: str

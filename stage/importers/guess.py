@@ -1,4 +1,4 @@
-"""What the files of a folder seem to be, and the command that imports them; what files do not say stands in the command in capitals."""
+"""Guesses the layout of a folder and the command that imports it; what the files do not say stands in the command in capitals."""
 
 import shlex
 from collections import Counter
@@ -17,11 +17,11 @@ from stage.importers.layout import image_names, image_resolution, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
-from stage.importers.opencv_gray import gray_order
+from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
 from stage.importers.plane_table import NAMES as PLANES
 from stage.importers.plane_table import read_planes
-from stage.importers.procam_file import PROJECTOR_MATRIX, projector_size
 from stage.importers.raw_arrays import ArrayFiles
+from stage.importers.sequences import GrayStack
 from stage.importers.video import is_video
 from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.manifest import FILE_NAME
@@ -46,7 +46,6 @@ def guess(source: Path) -> Guess:
 
     Raises:
         ManifestError: nothing fits, or the folder is a capture already.
-        StorageError: the folder cannot be read.
     """
     with storage("read", source):
         names = tuple(natural_order(path.name for path in source.iterdir() if path.is_file() and not path.name.startswith(".")))
@@ -198,7 +197,7 @@ def _scanner(folder: Folder) -> Guess | None:
 
 def _gray(folder: Folder) -> Guess | None:
     count = len(folder.pictures)
-    sizes = [size for size in PROJECTORS if len(gray_order(*size)) == count]
+    sizes = [size for size in PROJECTORS if len(GrayStack().entries(size)) == count]
     if not sizes or not _steady(_sums(folder, folder.pictures[:-2], 2)):
         return None
     names = [f"{width}x{height}" for width, height in sizes]

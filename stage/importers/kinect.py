@@ -33,7 +33,7 @@ P0_BYTES = P0_HEADER_BYTES + 3 * (P0_TABLE_BYTES + 4)
 P0_RADIANS = 0.000031 * pi
 """Radians of one unit of the P0 tables."""
 SATURATED = 32767
-"""What the device writes for a reading that is beyond its range."""
+"""The value that the device writes for a reading beyond its range."""
 
 
 def import_folder(source: Path, destination: Path, *, packet: Path | None = None, p0: Path | None = None,
@@ -41,15 +41,12 @@ def import_folder(source: Path, destination: Path, *, packet: Path | None = None
     """Write a capture.json for a depth packet of a Kinect v2, and its nine images as .npy.
 
     Args:
-        source: the folder of the dump.
-        destination: the folder of the capture.
         packet: the packet; None: the only file of the size of a packet.
         p0: the response with the P0 tables; None: the only file with p0 in its name.
         view: the camera, as libfreenect2's IrCameraParams have it; None: orthographic.
 
     Raises:
         ManifestError: packet or tables are not there, or have another size; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     packet = packet or _only(source, "depth packet", "--packet", lambda path: path.stat().st_size in PACKET_BYTES)
     p0 = p0 or _only(source, "file of P0 tables", "--p0", lambda path: "p0" in path.name.lower() and path.stat().st_size >= P0_BYTES)
@@ -91,7 +88,6 @@ def decode(path: Path) -> np.ndarray:
 
     Raises:
         ManifestError: the file has another size than a packet.
-        StorageError: the file cannot be read.
     """
     content = inputs.read_bytes(path)
     if len(content) not in PACKET_BYTES:
@@ -114,7 +110,6 @@ def read_p0(path: Path) -> np.ndarray:
 
     Raises:
         ManifestError: the file is too short.
-        StorageError: the file cannot be read.
     """
     content = inputs.read_bytes(path)
     if len(content) < P0_BYTES:

@@ -7,10 +7,9 @@ import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
-from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_names, image_resolution, write_capture
 from stage.importers.plane_table import PlaneTable, read_planes
-from stage.importers.view import AMBIENT_WORDS, Selection, View, only_image, select, view_of_file
+from stage.importers.view import AMBIENT_WORDS, Axes, Selection, View, camera_from_table, describe, only_image, select, view_of_file
 from stage.manifest import SCHEMA
 
 OFF_WORDS = AMBIENT_WORDS | {"background", "off", "nolaser"}
@@ -25,8 +24,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
     """Write a capture.json for images under one laser plane each.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
         view: the camera, as far as options say it.
         camera: a file with its matrix; None: as `view` says.
         planes: the file of the planes; None: every frame gets a placeholder.
@@ -34,11 +31,9 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.
         unit_m: the metres in one unit of the planes; needed with `planes`.
         selection: which images are frames; None: all but the mask and the one without the laser.
-        color_space: of the images; None: sRGB of 8-bit images, scene-linear of others.
 
     Raises:
         ManifestError: the camera is not known, planes cannot be read or do not fit the images; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     given = selection or Selection()
     off = only_image(source, image_names(source), given.ambient, OFF_WORDS, "ambient")

@@ -1,6 +1,7 @@
 """The common parts of the importers: reading tables of numbers, placing images and arrays, and writing the manifest."""
 
 import io
+import json
 import os
 import re
 import shutil
@@ -21,11 +22,11 @@ from stage.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
 from stage.records import describe
 
 PREVIOUS_NAME = "capture.previous.json"
-"""What a capture.json that an import replaces by another is kept as."""
+"""The name under which a capture.json is kept that an import replaces by another."""
 
 
 class Imported(NamedTuple):
-    """What an importer wrote, and how it understood the folder."""
+    """The capture that an importer wrote, and how it understood the folder."""
 
     path: Path
     """The manifest."""
@@ -40,11 +41,7 @@ def natural_order(names: Iterable[str]) -> list[str]:
 
 
 def image_names(folder: Path) -> list[str]:
-    """Return the names of the images in a folder, in natural order; hidden files are left out.
-
-    Raises:
-        StorageError: the folder cannot be read.
-    """
+    """Return the names of the images in a folder, in natural order; hidden files are left out."""
     with storage("read", folder):
         return natural_order(path.name for path in folder.iterdir()
                              if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
@@ -58,7 +55,6 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 
     Raises:
         ManifestError: a row has another count of numbers, or a number is not finite; the message names file and line.
-        StorageError: the file cannot be read.
     """
     with storage("read", path):
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -74,6 +70,18 @@ def read_table(path: Path, columns: int) -> np.ndarray:
             raise ManifestError(f"{path}: line {number}: {line.strip()[:60]!r} is not {columns} numbers")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ManifestError: the file is no JSON.
+    """
+    try:
+        return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise ManifestError(f"{path}: is not JSON") from error
 
 
 def image_resolution(path: Path) -> tuple[int, int]:

@@ -4,16 +4,15 @@ The names S, Dir, Phi, mu and K are those of Quéau, Durix, Wu, Cremers, Lauze a
 Calibration and Numerical Solution", JMIV 2018, and of its program near_ps, whose file is `light.mat`.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import inputs
 from stage.calibration.opencv_file import lens, read_matrices
 from stage.camera import Distortion
 from stage.errors import ManifestError
+from stage.importers.layout import read_json
 from stage.mat_file import read_mat_arrays
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
@@ -25,7 +24,7 @@ IMAGES = ("image", "file", "filename", "name")
 CAMERA_MATRIX = ("K", "camera_matrix", "cameraMatrix", "mtx", "cam_K", "Kc", "M1", "K1", "cameraMatrix1")
 CAMERA_LENS = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "dist", "cam_kc", "kc", "D1", "distCoeffs1")
 MATLAB_CENTRE, OPENCV_CENTRE = -0.5, 0.5
-"""What is added to image coordinates of MATLAB, where the centre of the first pixel is 1, and of OpenCV, where it is 0."""
+"""Offsets that are added to image coordinates of MATLAB, where the centre of the first pixel is 1, and of OpenCV, where it is 0."""
 
 
 class LightRig(NamedTuple):
@@ -60,7 +59,6 @@ def read_rig(path: Path) -> LightRig:
 
     Raises:
         ManifestError: the file holds no positions, or its arrays do not fit each other.
-        StorageError: the file cannot be read.
     """
     fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
@@ -83,7 +81,6 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
 
     Raises:
         ManifestError: the file holds no matrix of a camera.
-        StorageError: the file cannot be read.
     """
     matlab = path.suffix.lower() == ".mat"
     matrices = read_mat_arrays(path) if matlab else read_matrices(path)
@@ -107,10 +104,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
 
 
 def _from_json(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if isinstance(data, dict) and isinstance(data.get("lights"), list):
         data = data["lights"]
     if isinstance(data, list):

@@ -1,6 +1,5 @@
 """Tables of lights: rows of CSV and text files, arrays of .mat and .npy files, and lists of JSON files."""
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError
+from stage.importers.layout import read_json
 from stage.mat_file import read_mat_arrays
 from stage.text import name_fault
 from stage.tof.frames import read_array
@@ -52,7 +52,6 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
 
     Raises:
         ManifestError: the file holds no table of lights, or its shape leaves open where the lights are; the message names file and line.
-        StorageError: the file cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix == ".mat":
@@ -75,7 +74,6 @@ def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
 
     Raises:
         ManifestError: the file holds something else.
-        StorageError: the file cannot be read.
     """
     if path.suffix.lower() == ".mat":
         name, values = _variable(path, read_mat_arrays(path), variable,
@@ -229,10 +227,7 @@ def _without_headings(path: Path, rows: list[tuple[int, list[str]]], run: Run | 
 
 
 def _from_json(path: Path, variable: str | None, run: Run | None) -> LightTable:
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if isinstance(data, dict):
         key = variable or next((key for key in LIST_KEYS if key in data), None)
         if variable is not None and variable not in data:

@@ -21,7 +21,6 @@ def import_folder(source: Path, destination: Path) -> Path:
 
     Args:
         source: the .lp file, or a folder with exactly one .lp file.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
 
     Returns:
         The path of the manifest.

@@ -1,5 +1,10 @@
-"""Import of images under one light each (OLAT) with a table of far lights, whose axes and sense are told and never guessed."""
+"""Import of images under one light each (OLAT): far lights in a table, near lights (LED rigs) in a file, or lights that nobody knows yet.
 
+The axes of a table, and whether its vectors point to the light, are told and never guessed. Files of near lights are those of near_ps.
+Lights that nothing tells get the placeholder of calibration.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,11 +12,16 @@ import numpy as np
 
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
-from stage.importers.axes import Axes, camera_from_table, describe
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, natural_order, write_capture
+from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
-from stage.importers.view import Selected, Selection, View, select
+from stage.importers.view import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
+from stage.light import PLACEHOLDER
+from stage.lighting import MEASURED_BY
 from stage.manifest import FILE_NAME, SCHEMA
+
+LEAST = 3
+"""The fewest images from which a normal can be solved, whoever measures the lights."""
 
 
 def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool, lights: Path | None = None, variable: str | None = None,
@@ -20,21 +30,15 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     """Write a capture.json for images under one far light each.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than the source gets links to, or copies of, the images.
         axes: where x, y and z of the table point, as seen by the camera.
         to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
         lights: the table; None: the only one in the folder.
         variable: of a .mat or JSON table, as `read_light_table` takes it.
         run: whether lights are rows or columns, as `read_light_table` takes it.
         strengths: a file with the strength of each light; None: that in the table, else equal.
-        selection: which images are frames; None: all but mask and ambient light.
-        view: the camera; None: orthographic, of unknown scale.
-        color_space: of the images; None: sRGB of 8-bit images, scene-linear of others.
 
     Raises:
         ManifestError: there is no table or more than one, images and lights do not fit, or a value is wrong; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     path = lights or find_table(source)
     table = read_light_table(path, variable=variable, run=run)
@@ -45,25 +49,94 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
         raise ManifestError(f"{strengths or path}: has {len(strength)} strengths, the table {len(names)} lights")
     directions = table.vectors @ camera_from_table(axes).T * (1 if to_light else -1)
     irradiance = np.ones((len(names), 3)) if strength is None else strength
-    space = color_space or color_space_of(source / names[0])
-    view = view or View()
-    frames: list[dict[str, Any]] = [
-        {"image": name, "light": {"type": "distant", "direction": list(direction), "irradiance": list(power)}}
-        for name, direction, power in zip(names, directions.tolist(), irradiance.tolist(), strict=True)]
-    frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
-    written = write_capture({
-        "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(image_resolution(source / names[0])),
-        "mask": chosen.mask, "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
-    }, path, destination, folder=source)
     behind = int((directions[:, 2] < 0).sum())
-    return Imported(written, (
+    lit = [{"type": "distant", "direction": list(direction), "irradiance": list(power)}
+           for direction, power in zip(directions.tolist(), irradiance.tolist(), strict=True)]
+    return _written(source, destination, path, names, lit, chosen, view, None, color_space, (
         ("lights", f"{len(names)} from {table.what}, {matched}"),
         ("axes", f"{describe(axes)}; vectors {'point to the light' if to_light else 'point along the rays, from the light'}"),
         ("side", f"{len(names) - behind} lights stand on the camera's side of the object, {behind} behind it"
                  + (": if they should not, --axes or --vectors is another" if behind else "")),
-        ("strength", "equal: relit calibrate intensity measures it" if strength is None else "as the table says, with an unknown factor"),
-        ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),
-        ("camera", view.describe()), *chosen.facts()))
+        ("strength", "equal: relit calibrate intensity measures it" if strength is None else "as the table says, with an unknown factor")))
+
+
+def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: float, lights: Path | None = None,
+                       camera: Path | None = None, selection: Selection | None = None, view: View | None = None,
+                       color_space: ColorSpaceName | None = None) -> Imported:
+    """Write a capture.json for images under one near light each.
+
+    Args:
+        axes: where x, y and z of the rig point, as seen by the camera, whose centre is their origin.
+        unit_m: the metres in one unit of the positions.
+        lights: the file of the rig; None: the only table in the folder.
+        camera: a file with the matrix of the camera; None: as `view` says.
+
+    Raises:
+        ManifestError: the rig or the camera cannot be read, images and lights do not fit, or a value is wrong; the message names the file.
+    """
+    path = lights or find_table(source)
+    rig = read_rig(path)
+    chosen = select(source, selection or Selection())
+    names, matched = match(path, LightTable(rig.names, rig.positions, rig.strengths, "rows", str(path)), chosen)
+    matrix = camera_from_table(axes)
+    positions = unit_m * rig.positions @ matrix.T
+    far = np.linalg.norm(positions, axis=1)
+    ahead = int((positions[:, 2] < 0).sum())
+    return _written(source, destination, path, names, _entries(rig, positions, matrix), chosen, view, camera, color_space, (
+        ("lights", f"{len(names)} near lights from {path}, {matched}"),
+        ("axes", f"{describe(axes)}, from the centre of the camera"),
+        ("places", f"{far.min():.3g} to {far.max():.3g} m from the camera, {ahead} of them in front of it: if they should not be, --axes "
+                   "or --unit-m is another"),
+        ("lobes", "all directions alike" if rig.anisotropy is None or not rig.anisotropy.any() else
+                  f"cos^mu about each light's direction, mu {rig.anisotropy.min():.3g} to {rig.anisotropy.max():.3g}"),
+        ("strength", "equal: relit calibrate intensity measures it" if rig.strengths is None else
+                     "as the file says, with an unknown factor")))
+
+
+def _entries(rig: LightRig, positions: np.ndarray, matrix: np.ndarray) -> list[dict[str, Any]]:
+    """Return the entries `light` of the manifest."""
+    entries: list[dict[str, Any]] = []
+    for index, position in enumerate(positions.tolist()):
+        entry: dict[str, Any] = {"type": "point", "position_m": position,
+                                 "intensity": [1.0, 1.0, 1.0] if rig.strengths is None else rig.strengths[index].tolist()}
+        if rig.anisotropy is not None and rig.anisotropy[index] > 0 and rig.axes is not None:
+            entry |= {"axis": (matrix @ rig.axes[index]).tolist(), "anisotropy": float(rig.anisotropy[index])}
+        entries.append(entry)
+    return entries
+
+
+def import_photos(source: Path, destination: Path, *, selection: Selection | None = None, view: View | None = None,
+                  color_space: ColorSpaceName | None = None) -> Imported:
+    """Write a capture.json for images whose lights are yet to be measured.
+
+    Raises:
+        ManifestError: there are fewer than three images; the message names the folder.
+    """
+    chosen = select(source, selection or Selection())
+    names = chosen.frames
+    if len(names) < LEAST:
+        raise ManifestError(f"{source}: has {len(names)} images: normals need {LEAST} or more")
+    lights = [PLACEHOLDER.model_dump(mode="json")] * len(names)
+    return _written(source, destination, source, names, lights, chosen, view, None, color_space, (
+        ("lights", f"{len(names)} placeholders, {names[0]} to {names[-1]}: relit solve --lights unknown finds them from the images; "
+                   f"{MEASURED_BY}"),))
+
+
+def _written(source: Path, destination: Path, table: Path, names: Sequence[str], lights: list[dict[str, Any]], chosen: Selected,
+             view: View | None, camera: Path | None, color_space: ColorSpaceName | None, facts: tuple[tuple[str, str], ...]) -> Imported:
+    """Write the capture of images under one light each, with the image of ambient light, and add what was understood of the images."""
+    space = color_space or color_space_of(source / names[0])
+    resolution = image_resolution(source / names[0])
+    view, camera_words = view_of_file(view or View(), camera, resolution)
+    frames: list[dict[str, Any]] = [{"image": name, "light": light} for name, light in zip(names, lights, strict=True)]
+    frames += [{"image": chosen.ambient, "light": {"type": "off"}}] if chosen.ambient else []
+    written = write_capture({
+        "schema": SCHEMA, "name": source.resolve().name, "color_space": space, "camera": view.entry(resolution), "mask": chosen.mask,
+        "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space), "frames": frames,
+    }, table, destination, folder=source)
+    return Imported(written, (
+        *facts, ("colour", space + ("" if color_space else ", by the depth of the images: --color-space says another")),
+        ("camera", camera_words), *chosen.facts()))
 
 
 def find_table(source: Path) -> Path:
@@ -71,7 +144,6 @@ def find_table(source: Path) -> Path:
 
     Raises:
         ManifestError: there is none, or more than one.
-        StorageError: the folder cannot be read.
     """
     with storage("read", source):
         found = natural_order(path.name for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.name != FILE_NAME

@@ -6,14 +6,70 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+from stage.calibration.opencv_file import camera_from_projector, lens, pick, read_matrices
+from stage.camera import Distortion
 from stage.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
-from stage.importers.procam_file import camera_and_projector, projector_size
 from stage.importers.sequences import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
 from stage.importers.view import MASK_WORDS, only_image
 from stage.manifest import SCHEMA
+
+CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc")
+CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc")
+PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2", "Kp")
+PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2", "kp")
+ROTATION, TRANSLATION = ("R", "rotation", "roatation", "Rp"), ("T", "translation", "t", "Tp")
+"""The names under which calibration files hold these matrices and vectors, in order of preference; one common tool misspells, and those
+with a small p or c at the end are SLStudio's."""
+CAMERA_SIZE, PROJECTOR_SIZE = ("frameWidth", "frameHeight"), ("screenResX", "screenResY")
+"""The names of the image sizes in SLStudio's files."""
+PIXEL_CENTRE = 0.5
+"""The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
+
+
+def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
+    """Return the camera and the projector of the manifest from an OpenCV calibration file.
+
+    Raises:
+        ManifestError: a matrix is missing or invalid, or the file is of images of another size.
+    """
+    found = read_matrices(path)
+    rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
+    translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
+    pose = camera_from_projector(rotation, translation)
+    entries = {}
+    for what, matrix, coefficients, sides, size in (
+            ("camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
+            ("projector", PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
+        given = _size(found, sides)
+        if given is not None and given != tuple(size):
+            raise ManifestError(f"{path}: is of a {what} of {given[0]}x{given[1]} px, this one has {size[0]}x{size[1]}")
+        k = pick(found, matrix, path, f"matrix of the {what}", shape=(3, 3))
+        known = any(name in found for name in coefficients)
+        glass = lens(pick(found, coefficients, path, "distortion"), path, what) if known else Distortion(model="brown_conrady")
+        entries[what] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
+                         "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
+    return {"camera": {"projection": "perspective", **entries["camera"]},
+            "projector": {**entries["projector"], "camera_from_projector": pose.tolist()}}
+
+
+def projector_size(path: Path) -> tuple[int, int] | None:
+    """Return the width and height of the projector in a calibration file; None where it does not say them.
+
+    Raises:
+        ManifestError: the file cannot be parsed.
+    """
+    return _size(read_matrices(path), PROJECTOR_SIZE)
+
+
+def _size(found: dict[str, Any], names: tuple[str, str]) -> tuple[int, int] | None:
+    sides = [found[name] for name in names if name in found and found[name].size == 1]
+    if len(sides) < 2 or not all(float(side.item()).is_integer() and side.item() > 0 for side in sides):
+        return None
+    return int(sides[0].item()), int(sides[1].item())
+
 
 LINEAR: ColorSpaceName = "lin_rec709_scene"
 
@@ -55,7 +111,6 @@ def import_gray(source: Path, destination: Path, *, pictures: PatternImages, gra
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     return _write(source, destination, pictures, gray.entries(pictures.projector), ())
 
@@ -65,8 +120,6 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         pictures: the frames of the phases, and the rig.
         phase: how they were taken.
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
@@ -77,7 +130,6 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     extra: list[tuple[str, Entry]] = []
     if gray_images is not None:
@@ -100,8 +152,6 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
     """Write a capture.json for the images of a scanning program, with the calibration that it wrote.
 
     Args:
-        source: the folder of the images.
-        destination: the folder of the capture; another folder than `source` gets links to, or copies of, the images.
         calibration: its calibration file.
         codec: one of CODECS.
         axes: column, row or both: what was coded.
@@ -111,13 +161,47 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
 
     Raises:
         ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     size = projector or projector_size(calibration)
     if size is None:
         raise ManifestError(f"{calibration}: does not say how many pixels the projector has: give --projector")
     pictures = PatternImages(projector=size, images=images, calibration=calibration, unit_m=unit_m)
     return _write(source, destination, pictures, CODECS[codec](size, axes), (), shifted=codec in HALF_PIXEL)
+
+
+def import_opencv_gray(source: Path, destination: Path, *, projector: tuple[int, int], calibration: Path | None = None,
+                       unit_m: float = 1.0) -> Path:
+    """Write a capture.json for images in the order of OpenCV's GrayCodePattern: columns, rows, white, black.
+
+    Args:
+        source: the folder of the images, which are taken in the natural order of their names: 2 before 10.
+        projector: the width and height of the projector in pixels, which determine the count of bits.
+        calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`, and
+            the manifest has the size of the projector alone.
+        unit_m: the metres in one unit of T.
+
+    Returns:
+        The path of the manifest.
+
+    Raises:
+        ManifestError: the count of images does not fit the projector, or the calibration file lacks a matrix.
+    """
+    names = image_names(source)
+    patterns = GrayStack().entries(projector)
+    if len(names) != len(patterns):
+        raise ManifestError(f"{source}: holds {len(names)} images, a projector of {projector[0]}x{projector[1]} px takes {len(patterns)}: "
+                            "columns and rows with inverses, white, black")
+    resolution = image_resolution(source / names[0])
+    data: dict[str, Any] = {
+        "schema": SCHEMA, "name": source.resolve().name,
+        "color_space": "lin_rec709_scene",
+        "camera": {"projection": "orthographic", "resolution": resolution},
+        "projector": {"resolution": projector},
+    }
+    if calibration is not None:
+        data |= camera_and_projector(calibration, resolution, projector, unit_m)
+    data["frames"] = [{"image": name, "pattern": pattern} for name, pattern in zip(names, patterns, strict=True)]
+    return write_capture(data, source / names[0], destination)
 
 
 def _slstudio_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:

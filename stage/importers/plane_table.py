@@ -1,16 +1,15 @@
 """Planes of light in files: rows of coefficients or of a point and a normal, and entries of calibration files."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import inputs
 from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError, storage
 from stage.images import SUFFIXES as IMAGE_SUFFIXES
+from stage.importers.layout import read_json
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
 
@@ -20,7 +19,7 @@ NORMALS, DISTANCES, POINTS = ("normal", "normals", "n"), ("distance", "d", "offs
 """Names of the parts of one plane, or of all."""
 TEXT = (".csv", ".txt", ".tsv", ".dat")
 FORMS = {"zero": "a x + b y + c z + d = 0", "equals": "a x + b y + c z = d"}
-"""What four coefficients of a plane mean."""
+"""Meanings of the four coefficients of a plane."""
 
 
 class PlaneTable(NamedTuple):
@@ -63,7 +62,6 @@ def read_planes(path: Path) -> PlaneTable:
 
     Raises:
         ManifestError: there are no planes, or a row is no four or six numbers.
-        StorageError: the file cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:
@@ -108,10 +106,7 @@ def _from_text(path: Path) -> PlaneTable:
 
 def _objects(path: Path) -> PlaneTable | None:
     """Return the planes of a list of objects in a JSON file; None where it holds something else."""
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if isinstance(data, dict):
         data = next((data[name] for name in NAMES if isinstance(data.get(name), dict | list)), data)
     planes: list[Any] = [data] if isinstance(data, dict) else data if isinstance(data, list) else []

@@ -1,6 +1,5 @@
 """Arrays as sensors and programs write them: .npy, .npz, .mat, .json and raw .bin files."""
 
-import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError, StorageError, storage
-from stage.importers.layout import natural_order
+from stage.importers.layout import natural_order, read_json
 from stage.mat_file import read_mat_arrays
 from stage.tof.frames import read_array
 
@@ -41,7 +40,6 @@ class ArrayFiles:
 
         Raises:
             ManifestError: there is none.
-            StorageError: the folder cannot be read.
         """
         with storage("read", folder):
             found = natural_order(
@@ -58,7 +56,6 @@ class ArrayFiles:
         Raises:
             ManifestError: the file lacks a variable, holds several, or needs a type and a size; the message names the file.
             ImageError: a .npy file is damaged.
-            StorageError: the file cannot be read.
         """
         suffix = path.suffix.lower()
         if suffix == ".npy":
@@ -66,7 +63,7 @@ class ArrayFiles:
         if suffix in RAW:
             return [self._raw(path)]
         if suffix == ".json":
-            data = _json(path)
+            data = read_json(path)
             return [_at(path, data, name) for name in self.variables or ("",)]
         arrays = _npz(path) if suffix == ".npz" else read_mat_arrays(path)
         return [arrays[name] for name in _chosen(path, arrays, self.variables)]
@@ -109,13 +106,6 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
         raise
     except (ValueError, KeyError, EOFError, OSError, RuntimeError, BadZipFile, zlib.error, MemoryError) as error:
         raise ManifestError(f"{path}: is no whole .npz file of numbers") from error
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
 
 
 def _at(path: Path, data: Any, place: str) -> np.ndarray:

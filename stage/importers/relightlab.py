@@ -8,15 +8,13 @@ is `imageWidth`.
 Source: the program's Project and Dome classes (Visual Computing Lab, ISTI-CNR).
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stage import inputs
 from stage.errors import ManifestError, storage
-from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, write_capture
+from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, read_json, write_capture
 from stage.importers.view import Selection, select
 from stage.manifest import SCHEMA
 from stage.text import name_fault
@@ -36,7 +34,6 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
 
     Raises:
         ManifestError: the file cannot be read, an image has no light, or lights and images do not fit; the message names the file.
-        StorageError: a file cannot be read or written.
     """
     path = _find(source)
     data = _read(path)
@@ -103,10 +100,7 @@ def _find(source: Path) -> Path:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: is not JSON") from error
+    data = read_json(path)
     if not isinstance(data, dict):
         raise ManifestError(f"{path}: must hold one JSON object")
     return data

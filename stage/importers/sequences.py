@@ -16,9 +16,9 @@ Entry = dict[str, Any]
 """The entry `pattern` of a frame of the manifest."""
 
 PARTS = ("columns", "rows", "white", "black")
-"""What a sequence of a Gray code consists of."""
+"""The parts of a sequence of a Gray code."""
 LOOPS = ("axis", "period", "step")
-"""What the order of a stack of phases consists of."""
+"""The loops that the order of a stack of phases names."""
 AXIS_OF = {"columns": "column", "rows": "row"}
 
 
@@ -93,7 +93,7 @@ class PhaseStack:
     """Those along the rows; None: the same."""
     steps: int
     order: tuple[str, ...] = LOOPS
-    """What changes slowest first: of LOOPS."""
+    """The loops, of LOOPS, the one that changes slowest first."""
     advancing: bool = True
     """Whether the pattern moves to larger columns from step to step (minus in the formula); else plus."""
     offset_deg: float = 0.0

@@ -27,7 +27,7 @@ class Plane(NamedTuple):
     name: str
     """The file in the capture."""
     made: np.ndarray | None
-    """What the file holds where it is made: [rows, cols]; None: the file is there."""
+    """The values of a file that is written: [rows, cols]; None: the file is there."""
     shape: tuple[int, int]
     """Rows and columns."""
 
@@ -38,7 +38,6 @@ def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequ
     """Write a capture.json for correlation images of a continuous-wave camera.
 
     Args:
-        source: the folder of the arrays or images.
         destination: the folder of the capture. Files of one image each are placed there; images of other files are written as .npy.
         frequencies_hz: the modulation frequencies, in the order of the images.
         phases_deg: the reference phases δ of the images of a frequency, in their order.
@@ -47,11 +46,10 @@ def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequ
         arrays: which files, and what they do not say themselves.
         planes: `first` or `last`: where the images are counted in arrays of three dimensions; None: as their shape says.
         source_m: the place of the light source; None: at the camera.
-        view: the camera; None: orthographic.
 
     Raises:
         ManifestError: there are more or fewer images than frequencies times phases, or they differ in size; the message names the file.
-        ImageError, StorageError: a file cannot be read or written.
+        ImageError: a file cannot be read.
     """
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
@@ -104,11 +102,10 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
         bins: `first` or `last`: where the bins are counted.
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.
-        view: the camera; None: orthographic.
 
     Raises:
         ManifestError: an array is no histogram of pixels, or sizes differ; the message names the file.
-        ImageError, StorageError: a file cannot be read or written.
+        ImageError: a file cannot be read.
     """
     arrays = arrays or ArrayFiles()
     folder, names = (source.parent, [source.name]) if source.is_file() else (source, arrays.names(source))

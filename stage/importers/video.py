@@ -47,9 +47,9 @@ class VideoFrames(NamedTuple):
 
     folder: Path
     sentence: str
-    """What was read, for the person who asked."""
+    """Which frames were read, in words for the user."""
     assumed: tuple[str, ...]
-    """What the manifest says about it, as in its entry `assumed`."""
+    """Sentences for the entry `assumed` of the manifest."""
 
 
 def is_video(path: Path) -> bool:

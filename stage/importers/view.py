@@ -1,10 +1,12 @@
-"""What an importer is told of the camera and of the images, and the entries of the manifest that follow from it."""
+"""The options of importers about camera, axes and images, and the entries of the manifest that follow from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from stage.camera_raw import path_is_raw
 from stage.errors import ManifestError
@@ -102,7 +104,6 @@ def select(folder: Path, selection: Selection) -> Selected:
 
     Raises:
         ManifestError: there is no image, an image that was named does not exist, or more than one could be the mask.
-        StorageError: the folder cannot be read.
     """
     names = image_names(folder)
     mask = only_image(folder, names, selection.mask, MASK_WORDS, "mask")
@@ -154,3 +155,37 @@ def only_image(folder: Path, names: list[str], given: str | None, words: frozens
     if len(found) > 1:
         raise ManifestError(f"{folder}: {found[0]} and {found[1]} both look like the {what}: name it with --{what}")
     return found[0] if found else None
+
+
+WAYS: dict[str, tuple[int, int, int]] = {"right": (1, 0, 0), "left": (-1, 0, 0), "up": (0, 1, 0), "down": (0, -1, 0),
+                                         "towards": (0, 0, 1), "away": (0, 0, -1)}
+"""The direction of an axis as seen by the camera → its unit vector in the camera frame; `away` is where the camera looks."""
+
+Axes = tuple[str, str, str]
+"""Where x, y and z of a table point, each one of WAYS."""
+CAMERA: Axes = ("right", "up", "towards")
+"""The axes of the camera frame, which OpenGL has too."""
+OPENCV: Axes = ("right", "down", "away")
+
+
+def camera_from_table(axes: Axes) -> np.ndarray:
+    """Return the matrix that takes vectors of a table to the camera frame.
+
+    Returns:
+        [3, 3] float64 for column vectors; it mirrors when the axes are left-handed.
+
+    Raises:
+        ManifestError: two axes lie on one line.
+    """
+    matrix = np.array([WAYS[way] for way in axes], dtype=np.float64).T
+    if np.linalg.matrix_rank(matrix) < 3:
+        raise ManifestError(f"--axes {','.join(axes)}: two of them lie on one line: give one of right, left, one of up, down and one of "
+                         "towards, away")
+    return matrix
+
+
+def describe(axes: Axes) -> str:
+    """Return the axes as words: `x right, y down, z away from the camera (right-handed)`."""
+    words = {"towards": "towards the camera", "away": "away from the camera"}
+    hand = "right" if np.linalg.det(camera_from_table(axes)) > 0 else "left"
+    return ", ".join(f"{name} {words.get(way, way)}" for name, way in zip("xyz", axes, strict=True)) + f" ({hand}-handed)"

@@ -1,4 +1,4 @@
-"""What all codes share: the axis along which a code varies, uniform frames, and how many digits number the stripes."""
+"""Parts that all codes share: the axis along which a code varies, uniform frames, and how many digits number the stripes."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal

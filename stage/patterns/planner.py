@@ -35,7 +35,7 @@ class Rig(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What one axis of a code costs and gives."""
+    """The cost and the precision of one axis of a code."""
 
     name: str
     minimum: int

@@ -1,1 +1,4 @@
-"""Time of flight: raw frames, calibration tables, laser scans with their tracks, and a simulator of raw frames."""
+"""Time of flight: raw frames, calibration tables, laser scans with their tracks, and a simulator of raw frames.
+
+Every function that reads or writes a file raises StorageError where the file system refuses.
+"""

@@ -1,6 +1,7 @@
 """The calibration of a time-of-flight camera, schema relit.tof/1 (noise, wiggling, offset, drift, pulse), and its fits."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -9,7 +10,7 @@ from pydantic import Field, model_validator
 
 from stage.errors import CalibrationError
 from stage.files import write_text
-from stage.model import NotNegative, Positive, Strict
+from stage.model import NotNegative, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.light_time import SPEED_OF_LIGHT
 
@@ -115,7 +116,6 @@ def read_calibration(path: str | Path) -> TofCalibration:
 
     Raises:
         ManifestError: a field is wrong; the message names file and field.
-        StorageError: the file cannot be read.
     """
     return read_record(path, TofCalibration, SCHEMA)
 
@@ -200,3 +200,48 @@ def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Tem
     reference = float(temperature_c.mean())
     slope, level = np.polyfit(temperature_c - reference, error_m, 1)
     return Temperature(reference_c=reference, metres_per_c=float(slope)), float(level)
+
+
+SWEEP_SCHEMA = "relit.tof-sweep/1"
+
+
+class SweepDistance(Strict):
+    """The capture of the target at one distance."""
+
+    capture: Text
+    """The folder of the capture, relative to the folder of the sweep; the mask of the capture is the target."""
+    depth_m: Positive
+    """The distance from the camera to the plane of the target along the optical axis, metres."""
+    temperature_c: float | None = None
+
+
+class Sweep(Strict):
+    """The captures of a sweep, in any order."""
+
+    schema_: Literal["relit.tof-sweep/1"] = Field(alias="schema")
+    steps: Annotated[tuple[SweepDistance, ...], Field(min_length=2)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len({step.temperature_c is None for step in self.steps}) > 1:
+            raise ValueError("steps: temperature_c is missing for some: give it for every step or for none")
+        return self
+
+    @property
+    def commonest_temperature_c(self) -> float | None:
+        """The temperature of most captures, at which the wiggling is measured, so that drift is not mistaken for wiggling."""
+        return Counter(step.temperature_c for step in self.steps).most_common(1)[0][0]
+
+    @property
+    def has_drift(self) -> bool:
+        """True when the captures have more than one temperature."""
+        return len({step.temperature_c for step in self.steps}) > 1
+
+
+def read_sweep(path: str | Path) -> Sweep:
+    """Read a relit.tof-sweep/1 file.
+
+    Raises:
+        ManifestError: a field is wrong; the message names file and field.
+    """
+    return read_record(path, Sweep, SWEEP_SCHEMA)

@@ -193,7 +193,6 @@ def read_array(path: Path) -> np.ndarray:
 
     Raises:
         ImageError: the file is no whole .npy file, or not of real numbers; the message names the file.
-        StorageError: the file cannot be read.
     """
     with inputs.opened(path) as source:
         array_shape(path, source.file, source.max_pixels)

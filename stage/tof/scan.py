@@ -2,22 +2,71 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from stage.errors import ImageError, ManifestError, storage
+from stage.errors import CalibrationError, ImageError, ManifestError, storage
 from stage.frames import Transform
 from stage.model import Count, Positive, Strict, Text
 from stage.records import read_record
 from stage.tof.frames import read_array
-from stage.tof.track import Pose, Track, poses_at
 
 FILE_NAME = "scan.json"
 SCHEMA = "relit.scan/1"
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 COLUMNS = "time_s, azimuth_rad, elevation_rad"
+
+
+class Pose(Strict):
+    """The pose of the platform at one time."""
+
+    time_s: float
+    world_from_platform: Transform
+
+
+def _ascending(poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
+    for index in range(1, len(poses)):
+        if not poses[index].time_s > poses[index - 1].time_s:
+            raise ValueError(f"is out of order: pose {index} is not after pose {index - 1}")
+    return poses
+
+
+Track = Annotated[tuple[Pose, ...], Field(min_length=1), AfterValidator(_ascending)]
+"""Poses in order of time; a single pose means a platform that stands still."""
+
+
+def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Interpolate the poses of a track at given times: positions linearly, rotations by slerp.
+
+    Args:
+        track: the poses in order of time.
+        times_s: [n] seconds, on the clock of the track.
+
+    Returns:
+        rotation [n, 3, 3] and translation [n, 3] of world_from_platform, and covered [n] bool, which is False before the first and after
+        the last pose. The nearest pose is returned there; a single pose covers all times.
+
+    Raises:
+        CalibrationError: a time is not finite.
+
+    Source:
+        Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985.
+    """
+    if not np.isfinite(times_s).all():
+        raise CalibrationError("a shot has a time that is not finite")
+    known = np.array([pose.time_s for pose in track])
+    matrices = np.array([pose.world_from_platform for pose in track], dtype=np.float64)
+    if len(track) == 1:
+        return (np.broadcast_to(matrices[0, :3, :3], (len(times_s), 3, 3)), np.broadcast_to(matrices[0, :3, 3], (len(times_s), 3)),
+                np.ones(len(times_s), dtype=bool))
+    from scipy.spatial.transform import Rotation, Slerp  # the API reads scans, and needs no poses
+
+    turns = Rotation.from_matrix(matrices[:, :3, :3])
+    within = np.clip(times_s, known[0], known[-1])
+    translation = np.stack([np.interp(within, known, values) for values in matrices[:, :3, 3].T], axis=1)
+    return Slerp(known, turns)(within).as_matrix(), translation, within == times_s
 
 
 class Waveforms(Strict):
@@ -73,7 +122,6 @@ def read_scan(path: str | Path) -> Shots:
     Raises:
         ManifestError: scan.json is missing or wrong; the message names the field.
         ImageError: an array is unreadable or has the wrong shape; the message names the file.
-        StorageError: a file cannot be read.
     """
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given

@@ -9,7 +9,7 @@ from stage.correction import Correction
 from stage.errors import ImageError, ManifestError
 from stage.exif import Exposure
 from stage.images import read_header, read_pixels
-from stage.importers import photos
+from stage.importers.olat import import_photos
 from stage.importers.view import Selection
 from stage.orientation import TURNS, upright
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_image
@@ -163,8 +163,8 @@ def test_imports_take_raw_as_linear_and_ask_which_of_two_recordings(tmp_path):
         write_dng(tmp_path / f"IMG_{index}.DNG", np.full((ROWS, COLS), 3000, np.uint16))
         write_image(tmp_path / f"IMG_{index}.JPG", np.full((ROWS, COLS, 3), 90, np.uint8))
     with pytest.raises(ManifestError, match=r"IMG_0\.DNG and IMG_0\.JPG are one photograph: choose which are used, --images '\*\.DNG'"):
-        photos.import_folder(tmp_path, tmp_path)
-    photos.import_folder(tmp_path, tmp_path, selection=Selection(images="*.DNG"))
+        import_photos(tmp_path, tmp_path)
+    import_photos(tmp_path, tmp_path, selection=Selection(images="*.DNG"))
     capture = Capture.open(tmp_path)
     assert capture.manifest.color_space == "lin_rec709_scene"
     assert [frame.image for frame in capture.manifest.frames] == ["IMG_0.DNG", "IMG_1.DNG", "IMG_2.DNG"]

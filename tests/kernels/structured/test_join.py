@@ -5,10 +5,9 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.structured.decoded import Decoded
+from kernels.structured.decoded import Decoded, cropped
 from kernels.structured.frames import NoiseModel, upload
-from kernels.structured.join import cropped, join_periods
-from kernels.structured.phase import decode_phase
+from kernels.structured.phase import decode_phase, join_periods
 
 EIGHT_BIT = NoiseModel(0.003, 1.0e-4)
 """Noise of an ordinary camera of eight bits whose pixels hold ten thousand electrons, as parts of full scale."""

@@ -5,8 +5,8 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.structured.spot import find_spot, nearest_points
 from kernels.structured.stripe import find_stripe, plane_depths
+from service.depth.spot import find_spot, nearest_points
 
 
 def spot(u, v, width, shape=(60, 80)):

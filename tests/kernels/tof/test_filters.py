@@ -8,10 +8,9 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof import bilateral
 from kernels.tof.bilateral import smooth
-from kernels.tof.continuous import Noise, decode
+from kernels.tof.continuous import Noise, decode, sample_harmonics, straighten
 from kernels.tof.flying import mark_flying
-from kernels.tof.noise import estimate_noise
-from kernels.tof.wiggling import sample_harmonics, straighten
+from service.depth.continuous_wave import estimate_noise
 from tests.reference import tof
 
 

@@ -5,15 +5,14 @@ import pytest
 from scipy.special import ndtr
 
 from kernels.errors import ArrayError
-from kernels.tof.count_scale import estimate_count_scale
-from kernels.tof.fixed_pattern import pattern_bins
-from kernels.tof.interlaced import interlaced
 from kernels.tof.misfit import misfit
 from kernels.tof.pileup import place, without_pileup
 from kernels.tof.pulse import gaussian, with_tail
 from kernels.tof.returns import find_returns
 from kernels.tof.rivals import vote_on_returns
 from kernels.tof.undeclared_pileup import estimate_pulses
+from service.depth.count_scale import estimate_count_scale
+from service.depth.histograms import interlaced, pattern_bins
 from tests.reference import tof
 
 BINS = 64

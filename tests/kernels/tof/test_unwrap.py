@@ -8,8 +8,7 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.tof.continuous import Noise, decode
 from kernels.tof.decide import decide
-from kernels.tof.unwrap import decay, unwrap
-from kernels.tof.vote import vote
+from kernels.tof.unwrap import decay, unwrap, vote
 from tests.reference import tof
 
 FAR = 14.98

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from stage.tof.calibration import TofCalibration
+from stage.tof.calibration import Sweep, TofCalibration
 from stage.tof.scan import Scan
-from stage.tof.sweep import Sweep
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "time_of_flight.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w*)\n(.*?)```", DOCS, re.DOTALL)

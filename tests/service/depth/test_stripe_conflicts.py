@@ -3,8 +3,7 @@
 import numpy as np
 
 from kernels.status import Status
-from service.depth.stripe_conflicts import contradicted
-from service.depth.stripe_map import StripeSamples
+from service.depth.stripe_map import StripeSamples, contradicted
 from stage.camera import Camera
 
 CAMERA = Camera(projection="perspective", resolution=(200, 40), focal_px=(300.0, 300.0))

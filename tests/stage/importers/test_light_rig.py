@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from stage.capture import Capture
 from stage.errors import ManifestError
-from stage.importers import near_lights, olat, relightlab
+from stage.importers import olat, relightlab
 from stage.importers.light_rig import read_camera_matrix
 from stage.importers.view import View
 from tests.scenes.captures import files_in, write_image
@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 
 def lights_of(folder, **choices):
-    near_lights.import_folder(folder, folder, **{**CHOICES, **choices})
+    olat.import_near_lights(folder, folder, **{**CHOICES, **choices})
     return [frame.light for frame in Capture.open(folder).manifest.frames]
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from stage.capture import Capture
 from stage.errors import ManifestError
-from stage.importers.opencv_gray import gray_order, import_folder
+from stage.importers.patterns import import_opencv_gray as import_folder
+from stage.importers.sequences import GrayStack
 from stage.projector import UncalibratedProjector
 from tests.scenes.captures import write_image
 
@@ -23,7 +24,7 @@ FILES = {"moreno": ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T"),
 @pytest.fixture
 def scan(tmp_path):
     folder = tmp_path / "scan"
-    for number in range(len(gray_order(16, 6))):
+    for number in range(len(GrayStack().entries((16, 6)))):
         write_image(folder / f"im{number}.png", np.full((48, 64), number, np.uint8))
     return folder
 

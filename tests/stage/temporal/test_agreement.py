@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stage.temporal.agreement import agree, noise_share
-from stage.temporal.recursion import advance, begin
+from stage.temporal.agreement import advance, agree, begin, noise_share
 
 SIDE = 96
 ALL = np.ones((SIDE, SIDE), bool)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stage.errors import ImageError, ManifestError
-from stage.tof.scan import directions, read_scan, world_points
-from stage.tof.track import Pose, poses_at
+from stage.tof.scan import Pose, directions, poses_at, read_scan, world_points
 from tests.reference.tof import LIGHT
 
 STILL = np.eye(4)

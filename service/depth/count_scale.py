@@ -36,7 +36,7 @@ STEP_TOLERANCE = 1e-3
 
 
 class CountScale(NamedTuple):
-    """What a photon is in a capture's counts."""
+    """The size of a photon in a capture's counts."""
 
     units: float  # recorded units a photon; counts divided by it vary as photons do
     shared: bool  # neighbouring bins vary together: the histograms were smoothed

@@ -8,6 +8,7 @@ would pull it by hundredths of a pixel. One spot a frame is little work, so this
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from kernels.spread import MAD_TO_SIGMA
 from kernels.status import Status
@@ -71,7 +72,7 @@ def find_spot(signal: np.ndarray) -> Spot:
     middle = float(np.median(sample))
     noise = max(MAD_TO_SIGMA * float(np.median(np.abs(sample - middle))), 1e-7 * float(np.abs(values).max()))
     values = np.where(valid, signal - middle, 0)
-    row, col = np.unravel_index(int(np.argmax(_blurred(values))), values.shape)
+    row, col = (int(at) for at in np.unravel_index(int(np.argmax(_blurred(values))), values.shape))
     if values[row, col] <= 0 or _blurred(values[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]).max() < NOISE_FACTOR * noise / 3:
         return none
     top, left = max(row - REACH_PX, 0), max(col - REACH_PX, 0)
@@ -170,13 +171,6 @@ def _blurred(values: np.ndarray) -> np.ndarray:
 
 def _hanging_together(above: np.ndarray, row: int, col: int) -> np.ndarray:
     """Return the connected part of a mask that contains a place or one of its neighbours; pixels that touch at a corner are connected."""
-    inside = np.zeros_like(above)
-    inside[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2] = True
-    inside &= above
-    while True:
-        padded = np.pad(inside, 1)
-        rows = padded[:-2] | padded[1:-1] | padded[2:]
-        grown = (rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]) & above
-        if (grown == inside).all():
-            return inside
-        inside = grown
+    parts, _ = label(above, np.ones((3, 3)))
+    near = parts[max(row - 1, 0):row + 2, max(col - 1, 0):col + 2]
+    return np.isin(parts, near[near > 0])
