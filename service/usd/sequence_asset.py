@@ -17,10 +17,9 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 from service.asset.errors import AssetError
 from service.usd.camera import define_cameras
 from service.usd.files import write_layer
-from service.usd.layers import PURPOSES, describe_root, pose_matrix
+from service.usd.layers import CAMERA_FRAME, define_root, describe_root, pose_matrix, prim_name, set_extents_hint
 from service.usd.materials import define_display_color_material
-from service.usd.names import prim_name
-from service.usd.primvars import distinct
+from service.usd.scene import distinct
 from stage.camera import Camera
 
 SUFFIXES = (".usdc", ".usdz")
@@ -114,22 +113,16 @@ def _define(usd_stage: Usd.Stage, moments: Iterator[Moment], target: Path, descr
     usd_stage.SetFramesPerSecond(description.frames_per_second)
     extent = np.stack([low, high])
     define_cameras(usd_stage, root.GetPath(), description.camera, extent)
-    model = UsdGeom.ModelAPI.Apply(root.GetPrim())
-    model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
+    set_extents_hint(root.GetPrim())
     return SequenceSizes(steps, vertices, faces)
 
 
 def _define_root(usd_stage: Usd.Stage, target: Path, description: SequenceDescription) -> UsdGeom.Xform:
     """Define the root prim with its pose, and what the layer says about itself."""
-    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(usd_stage, description.unit_m)
-    usd_stage.GetRootLayer().documentation = (
-        f"{description.name}: a measured sequence, exported by Relit. Camera frame: +x right, +y up, +z towards the viewer. "
-        "Where it comes from is in customLayerData.")
-    for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
-        usd_stage.SetMetadataByDictKey("customLayerData", key, value)
-    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name)))
-    usd_stage.SetDefaultPrim(root.GetPrim())
+    root = define_root(
+        usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name)), unit_m=description.unit_m,
+        provenance={**description.provenance, "relit:camera": description.camera.model_dump_json()},
+        documentation=f"{description.name}: a measured sequence, exported by Relit. {CAMERA_FRAME}")
     describe_root(root, name=description.name, identifier=target.name, version=description.version, provenance=description.provenance)
     if description.camera.world_from_camera is not None:
         root.AddTransformOp().Set(pose_matrix(description.camera.world_from_camera, description.unit_m))

@@ -158,8 +158,8 @@ def write_quadrature(lights: DistantLights, file: BlockFile) -> dict[str, Any]:
     """Write what a page needs to share light out as `relit relight --weights kernel` does, and return what view.json says of it.
 
     Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with
-    them gives the energies of the lights, none below 0 (kernels.relight.kernel_quadrature). Light from beyond them is shared by a table over
-    the grid of directions, since its parts add up (kernels.relight.smooth).
+    them gives the energies of the lights, none below 0 (kernels.relight.kernel_quadrature). Light from beyond them is shared by a table
+    over the grid of directions, since its parts add up (kernels.relight.smooth).
 
     Args:
         lights: of the captured images.

@@ -8,8 +8,7 @@ import pytest
 
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
-from service.gltf.asset import write_asset
-from service.gltf.depth_asset import write_depth
+from service.gltf.asset import write_asset, write_depth
 from service.gltf.inspect import inspect_glb
 from service.requests.export import Geometry
 from stage.camera import Camera

@@ -42,8 +42,8 @@ def test_a_ball(ball, suffix, tmp_path):
     assert found.size_bytes == sum(p.stat().st_size for p in referred)
     np.testing.assert_allclose(facts["extent_m"], height_mesh(ball).extent, atol=1e-6)
     mesh, = of_kind(found, "mesh")
-    assert mesh.name == "/Kugel/Geom/Mesh" and mesh.facts == {
-        "vertices": report.vertex_count, "faces": report.face_count, "purpose": "default", "primvars": ["st vertex"]}
+    assert mesh.name == "/Kugel/Geom/Mesh" and (mesh.facts["vertices"], mesh.facts["faces"]) == report.sizes["mesh"]
+    assert (mesh.facts["purpose"], mesh.facts["primvars"]) == ("default", ["st vertex"])
     camera, far = of_kind(found, "camera")
     assert (camera.name, far.name) == ("/Kugel/Camera", "/Kugel/CameraPerspective")
     assert camera.facts["orthographic_m"] == pytest.approx([24 * ball.camera.pixel_size_m] * 2)
