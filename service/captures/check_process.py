@@ -7,7 +7,6 @@ It reads one line of JSON from its standard input, and answers with lines of JSO
 and at last {"facts": …}, {"error": sentence} or {"fault": traceback}.
 """
 
-import gc
 import json
 import os
 import selectors
@@ -161,11 +160,9 @@ def main() -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     folder = Path(asked["folder"])
     try:
-        gc.disable()  # what is imported stays: looking through it for garbage is a fifth of a check
         from service.captures.admit import admit_capture, admit_environment
         from stage import inputs
 
-        gc.enable()
         with ExitStack() as held:
             if asked["root"] is not None:
                 top = folder.parent if asked["environment"] else folder

@@ -15,7 +15,8 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import ExportRequest, Geometry, TextureFormat
-from service.usd.sequence_asset import Faces, Moment, SequenceDescription, SequenceSizes, write_sequence_asset
+from service.usd.layers import Description
+from service.usd.sequence_asset import Faces, Moment, SequenceSizes, write_sequence_asset
 from stage.camera import Camera
 from stage.colour import convert
 from stage.depth_maps import DEPTH_FILE, DepthMaps
@@ -66,10 +67,11 @@ def export_sequence(request: ExportRequest, timings: Timings) -> tuple[SequenceS
     warnings: list[str] = []
     of_all = {name: value for name, value in first.provenance.items() if name not in OF_ONE_STEP}
     provenance = {**of_all, **export_metadata(request, {"steps": combined(map(digest, files))})}
-    description = SequenceDescription(request.name or request.out.name.split(".")[0], first.camera, provenance,
-                                      unit_in_metres(first.camera), request.version, sequence.frames_per_second)
+    description = Description(request.name or request.out.name.split(".")[0], first.camera, provenance, unit_in_metres(first.camera),
+                              request.version)
     timings.stage("steps", len(files))
-    sizes = write_sequence_asset(_moments(request, sequence, files, first.camera, warnings, timings), request.out, description)
+    sizes = write_sequence_asset(_moments(request, sequence, files, first.camera, warnings, timings), request.out, description,
+                                 frames_per_second=sequence.frames_per_second)
     return sizes, tuple(warnings)
 
 
