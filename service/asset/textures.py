@@ -83,8 +83,7 @@ class BakedImages(NamedTuple):
 
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None = None,
-                   storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None,
-                   progress: Callable[[str, float], None] = lambda name, done: None) -> dict[str, Texture]:
+                   storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None) -> dict[str, Texture]:
     """Write the images that the materials of solved maps use.
 
     Args:
@@ -93,7 +92,6 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         look: of these maps, for `base_color` and `metallic`; an object without metal has no `metallic`.
         storage: 8 bits are kept for colours alone: normals and roughness would show their steps in highlights, and have 16.
         tangent: the normals in the tangent space of the mesh; None: those of the maps, whose pixels carry the vertices of the mesh.
-        progress: is called before each image is waited for, with its name and the part that is done, 0…1.
 
     Returns:
         By name, in the order of NAMES.
@@ -128,27 +126,18 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
         write_png(folder / f"{name}.png", bleed(codes, known, reach=reach, in_place=True), srgb=colour)
         return Texture(f"{name}.png", space, clipped)
 
-    return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None}, progress)
+    return side_by_side({name: partial(write, name, source) for name in NAMES if (source := sources.get(name)) is not None})
 
 
-def side_by_side(writers: Mapping[str, Callable[[], Texture]], progress: Callable[[str, float], None]) -> dict[str, Texture]:
-    """Call the writers of images, IMAGES_AT_ONCE at a time, and return what they return.
-
-    Args:
-        writers: by name of the image.
-        progress: is called before each image is waited for, with its name and the part that is done, 0…1.
-    """
-    written: dict[str, Texture] = {}
+def side_by_side(writers: Mapping[str, Callable[[], Texture]]) -> dict[str, Texture]:
+    """Call the writers of images by their names, IMAGES_AT_ONCE at a time, and return what they return."""
     with ThreadPoolExecutor(IMAGES_AT_ONCE, thread_name_prefix="relit-textures") as pool:
-        futures = [(name, pool.submit(writer)) for name, writer in writers.items()]
+        futures = {name: pool.submit(writer) for name, writer in writers.items()}
         try:
-            for index, (name, future) in enumerate(futures):
-                progress(name, index / len(futures))
-                written[name] = future.result()
+            return {name: future.result() for name, future in futures.items()}
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return written
 
 
 def space_warnings(textures: Mapping[str, Texture]) -> Iterator[str]:

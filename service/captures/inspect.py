@@ -16,7 +16,7 @@ from service.requests.captures import InfoRequest
 from stage import images
 from stage.capture import Capture
 from stage.correction import Correction
-from stage.errors import StageError
+from stage.errors import StageError, StorageError
 from stage.front_lights import front_lights
 from stage.gradients import gradient_frames, has_gradients
 from stage.light import DistantLight, PointLight
@@ -28,8 +28,6 @@ from stage.projector import Projector
 from stage.radiance import clipping_sentences
 from stage.tof.frames import check_frames, read_frame
 
-SHOWN = ("frames", "lights", "near lights", "not seen")
-"""The facts that stand below a picture."""
 FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
 """What is said of near lights whose distance to the surface nobody has measured."""
 
@@ -103,28 +101,26 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
                                               if level.picked is not None})
     looks = [*capture.doubts, *found.sentences]
     if request.picture is not None:
-        sentences = [*(f"wrong: {fault}" for fault in faults), *(f"finding: {sentence}" for sentence in looks),
-                     *(f"{name}: {value}" for name, value in facts if name in SHOWN)]
         peak = max((level.peak for level in read), default=1.0)
-        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, sentences, timings)))
+        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, timings)))
     timings.close()
     return Inspection(facts, faults, looks)
 
 
-def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], sentences: list[str], timings: Timings) -> str:
+def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], timings: Timings) -> str:
     """Write the picture of a capture, and return its path, or why there is none."""
-    from service.captures.frame_views import view_capture
     from service.captures.picture import write_picture
     from service.light.outputs import check_outputs
 
     check_outputs([(f"--picture {path}", path)], (capture.folder / FILE_NAME, *(capture.file(name) for _, name in capture.files())))
     timings.stage("picture", len(capture.manifest.frames))
     try:
-        view = view_capture(capture, peak, timings.advance)
+        write_picture(path, capture, peak, suspects, timings.advance)
+    except StorageError:
+        raise
     except StageError as error:  # of the mask, or the dark, flat or ambient frames
         timings.advance(len(capture.manifest.frames))
         return f"none: {error}"
-    write_picture(path, capture, view, suspects, sentences)
     return str(path)
 
 

@@ -5,20 +5,18 @@ from pathlib import Path
 
 import numpy as np
 
-from service.asset.depth_cloud import colour_image, measured_points
-from service.asset.depth_mesh import depth_mesh
+from service.asset.camera import unit_in_metres
+from service.asset.depth import GREY, colour_image, depth_mesh, measured_points
 from service.asset.errors import AssetError
 from service.asset.mesh import height_mesh
 from service.asset.metallic import metallic_look
 from service.asset.repair import repair_heights
-from service.asset.units import unit_in_metres
 from service.errors import RequestError
-from service.export.surroundings import refuse_surroundings
 from service.reporting.progress import Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import ExportRequest, Geometry, TextureFormat
-from service.usd.depth_asset import GREY, POINT_WIDTH
-from service.usd.sequence_asset import Faces, Moment, SequenceDescription, SequenceSizes, write_sequence_asset
+from service.usd.layers import Description
+from service.usd.sequence_asset import Faces, Moment, SequenceSizes, write_sequence_asset
 from stage.camera import Camera
 from stage.colour import convert
 from stage.depth_maps import DEPTH_FILE, DepthMaps
@@ -54,7 +52,6 @@ def export_sequence(request: ExportRequest, timings: Timings) -> tuple[SequenceS
         AssetError: another suffix than .usdc and .usdz, or a step without a surface; names the step.
         StorageError: the asset cannot be written; nothing is left half-written.
     """
-    refuse_surroundings(request)
     for name, given in (("--levels", request.levels != 0), ("--textures", request.textures is not TextureFormat.PNG16)):
         if given:
             raise RequestError(f"{name}: the asset of a sequence has colours at its vertices, in one level of detail: leave the option out")
@@ -70,10 +67,11 @@ def export_sequence(request: ExportRequest, timings: Timings) -> tuple[SequenceS
     warnings: list[str] = []
     of_all = {name: value for name, value in first.provenance.items() if name not in OF_ONE_STEP}
     provenance = {**of_all, **export_metadata(request, {"steps": combined(map(digest, files))})}
-    description = SequenceDescription(request.name or request.out.name.split(".")[0], first.camera, provenance,
-                                      unit_in_metres(first.camera), request.version, sequence.frames_per_second)
+    description = Description(request.name or request.out.name.split(".")[0], first.camera, provenance, unit_in_metres(first.camera),
+                              request.version)
     timings.stage("steps", len(files))
-    sizes = write_sequence_asset(_moments(request, sequence, files, first.camera, warnings, timings), request.out, description)
+    sizes = write_sequence_asset(_moments(request, sequence, files, first.camera, warnings, timings), request.out, description,
+                                 frames_per_second=sequence.frames_per_second)
     return sizes, tuple(warnings)
 
 
@@ -126,10 +124,8 @@ def _of_depth(file: Path, time_code: float, geometry: Geometry) -> tuple[Moment,
     beside = file.parent / POINTS_FILE
     measured = measured_points(maps, read_ply(beside) if beside.exists() else None)
     if geometry is Geometry.POINTS:
-        focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
-        footprint = np.abs(measured.points[:, 2]) / focal if focal else np.full(len(measured.points), maps.camera.pixel_size_m or 1.0)
         colours = np.broadcast_to(GREY, measured.points.shape) if measured.colours is None else measured.colours
-        widths = (POINT_WIDTH * footprint).astype(np.float32)
+        widths = measured.widths(maps.camera).astype(np.float32)
         return Moment(time_code, measured.points, colours, measured.normals, None, widths), [], maps.camera
     mesh = depth_mesh(maps)
     image = colour_image(measured, maps.mask)

@@ -1,46 +1,25 @@
-"""Writes solved maps as binary glTF: a mesh with textures, a metallic-roughness material and the camera, in one .glb file."""
+"""Writes solved maps or a measured depth as binary glTF: one .glb file with a mesh or points, their material and the camera."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
-from service.asset.mesh import height_mesh
-from service.asset.metallic import GLASS_IOR, loss_warnings, metallic_look
-from service.asset.units import unit_in_metres
-from service.gltf.camera import camera_warnings
-from service.gltf.container import writing_glb
-from service.gltf.geometry import add_surface
-from service.gltf.materials import add_material
-from service.gltf.scene import add_scene
-from service.gltf.textures import NORMAL, check_textures, write_textures
-from service.requests.export import FIRST_VERSION, TextureFormat
+import numpy as np
+from pygltflib import Primitive
+
+from service.asset.depth import UNCERTAINTY, colour_image, colour_warnings, depth_mesh, measured_points, mesh_warnings, photographed
+from service.asset.metallic import GLASS_IOR, loss_warnings
+from service.asset.surface import AssetReport, surface_of
+from service.gltf.container import Glb, writing_glb
+from service.gltf.geometry import add_attribute, add_points, add_surface
+from service.gltf.materials import NORMAL, add_material, add_unlit_material, check_textures, write_textures
+from service.gltf.scene import add_scene, camera_warnings
+from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
+from stage.depth_maps import DepthMaps
 from stage.maps import SurfaceMaps
-
-Progress = Callable[[str, float], None]
-"""Called with the name of the work that begins and the fraction of the whole that is done, 0…1."""
-
-TEXTURES_START, TEXTURES_END = 0.1, 0.9
-"""Fractions of the whole at which the textures begin and end, as measured for 4096 by 4096 pixels."""
-
-
-class AssetReport(NamedTuple):
-    """The file and the sizes of an asset, and what its user should know of it."""
-
-    path: Path
-    vertex_count: int
-    triangle_count: int
-    step: int  # every step-th pixel in both directions carries a vertex
-    clipped_pixels: dict[str, int]  # texture → pixels that did not fit into 0…1
-    warnings: tuple[str, ...]  # sentences
-
-    @property
-    def sizes(self) -> dict[str, tuple[int, int]]:
-        """Vertices and faces of the mesh."""
-        return {"mesh": (self.vertex_count, self.triangle_count)}
+from stage.ply import PointCloud
 
 
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
-                textures: TextureFormat = TextureFormat.PNG16, progress: Progress | None = None) -> AssetReport:
+                textures: TextureFormat = TextureFormat.PNG16) -> AssetReport:
     """Write solved maps as a .glb file, whole or not at all.
 
     Args:
@@ -49,7 +28,6 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
         name: free text; the root node, the mesh and the material are named after it.
         version: of the asset, kept with the file's name in the extras of `asset`.
         textures: the bits of normals, roughness and metallic; colours have 8.
-        progress: called before each part of the work.
 
     Raises:
         AssetError: EXR textures; no height layer, or no face; a colour space that is not known; more than the 4 GiB that a .glb can hold.
@@ -57,19 +35,64 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     """
     target = Path(path)
     check_textures(target, textures)
-    tell = progress or (lambda what, done: None)
-    tell("mesh", 0.0)
-    mesh = height_mesh(maps)
-    look = metallic_look(maps) if maps.diffuse_albedo is not None else None
-    unit_m = unit_in_metres(maps.camera)
+    mesh, look, provenance, unit_m = surface_of(maps)
     with writing_glb(target) as (glb, folder):
-        written = write_textures(maps, mesh, folder, look=look, storage=textures, progress=lambda name, done: tell(
-            f"texture {name}", TEXTURES_START + (TEXTURES_END - TEXTURES_START) * done))
-        tell("file", TEXTURES_END)
+        written = write_textures(maps, mesh, folder, look=look, storage=textures)
         material = add_material(glb, written, folder, ior=look.ior if look is not None else GLASS_IOR, name=name)
         surface = add_surface(glb, mesh, unit_m=unit_m, material=material, textured=bool(written), with_tangents=NORMAL in written)
-        provenance = {**maps.provenance, "relit:color_space": maps.color_space, **(look.provenance if look is not None else {})}
         add_scene(glb, surface, maps.camera, mesh.extent, provenance, name=name, file_name=target.name, version=version, unit_m=unit_m)
-    return AssetReport(target, len(mesh.points), 2 * len(mesh.quads) + len(mesh.triangles), mesh.step,
+    return AssetReport(target, {"mesh": (len(mesh.points), 2 * len(mesh.quads) + len(mesh.triangles))}, mesh.step,
                        {name: texture.clipped_pixels for name, texture in written.items()},
                        (*camera_warnings(maps.camera), *(loss_warnings(look) if look is not None else ())))
+
+
+def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
+                version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
+    """Write a depth as a .glb file, whole or not at all.
+
+    Args:
+        maps: a depth.
+        cloud: what points.ply holds, or None.
+        path: the file; missing folders are made.
+        name: free text; the root node and the material are named after it.
+        geometry: what the asset is made of; glTF has no variants for both.
+        version: of the asset, kept with the file's name in the extras of `asset`.
+        textures: a .glb has no place for EXR.
+
+    Returns:
+        Sentences on what the asset lacks.
+
+    Raises:
+        AssetError: EXR textures; no point, or no face for a mesh; a cloud that is not one of this depth; more than 4 GiB.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    target = Path(path)
+    check_textures(target, textures)
+    points = measured_points(maps, cloud)
+    mesh = depth_mesh(maps) if geometry is Geometry.MESH else None
+    with writing_glb(target) as (glb, folder):
+        if mesh is None:
+            material = add_unlit_material(glb, name=name, coloured=points.colours is not None)
+            primitive, extent = add_points(glb, points.points, points.colours, material=material), points.extent
+            _add_uncertainty(glb, primitive, maps, points.rows, points.cols)
+        else:
+            colours = colour_image(points, maps.mask)
+            written = {}
+            if colours is not None:
+                seen, look = photographed(maps, colours)
+                written = write_textures(seen, mesh, folder, look=look, storage=textures)
+            material = add_material(glb, written, folder, name=name)
+            primitive = add_surface(glb, mesh, unit_m=1.0, material=material, textured=bool(written), with_tangents=False)
+            extent = mesh.extent
+            _add_uncertainty(glb, primitive, maps, mesh.rows, mesh.cols)
+        add_scene(glb, primitive, maps.camera, extent, maps.provenance, name=name, file_name=target.name, version=version)
+    told = mesh_warnings(mesh, maps) if mesh is not None else ()
+    return (*colour_warnings(points), *told, *camera_warnings(maps.camera))
+
+
+def _add_uncertainty(glb: Glb, primitive: Primitive, maps: DepthMaps, rows: np.ndarray, cols: np.ndarray) -> None:
+    """Add standard deviation (_SIGMA, metres) and confidence (_CONFIDENCE) of each vertex, where the depth has them; 0: unknown."""
+    for layer in UNCERTAINTY:
+        values = getattr(maps, layer)
+        if values is not None:
+            add_attribute(glb, primitive, layer, values[rows, cols])

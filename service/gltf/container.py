@@ -115,6 +115,7 @@ class GlbContents(NamedTuple):
     document: GLTF2
     data_start: int  # byte of the file at which the buffer begins
     data_size: int  # its bytes; 0: there is no buffer
+    faults: tuple[str, ...]  # sentences about lengths that the file does not have
 
 
 def read_glb(path: Path) -> GlbContents:
@@ -137,10 +138,17 @@ def read_glb(path: Path) -> GlbContents:
         if length > size or text_length > size:
             raise AssetError(f"{path}: is cut off: it has {size} of {length} bytes")
         text, next_head = stream.read(text_length), stream.read(_CHUNK_HEADER.size)
-    data_size = _CHUNK_HEADER.unpack(next_head)[0] if len(next_head) == _CHUNK_HEADER.size else 0
+    data_start = start + text_length + _CHUNK_HEADER.size
+    data_size, kind = _CHUNK_HEADER.unpack(next_head) if len(next_head) == _CHUNK_HEADER.size else (0, _BIN)
+    faults = []
+    if length != size:
+        faults.append(f"the header says that the file has {length} bytes, and it has {size}")
+    if kind != _BIN or data_start + data_size > size:
+        faults.append(f"the chunk behind the document says {data_size} bytes of type {kind!r}: {max(size - data_start, 0)} bytes follow")
+        data_size = min(data_size, max(size - data_start, 0)) if kind == _BIN else 0
     try:
-        return GlbContents(GLTF2.gltf_from_json(text.decode()), start + text_length + _CHUNK_HEADER.size, data_size)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return GlbContents(GLTF2.gltf_from_json(text.decode()), data_start, data_size, tuple(faults))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise AssetError(f"{path}: holds no glTF document that can be read: {error}") from error
 
 

@@ -10,6 +10,7 @@ from kernels import device as devices
 from kernels.fusion.bricks import MEMORY_BOUND
 from service.asset.unwrap import textured_mesh, unwrapper
 from service.errors import RequestError
+from service.export.writers import WRITERS
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.fuse import FuseRequest
@@ -20,11 +21,9 @@ from service.scans.join import with_joined_normals
 from service.scans.pieces import SharedPieces
 from service.scans.surface import Surface, joined_surface
 from service.scans.tiles import write_tiles
-from service.usd.fused_asset import write_fused
 from stage.files import write_text
 from stage.fingerprint import digest
 from stage.meshes.holes import Holes, find_holes
-from stage.meshes.mesh import write_mesh_ply
 from stage.scans.records import ScanSet, read_scan_set
 
 MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
@@ -125,9 +124,10 @@ def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBric
         asset_path = request.out / ASSET_FILE
         facts["texture"] = {"vertices": int(baked[0].place.max()) + 1, "faces": len(baked[0].mesh.triangles),
                             "seen_share": round(baked[1].seen_share, 4)}
-        write_fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance)
-    write_mesh_ply(mesh, request.out / MESH_FILE, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
-    return _Made(request.out / MESH_FILE, asset_path, facts)
+        WRITERS[asset_path.suffix].fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance)
+    mesh_path = request.out / MESH_FILE
+    WRITERS[mesh_path.suffix].mesh(mesh, mesh_path, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
+    return _Made(mesh_path, asset_path, facts)
 
 
 def _tiles(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, provenance: dict[str, str], timings: Timings

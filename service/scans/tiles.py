@@ -11,7 +11,7 @@ from kernels.fusion.bricks import BRICK_VOXELS, MEMORY_BOUND
 from service.scans.fused_bricks import FusedBricks
 from service.scans.fused_mesh import SEEN_BY, short, triangle_mesh
 from service.scans.surface import VERTEX, BrickSurface, Tally
-from service.usd.tiled_asset import SITE_FILE, Tile, remove_other_tiles, write_site, write_tile
+from service.usd.fused_asset import SITE_FILE, Tile, remove_other_tiles, write_site, write_tile
 from stage.meshes.holes import area_vectors
 from stage.meshes.mesh import write_mesh_ply
 

@@ -9,7 +9,7 @@ Source: OpenUSD, UsdGeomCamera: apertures, focal length and their units.
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from service.asset.view import ORTHOGRAPHIC_CLEARANCE, view_of
+from service.asset.camera import ORTHOGRAPHIC_CLEARANCE, view_of
 from stage.camera import Camera
 
 CAMERA, FAR_CAMERA = "Camera", "CameraPerspective"

@@ -6,29 +6,29 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from service.asset.depth_cloud import UNCERTAINTY, MeasuredPoints, colour_image, colour_warnings, measured_points
-from service.asset.depth_mesh import depth_mesh, mesh_warnings
+from service.asset.depth import (
+    GREY,
+    UNCERTAINTY,
+    MeasuredPoints,
+    colour_image,
+    colour_warnings,
+    depth_mesh,
+    measured_points,
+    mesh_warnings,
+    photographed,
+)
 from service.asset.errors import AssetError
 from service.asset.mesh import SurfaceMesh
-from service.asset.metallic import metallic_look
 from service.asset.textures import write_textures
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from service.usd.camera import define_cameras
-from service.usd.files import check_textures, install, temporary_folder_beside
-from service.usd.layers import AssetLayers, Description, texture_folder
+from service.usd.files import check_textures
+from service.usd.layers import AssetLayers, Description
 from service.usd.materials import define_display_color_material, define_looks
-from service.usd.points import define_points
-from service.usd.primvars import set_primvar
-from service.usd.scene import define_mesh
-from service.usd.surroundings import files_of_assets
+from service.usd.scene import define_mesh, define_points, set_primvar
+from service.usd.surroundings import writing_asset
 from stage.depth_maps import DepthMaps
-from stage.maps import SurfaceMaps
 from stage.ply import PointCloud
-
-POINT_WIDTH = 1.5
-"""Width of a point in footprints of a pixel: neighbouring points just overlap, corner to corner."""
-GREY = np.full((1, 3), 0.5, np.float32)
-"""Linear colour where none is known."""
 
 
 class _Parts(NamedTuple):
@@ -38,11 +38,6 @@ class _Parts(NamedTuple):
     points: MeasuredPoints
     point_step: int  # the points are of every point_step-th row and column of pixels
     colours: np.ndarray | None  # [rows, cols, 3] float32 scene-linear Rec.709
-
-    @property
-    def extent(self) -> np.ndarray:
-        """Return the bounding box of all points, [2, 3] float32."""
-        return np.stack([self.points.points.min(axis=0), self.points.points.max(axis=0)])
 
 
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
@@ -70,20 +65,16 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
     target = Path(path)
     check_textures(target, textures)
     parts = _parts(maps, cloud, geometry)
-    with temporary_folder_beside(target) as temporary:
-        folder = temporary / texture_folder(target)
-        folder.mkdir()
-        layers = AssetLayers(temporary, target, Description(name, maps.camera, maps.provenance, version=version))
+    with writing_asset(target, Description(name, maps.camera, maps.provenance, version=version)) as files:
+        layers = files.layers
         UsdGeom.Scope.Define(layers.materials, layers.looks)
         for variant in sorted(Geometry, key=lambda other: other != geometry):
             if variant is Geometry.POINTS:
                 _add_points(layers, parts, maps)
             elif parts.mesh is not None:
-                _add_mesh(layers, parts.mesh, parts.colours, maps, folder, textures)
-        define_cameras(layers.geometry, layers.root, maps.camera, parts.extent)
-        layers.save()
-        first, *others = layers.files
-        install(target, first, [*others, *sorted(folder.iterdir())], ours=files_of_assets(target))
+                _add_mesh(layers, parts.mesh, parts.colours, maps, files.textures, textures)
+        define_cameras(layers.geometry, layers.root, maps.camera, parts.points.extent)
+        files.beside.extend(sorted(files.textures.iterdir()))
     told = mesh_warnings(parts.mesh, maps) if parts.mesh is not None and geometry is Geometry.MESH else ()
     return (*colour_warnings(parts.points), *told)
 
@@ -110,19 +101,16 @@ def _add_mesh(layers: AssetLayers, mesh: SurfaceMesh, colours: np.ndarray | None
         _set_uncertainty(prim, maps, mesh.rows, mesh.cols)
         layers.add_surface(prim.GetPath())
     if colours is not None:
-        seen = SurfaceMaps(camera=maps.camera, mask=maps.mask, diffuse_albedo=colours, color_space="lin_rec709_scene")
-        look = metallic_look(seen)
+        seen, look = photographed(maps, colours)
         define_looks(layers, write_textures(seen, mesh, folder, look=look, storage=storage), ior=look.ior)
 
 
 def _add_points(layers: AssetLayers, parts: _Parts, maps: DepthMaps) -> None:
     """Define the variant with the points, and a material that shows their colours."""
     points, rows, cols, colours, normals = parts.points
-    focal = min(maps.camera.focal_px) if maps.camera.focal_px is not None else None
-    footprints = np.abs(points[:, 2]) / focal if focal else np.full(len(points), maps.camera.pixel_size_m or 1.0)
     material = define_display_color_material(layers.materials, layers.looks.AppendChild("PointMaterial"))
     with layers.geometry_variant(Geometry.POINTS) as geom:
-        prim = define_points(layers.geometry, geom.AppendChild("Points"), points, POINT_WIDTH * parts.point_step * footprints,
+        prim = define_points(layers.geometry, geom.AppendChild("Points"), points, parts.points.widths(maps.camera, parts.point_step),
                              normals=normals)
         set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, GREY if colours is None else colours)
         _set_uncertainty(prim, maps, rows, cols)

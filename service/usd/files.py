@@ -140,7 +140,7 @@ def temporary_folder_beside(target: Path) -> Iterator[Path]:
         with storage("write", target):
             yield temporary
     except Tf.ErrorException as error:
-        raise StorageError(f"cannot write {target}: {_reason(error)}") from error
+        raise StorageError(f"cannot write {target}: {reason_of(error)}") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -169,7 +169,7 @@ def _pack(package: Path, layer: Path, files: Sequence[Path]) -> None:
         raise AssetError("the asset is larger than the 4 GiB that a .usdz can hold: export a .usdc") from error
 
 
-def _reason(error: Tf.ErrorException) -> str:
+def reason_of(error: Tf.ErrorException) -> str:
     """Return the first reason that USD gives, without the place in its source."""
     reasons = [str(getattr(cause, "commentary", cause)).strip() for cause in error.args]
     return reasons[0].splitlines()[0].lower() if reasons and reasons[0] else "USD could not write it"

@@ -1,75 +1,32 @@
-"""Inspection of a USD asset for relit inspect: the facts that a technical director checks, and every finding of the validators.
+"""Inspection of a USD asset for relit inspect: what it holds, and every finding of OpenUSD's validators in each of its variants.
 
-Source: OpenUSD: UsdModelAPI, UsdGeomModelAPI, UsdGeomCamera (units of apertures), UsdValidation.
+Source: OpenUSD: UsdModelAPI, UsdGeomModelAPI, UsdGeomCamera (units of apertures), UsdShade (render contexts, connections), UsdValidation;
+Apple, "Creating USD files for Apple devices": the root layer of a package is binary and refers to no other layer.
 """
 
-from collections.abc import Callable, Container, Iterator
-from dataclasses import dataclass
+import zipfile
+from collections.abc import Iterator
+from os.path import relpath
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
 from service.asset.errors import AssetError
+from service.asset.inspection import Inspection, Part, image_facts
 from service.usd.camera import APERTURE_UNIT
-from service.usd.inspect_geometry import FIRST, MeshFacts, PointsFacts, mesh_facts, points_facts
-from service.usd.inspect_looks import MaterialFacts, material_facts
-from service.usd.inspect_package import arkit_findings, package_findings
-from service.usd.layers import GEO, LOOK, PURPOSES
+from service.usd.files import reason_of
+from service.usd.layers import PURPOSES
+from stage.errors import storage
 
 SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
-
+FIRST = Usd.TimeCode.EarliestTime()
+"""When an asset with time samples is looked at."""
 HINT_TOLERANCE = 1e-4
 """How far extentsHint may be from the geometry, as a part of its size: more than float32 rounds."""
-
-
-@dataclass(frozen=True)
-class CameraFacts:
-    """A camera."""
-
-    path: str
-    projection: str
-    framing: str
-    """The angle of view, or the width and height of the picture in metres."""
-
-
-@dataclass(frozen=True)
-class Inspection:
-    """What an asset holds, and what is wrong with it."""
-
-    file: str
-    size_bytes: int
-    """Bytes of the asset and of all files that it refers to."""
-    layers: tuple[str, ...]
-    """Layers beyond the first, relative to its folder."""
-    default_prim: str | None
-    kind: str | None
-    asset_info: dict[str, str]
-    notes: dict[str, str]
-    """customData of the default prim, as relit:scale where the capture has none."""
-    up_axis: str
-    meters_per_unit: float
-    time_codes: tuple[float, float, float] | None
-    """First and last, and how many a second; None where nothing is timed."""
-    extent_m: tuple[tuple[float, ...], tuple[float, ...]] | None
-    """Lowest and highest corner of the bounding box in the world, metres."""
-    variants: dict[str, tuple[str, ...]]
-    """The variants of each set."""
-    selections: dict[str, str]
-    meshes: dict[str, tuple[MeshFacts, ...]]
-    """By `geo=variant`; under an empty name where there is no such set."""
-    points: dict[str, tuple[PointsFacts, ...]]
-    materials: dict[str, tuple[MaterialFacts, ...]]
-    """Materials that something is bound to, by `set=variant`: those of each look, and what other variants of `geo` bind beside them."""
-    lights: dict[str, tuple[str, ...]]
-    """Paths and types, by `set=variant` of the other sets; under an empty name where there are no others."""
-    cameras: tuple[CameraFacts, ...]
-    provenance: dict[str, str]
-    """customLayerData."""
-    validators: int
-    """How many validators of OpenUSD looked at each variant."""
-    warnings: tuple[str, ...]
-    errors: tuple[str, ...]
+BINARY = b"PXR-USDC"
+"""The first bytes of a binary layer."""
 
 
 def inspect_asset(path: Path) -> Inspection:
@@ -79,150 +36,161 @@ def inspect_asset(path: Path) -> Inspection:
         AssetError: it is no USD file, or one that cannot be opened.
         StorageError: it cannot be read.
     """
-    if path.is_dir():
-        raise AssetError(f"{path} is a folder: give the asset, a file that ends with {', '.join(SUFFIXES)}")
-    if not path.exists():
-        raise AssetError(f"{path} is not there")
     if path.suffix.lower() not in SUFFIXES:
         raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)} and .glb")
-    packed = path.suffix.lower() == ".usdz"
-    errors = package_findings(path) if packed else []
+    warnings = _check_package(path) if path.suffix.lower() == ".usdz" else []
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print about missing files is among the findings
     try:
         usd_stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise AssetError(f"{path} cannot be opened: it is no USD file, or a damaged one") from error
-    warnings = arkit_findings(path, usd_stage.GetRootLayer()) if packed else []
+        raise AssetError(f"{path} cannot be opened: it is no USD file, or a damaged one: {reason_of(error)}") from error
+    if path.suffix.lower() == ".usdz" and (others := sorted(usd_stage.GetRootLayer().GetCompositionAssetDependencies())):
+        warnings.append(f"ARKit takes packages of one layer, and the root layer of this one refers to {', '.join(others)}")
     usd_stage.SetEditTarget(usd_stage.GetSessionLayer())
-    inspection = _inspect(usd_stage, path, warnings, errors)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    errors, parts = list[str](), dict[str, Part]()
+    for variant in _each_variant(usd_stage.GetDefaultPrim()):
+        for part in _parts(usd_stage, variant):
+            parts.setdefault(repr((part.kind, part.name, part.facts)), part)
+        for found in UsdValidation.ValidationContext(validators).Validate(usd_stage):
+            sentences = errors if found.GetType() == UsdValidation.ValidationErrorType.Error else warnings
+            sentences.append(f"{found.GetName()}: {' '.join(found.GetMessage().split())}")
+        errors += _hint_findings(usd_stage.GetDefaultPrim())
+    layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
+    beside = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]).resolve() for file in [*(layer.realPath for layer in layers), *files]}
+    size = sum(file.stat().st_size for file in beside | {path.resolve()} if file.is_file())
+    names = sorted(relpath(layer.realPath or layer.identifier, path.parent) for layer in layers if layer != usd_stage.GetRootLayer())
+    inspection = Inspection(
+        str(path), size, {**_facts(usd_stage), "layers": names, "validators": len(validators)}, tuple(parts.values()),
+        dict(_flat(usd_stage.GetRootLayer().customLayerData)), tuple(sorted(set(warnings))), tuple(sorted(set(errors))))
     del quiet
     return inspection
 
 
-def _inspect(usd_stage: Usd.Stage, path: Path, warnings: list[str], errors: list[str]) -> Inspection:
-    root = usd_stage.GetDefaultPrim()
-    if not root:
-        errors.append("the layer has no default prim, so that nothing can refer to it")
+def _check_package(path: Path) -> list[str]:
+    """Refuse what is no package, or a damaged one, and return why ARKit does not take its root layer."""
+    with storage("read", path):
+        try:
+            with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as layer:
+                damaged, binary = archive.testzip(), layer.read(len(BINARY)) == BINARY
+        except (zipfile.BadZipFile, NotImplementedError, EOFError, IndexError) as error:
+            raise AssetError(f"{path} is no USDZ package, or only a part of one: {str(error).lower()}") from error
+    if damaged is not None:
+        raise AssetError(f"{path} is damaged: the checksum of {damaged} does not fit")
+    return [] if binary else ["ARKit takes a binary root layer, and that of this package is text"]
+
+
+def _facts(usd_stage: Usd.Stage) -> dict[str, Any]:
+    """Return what holds for the asset as a whole."""
+    root, unit_m = usd_stage.GetDefaultPrim(), UsdGeom.GetStageMetersPerUnit(usd_stage)
+    facts = {"default_prim": str(root.GetPath()) if root else None, "up_axis": str(UsdGeom.GetStageUpAxis(usd_stage)),
+             "meters_per_unit": unit_m}
+    if usd_stage.HasAuthoredTimeCodeRange():
+        facts["time_codes"] = [usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()]
+        facts["time_codes_per_second"] = usd_stage.GetTimeCodesPerSecond()
+    if root:
+        sets, box = root.GetVariantSets(), UsdGeom.BBoxCache(FIRST, PURPOSES).ComputeWorldBound(root).ComputeAlignedRange()
+        repeated = set(_flat(usd_stage.GetRootLayer().customLayerData))
+        facts |= {"kind": Usd.ModelAPI(root).GetKind() or None,
+                  "asset_info": dict(entry for entry in _flat(Usd.ModelAPI(root).GetAssetInfo()) if entry not in repeated),
+                  "notes": dict(entry for spec in reversed(root.GetPrimStack()) for entry in _flat(spec.customData)),
+                  "extent_m": None if box.IsEmpty() else [[unit_m * each for each in corner] for corner in (box.GetMin(), box.GetMax())],
+                  "variants": {name: list(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()},
+                  "selections": dict(sets.GetAllVariantSelections())}
+    return facts
+
+
+def _each_variant(root: Usd.Prim) -> Iterator[str]:
+    """Select each variant of each set in turn, beside the first selections of other sets, and yield it; these come first, as ""."""
+    yield ""
+    for name in root.GetVariantSets().GetNames() if root else []:
+        variants = root.GetVariantSets().GetVariantSet(name)
+        selected = variants.GetVariantSelection()
+        for variant in variants.GetVariantNames():
+            if variant != selected:
+                variants.SetVariantSelection(variant)
+                yield f"{name}={variant}"
+        variants.ClearVariantSelection()
+
+
+def _parts(usd_stage: Usd.Stage, variant: str) -> Iterator[Part]:
+    """Yield the geometry, lights, cameras and bound materials of the selected variants."""
     unit_m = UsdGeom.GetStageMetersPerUnit(usd_stage)
-    meshes, points, materials = {}, {}, {}
-    for variant in _each_variant(root, LOOK):
-        materials[_chosen(LOOK, variant)] = _materials(usd_stage, ())
-        _find(usd_stage, root, warnings, errors)
-    for variant in _each_variant(root, GEO):
-        chosen = _chosen(GEO, variant)
-        meshes[chosen] = tuple(mesh_facts(UsdGeom.Mesh(prim)) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Mesh))
-        points[chosen] = tuple(points_facts(UsdGeom.Points(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Points))
-        own = _materials(usd_stage, {material.path for known in materials.values() for material in known})
-        materials.update({chosen: own} if own else {})
-        _find(usd_stage, root, warnings, errors)
-    lights = {}
-    for name in [name for name in (root.GetVariantSets().GetNames() if root else []) if name not in (GEO, LOOK)] or [""]:
-        for variant in _each_variant(root, name):
-            lights[_chosen(name, variant)] = tuple(
-                f"{prim.GetPath()} ({prim.GetTypeName()})" for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI))
-            _find(usd_stage, root, warnings, errors)
-    start, end = usd_stage.GetStartTimeCode(), usd_stage.GetEndTimeCode()
-    layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
-    others = [layer for layer in layers if layer != usd_stage.GetRootLayer()]
-    packed = path.suffix.lower() == ".usdz"
-    places = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]) for file in [*(each.realPath for each in others), *files]}
-    places -= {path.resolve(), path}
-    size = path.stat().st_size + (0 if packed else sum(place.stat().st_size for place in places if place.is_file()))
-    sets = root.GetVariantSets() if root else None
-    return Inspection(
-        file=str(path), size_bytes=size, layers=tuple(sorted(_relative(layer, path) for layer in others)),
-        default_prim=str(root.GetPath()) if root else None, kind=(Usd.ModelAPI(root).GetKind() or None) if root else None,
-        asset_info=dict(_flat(Usd.ModelAPI(root).GetAssetInfo())) if root else {},
-        notes=dict(entry for spec in reversed(root.GetPrimStack()) for entry in _flat(spec.customData)) if root else {},
-        up_axis=str(UsdGeom.GetStageUpAxis(usd_stage)), meters_per_unit=unit_m,
-        time_codes=(start, end, usd_stage.GetTimeCodesPerSecond()) if usd_stage.HasAuthoredTimeCodeRange() else None,
-        extent_m=_extent(root, unit_m) if root else None,
-        variants={name: tuple(sets.GetVariantSet(name).GetVariantNames()) for name in sets.GetNames()} if sets else {},
-        selections=dict(sets.GetAllVariantSelections()) if sets else {},
-        meshes=meshes, points=points, materials=materials, lights=lights,
-        cameras=tuple(_camera(UsdGeom.Camera(prim), unit_m) for prim in usd_stage.Traverse() if prim.IsA(UsdGeom.Camera)),
-        provenance=dict(_flat(usd_stage.GetRootLayer().customLayerData)), validators=len(_validators()),
-        warnings=tuple(sorted(set(warnings))),
-        errors=tuple(sorted(set(errors))))  # sorted: validators run side by side
-
-
-def _each_variant(root: Usd.Prim, name: str) -> Iterator[str]:
-    """Select each variant of a set in turn, the selected one first; then restore the selection. Yield "" where there is no such set."""
-    names = root.GetVariantSets().GetNames() if root else []
-    if name not in names:
-        yield ""
-        return
-    variants = root.GetVariantSets().GetVariantSet(name)
-    selected = variants.GetVariantSelection()
-    for variant in sorted(variants.GetVariantNames(), key=lambda each: (each != selected, each)):
-        variants.SetVariantSelection(variant)
-        yield variant
-    variants.ClearVariantSelection()
-
-
-def _chosen(variant_set: str, variant: str) -> str:
-    """Return how a variant is written; nothing where there is none."""
-    return f"{variant_set}={variant}" if variant else ""
-
-
-def _materials(usd_stage: Usd.Stage, known: Container[str]) -> tuple[MaterialFacts, ...]:
-    """Return the materials that are bound to geometry, each once, without those whose path is known."""
-    bound: dict[Sdf.Path, MaterialFacts] = {}
     for prim in usd_stage.Traverse():
+        path = str(prim.GetPath())
+        if prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.Points):
+            is_mesh, shape = prim.IsA(UsdGeom.Mesh), UsdGeom.PointBased(prim)
+            sizes = (UsdGeom.Mesh(prim).GetFaceVertexCountsAttr() if is_mesh else UsdGeom.Points(prim).GetWidthsAttr()).Get(FIRST) or []
+            yield Part("mesh" if is_mesh else "points", path, variant, {
+                "vertices": len(shape.GetPointsAttr().Get(FIRST) or []),
+                **({"faces": len(sizes)} if is_mesh else {"widths_m": [unit_m * edge(sizes, default=0) for edge in (min, max)]}),
+                "purpose": str(shape.ComputePurpose()),
+                "primvars": [f"{each.GetPrimvarName()} {each.GetInterpolation()}"
+                             for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()]})
+        elif prim.HasAPI(UsdLux.LightAPI):
+            yield Part("light", path, variant, {"type": str(prim.GetTypeName())})
+        elif prim.IsA(UsdGeom.Camera):
+            lens = UsdGeom.Camera(prim).GetCamera(FIRST)
+            sides = [APERTURE_UNIT * unit_m * side for side in (lens.horizontalAperture, lens.verticalAperture)]
+            angles = [lens.GetFieldOfView(side) for side in (Gf.Camera.FOVHorizontal, Gf.Camera.FOVVertical)]
+            flat = lens.projection == Gf.Camera.Orthographic
+            yield Part("camera", path, variant, {"orthographic_m": sides} if flat else {"perspective_degrees": angles})
         if prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset):
             material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-            if material and material.GetPath() not in bound and str(material.GetPath()) not in known:
-                bound[material.GetPath()] = material_facts(material)
-    return tuple(bound.values())
+            if material:
+                yield from _material(material, variant)
 
 
-def _find(usd_stage: Usd.Stage, root: Usd.Prim, warnings: list[str], errors: list[str]) -> None:
-    """Add what the validators find in the selected variants, and whether extentsHint is right."""
-    for found in UsdValidation.ValidationContext(_validators()).Validate(usd_stage):
-        sentence = f"{found.GetName()}: {' '.join(found.GetMessage().split())}"
-        if found.GetType() == UsdValidation.ValidationErrorType.Error:
-            errors.append(sentence)
-        else:
-            warnings.append(sentence)
-    hint = UsdGeom.ModelAPI(root).GetExtentsHint() if root else None
-    box = _bounds(root, UsdGeom.BBoxCache.ComputeUntransformedBound) if root else Gf.Range3d()
-    if hint and not box.IsEmpty():
-        if len(hint) % 2:
-            errors.append(f"extentsHint of {root.GetPath()} has {len(hint)} corners: it has two for each purpose")
-            return
-        given = Gf.Range3d()
-        for low, high in zip(hint[::2], hint[1::2], strict=True):  # of each purpose
-            given.UnionWith(Gf.Range3d(Gf.Vec3d(low), Gf.Vec3d(high)))
-        tolerance = HINT_TOLERANCE * max(box.GetSize().GetLength(), 1e-12)
-        if _distance(box, given) > tolerance:
-            errors.append(f"extentsHint of {root.GetPath()} is {given}, and the geometry of the selected variants fills {box}")
+def _material(material: UsdShade.Material, variant: str) -> Iterator[Part]:
+    """Yield the surfaces of a material by their render contexts, and the texture of each input that has one."""
+    for output in material.GetSurfaceOutputs():
+        for producer in UsdShade.Utils.GetValueProducingAttributes(output)[:1]:
+            shader = UsdShade.Shader(producer.GetPrim())
+            context = output.GetBaseName().removesuffix("surface").removesuffix(":") or "universal"
+            files = {entry.GetBaseName(): _file_of(entry, set()) for entry in shader.GetInputs()}
+            values = {entry.GetBaseName(): str(entry.Get(FIRST)) for entry in shader.GetInputs()
+                      if files[entry.GetBaseName()] is None and entry.Get(FIRST) is not None}
+            yield Part("material", str(material.GetPath()), variant,
+                       {"context": context, "shader": str(shader.GetIdAttr().Get() or "no identifier"), **values})
+            for name, file in files.items():
+                if file is not None:
+                    yield Part("texture", f"{material.GetPath()} {context}:{name}", variant, _texture(file))
 
 
-def _validators() -> list[UsdValidation.Validator]:
-    return UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+def _file_of(entry: UsdShade.Input, seen: set[Sdf.Path]) -> UsdShade.Input | None:
+    """Return the input `file` of the texture that an input is connected to, through any nodes between, or None."""
+    for producer in UsdShade.Utils.GetValueProducingAttributes(entry):
+        shader = UsdShade.Shader(producer.GetPrim())
+        if not shader or producer.GetPath() == entry.GetAttr().GetPath() or shader.GetPath() in seen:
+            continue
+        seen.add(shader.GetPath())
+        if file := shader.GetInput("file"):
+            return file
+        if found := next(filter(None, (_file_of(inner, seen) for inner in shader.GetInputs())), None):
+            return found
+    return None
 
 
-def _bounds(root: Usd.Prim, compute: Callable[[UsdGeom.BBoxCache, Usd.Prim], Gf.BBox3d]) -> Gf.Range3d:
-    """Return the bounding box of the geometry below a prim, of every purpose."""
-    return compute(UsdGeom.BBoxCache(FIRST, PURPOSES), root).ComputeAlignedRange()
+def _texture(file: UsdShade.Input) -> dict[str, Any]:
+    asset = file.GetAttr().Get(FIRST)
+    declared = UsdShade.Shader(file.GetPrim()).GetInput("sourceColorSpace")
+    color_space = (declared.Get() if declared else None) or file.GetAttr().GetColorSpace() or None
+    source = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(asset.resolvedPath)) if asset is not None and asset.resolvedPath else None
+    found = {"missing": True} if source is None else image_facts(bytes(source.GetBuffer()), asset.path)
+    return {"file": asset.path if asset is not None else "", "color_space": color_space, **found}
 
 
-def _distance(one: Gf.Range3d, other: Gf.Range3d) -> float:
-    return float(max(np.abs(np.array(one.GetMin()) - other.GetMin()).max(), np.abs(np.array(one.GetMax()) - other.GetMax()).max()))
-
-
-def _extent(root: Usd.Prim, unit_m: float) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-    box = _bounds(root, UsdGeom.BBoxCache.ComputeWorldBound)
-    return None if box.IsEmpty() else (tuple(unit_m * each for each in box.GetMin()), tuple(unit_m * each for each in box.GetMax()))
-
-
-def _camera(camera: UsdGeom.Camera, unit_m: float) -> CameraFacts:
-    gf_camera = camera.GetCamera(FIRST)
-    if gf_camera.projection == Gf.Camera.Orthographic:
-        width, height = (APERTURE_UNIT * aperture * unit_m for aperture in (gf_camera.horizontalAperture, gf_camera.verticalAperture))
-        return CameraFacts(str(camera.GetPath()), "orthographic", f"{width:.6g} × {height:.6g} m")
-    angles = (gf_camera.GetFieldOfView(direction) for direction in (Gf.Camera.FOVHorizontal, Gf.Camera.FOVVertical))
-    return CameraFacts(str(camera.GetPath()), "perspective", " × ".join(f"{angle:.4g}°" for angle in angles))
+def _hint_findings(root: Usd.Prim) -> Iterator[str]:
+    """Yield how extentsHint, two corners for each purpose, differs from the geometry of the selected variants."""
+    hint = list(UsdGeom.ModelAPI(root).GetExtentsHint() or []) if root else []
+    if not hint:
+        return
+    box, given = UsdGeom.BBoxCache(FIRST, PURPOSES).ComputeUntransformedBound(root).ComputeAlignedRange(), Gf.Range3d()
+    for low, high in zip(hint[::2], hint[1::2], strict=False):
+        given.UnionWith(Gf.Range3d(Gf.Vec3d(low), Gf.Vec3d(high)))
+    far = np.abs(np.subtract([*box.GetMin(), *box.GetMax()], [*given.GetMin(), *given.GetMax()])).max()
+    if len(hint) % 2 or (not box.IsEmpty() and far > HINT_TOLERANCE * max(box.GetSize().GetLength(), 1e-12)):
+        yield f"extentsHint of {root.GetPath()} is {given} in {len(hint)} corners, and the geometry of the selected variants fills {box}"
 
 
 def _flat(data: dict[str, object], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -232,8 +200,3 @@ def _flat(data: dict[str, object], prefix: str = "") -> Iterator[tuple[str, str]
             yield from _flat(value, f"{prefix}{key}:")
         else:
             yield f"{prefix}{key}", value.path if isinstance(value, Sdf.AssetPath) else str(value)
-
-
-def _relative(layer: Sdf.Layer, path: Path) -> str:
-    folder = f"{path.resolve().parent}/"
-    return str(layer.identifier).removeprefix(folder).removeprefix(f"{path.parent}/")

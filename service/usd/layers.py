@@ -13,22 +13,40 @@ Source: OpenUSD: UsdVariantSet, UsdModelAPI (kind, assetInfo), UsdGeomModelAPI (
 variant is weaker than one beside it, so that what variants change is stated in variants alone).
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from anyascii import anyascii
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from service.requests.export import FIRST_VERSION
 from service.usd.files import check_suffix
-from service.usd.names import prim_name
 from stage.camera import Camera
+
+NAMELESS = "Asset"
+"""Name of a prim whose text holds no letter and no digit."""
+
+
+def prim_name(text: str) -> str:
+    """Return a valid prim name that keeps the words of a text, which may be in any script.
+
+    Whatever is no letter and no digit separates words, which are joined by _. Only the root prim of an asset is named after a text, so that
+    the name needs to differ from no other.
+    """
+    words = re.findall(r"[A-Za-z0-9_]+", anyascii(text))
+    name = "_".join(words).strip("_") or NAMELESS
+    return f"_{name}" if name[0].isdigit() else name
+
 
 GEO, LOOK, LIGHT = "geo", "look", "light"
 """The variant sets."""
 
+CAMERA_FRAME = "Camera frame: +x right, +y up, +z towards the viewer. Where it comes from is in customLayerData."
+"""The end of the documentation of layers."""
 FRAME_RATE = 24.0
 """Time codes, which are frame numbers, a second."""
 
@@ -59,6 +77,7 @@ class AssetLayers:
         geometry: the stage for everything below `geom`, for cameras and lights.
         materials: the stage for everything below `looks`.
         root: path of the root prim, /Name.
+        packed: whether the asset becomes a package, a .usdz.
         texture_folder: of the textures, relative to the layer of the materials.
         lights: temporary folder of the layers of lights and their textures.
         light_files: the layers of lights.
@@ -72,12 +91,12 @@ class AssetLayers:
             target: the asset that they become.
         """
         self._description = description
-        self._packed = check_suffix(target) == ".usdz"
-        self._interface_file = folder / f"{target.stem}{'.usdc' if self._packed else target.suffix.lower()}"
+        self.packed = check_suffix(target) == ".usdz"
+        self._interface_file = folder / f"{target.stem}{'.usdc' if self.packed else target.suffix.lower()}"
         self._identifier = target.name
         self.root = Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name))
         self._interface = self._create(self._interface_file)
-        if self._packed:
+        if self.packed:
             self.files: tuple[Path, ...] = (self._interface_file,)
             self.geometry = self.materials = self._interface
         else:
@@ -85,7 +104,7 @@ class AssetLayers:
             layers.mkdir()
             self.files = (self._interface_file, *(layers / file for file in LAYER_FILES))
             self.geometry, self.materials = self._create(layers / GEOMETRY), self._create(layers / MATERIALS)
-        self.texture_folder = f"{'.' if self._packed else '..'}/{texture_folder(target)}"
+        self.texture_folder = f"{'.' if self.packed else '..'}/{texture_folder(target)}"
         self._geometries: list[str] = []
         self._first_prims: list[Sdf.Path] = []
         self._surfaces: list[tuple[str, Sdf.Path]] = []
@@ -149,7 +168,7 @@ class AssetLayers:
 
     def set_times(self, usd_stage: Usd.Stage, first: float, last: float) -> None:
         """Let a stage, and the asset that it is a part of, reach from one time code to another, both included."""
-        if not self._packed or usd_stage == self._interface:
+        if not self.packed or usd_stage == self._interface:
             self._times += [first, last]
         _set_times(usd_stage, first, last)
 
@@ -160,16 +179,15 @@ class AssetLayers:
                 self._bind(geometry, surface, name, material)
         for geometry, prim, material in self._bindings:
             self._bind(geometry, prim, None, material)
-        if not self._packed:
+        if not self.packed:
             self._write_payload()
         root = self._interface.GetPrimAtPath(self.root)
         for name in self._geometries:
             with _in_variant(self._interface, self.root, GEO, name):
-                model = UsdGeom.ModelAPI.Apply(root)
-                model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
+                set_extents_hint(root)
         for name in self._looks:
             root.GetVariantSets().AddVariantSet(LOOK).AddVariant(name)
-        lightings = [LIGHT_OFF] if self.light_files and not self._packed else []
+        lightings = [LIGHT_OFF] if self.light_files and not self.packed else []
         for file in self.light_files if lightings else ():
             root.GetVariantSets().AddVariantSet(LIGHT).AddVariant(LIGHT_OFF)
             lightings.append(file.stem)
@@ -211,16 +229,9 @@ class AssetLayers:
         """
         description = self._description
         usd_stage: Usd.Stage = Usd.Stage.CreateNew(str(file))
-        UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
-        UsdGeom.SetStageMetersPerUnit(usd_stage, description.unit_m)
-        root = UsdGeom.Xform.Define(usd_stage, self.root)
-        usd_stage.SetDefaultPrim(root.GetPrim())
-        usd_stage.GetRootLayer().documentation = (
-            f"{description.name}: a measured surface, exported by Relit. Camera frame: "
-            "+x right, +y up, +z towards the viewer. Where it comes from is in customLayerData.")
         camera = {} if description.camera is None else {"relit:camera": description.camera.model_dump_json()}
-        for key, value in sorted({**description.provenance, **camera}.items()):
-            usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+        root = define_root(usd_stage, self.root, unit_m=description.unit_m, provenance={**description.provenance, **camera}, documentation=(
+            f"{description.name}: a measured surface, exported by Relit. {CAMERA_FRAME}"))
         if file == self._interface_file:
             describe_root(root, name=description.name, identifier=self._identifier, version=description.version,
                           provenance=description.provenance)
@@ -228,6 +239,26 @@ class AssetLayers:
         if (posed or file == self._interface_file) and pose is not None:
             root.AddTransformOp().Set(pose_matrix(pose, description.unit_m))
         return usd_stage
+
+
+def define_root(usd_stage: Usd.Stage, path: Sdf.Path, *, unit_m: float = 1.0, provenance: Mapping[str, str] | None = None,
+                documentation: str | None = None) -> UsdGeom.Xform:
+    """Define the default prim of a layer, and say what the layer's axes and unit are, what it is and where it comes from."""
+    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(usd_stage, unit_m)
+    root = UsdGeom.Xform.Define(usd_stage, path)
+    usd_stage.SetDefaultPrim(root.GetPrim())
+    if documentation is not None:
+        usd_stage.GetRootLayer().documentation = documentation
+    for key, value in sorted((provenance or {}).items()):
+        usd_stage.SetMetadataByDictKey("customLayerData", key, value)
+    return root
+
+
+def set_extents_hint(root: Usd.Prim) -> None:
+    """Write the bounding boxes of what lies below a prim, so that viewers know them before they load it."""
+    model = UsdGeom.ModelAPI.Apply(root)
+    model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
 
 
 def describe_root(root: UsdGeom.Xform, *, name: str, identifier: str, version: str, provenance: Mapping[str, str]) -> None:

@@ -8,10 +8,13 @@ attribute, UsdColorSpaceAPI).
 """
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from pxr import Gf, Sdf, Usd, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
+from service.asset.metallic import IOR_LIMITS, MetallicLook
+from service.asset.openpbr import openpbr_document, write_openpbr
 from service.asset.textures import DISPLAY_SPACE, Texture
 from service.usd.layers import AssetLayers
 from service.usd.openpbr import define_materialx_surface
@@ -69,12 +72,29 @@ def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: f
     layers.add_look(SPECULAR, specular)
 
 
+def define_openpbr_looks(layers: AssetLayers, folder: Path, textures: Mapping[str, Texture], look: MetallicLook | None) -> list[Path]:
+    """Define the looks, the metallic one with an OpenPBR surface too, and return the files that the asset has for them.
+
+    Args:
+        layers: of the asset.
+        folder: of the textures; a MaterialX document is written into it, unless the asset is a package, which may hold none.
+        textures: by name.
+        look: of the surface; None: its reflectance is not known.
+    """
+    ior = look.ior if look is not None else IOR_LIMITS[0]
+    document = openpbr_document(textures, ior=ior) if look is not None else None
+    UsdGeom.Scope.Define(layers.materials, layers.looks)
+    define_looks(layers, textures, ior=ior, openpbr=document)
+    files = [folder / texture.file_name for texture in textures.values()]
+    return files if document is None or layers.packed else [*files, write_openpbr(document, folder)]
+
+
 def _define_material(layers: AssetLayers, look: str, name: str, textures: Mapping[str, Texture]) -> UsdShade.Material:
     """Define a material whose inputs read the textures that there are."""
     usd_stage, path = layers.materials, layers.looks.AppendChild(name)
     material = UsdShade.Material.Define(usd_stage, path)
     Usd.ColorSpaceAPI.Apply(material.GetPrim()).CreateColorSpaceNameAttr().Set(Gf.ColorSpaceNames.LinearRec709)
-    surface = _shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
+    surface = define_shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
     surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(int(look == SPECULAR))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", _TYPES.Token))
     if "roughness" not in textures:
@@ -84,21 +104,12 @@ def _define_material(layers: AssetLayers, look: str, name: str, textures: Mappin
             for name, candidates in {**_TEXTURED[look], **_SHARED}.items()}
     if not any(read.values()):
         return material
-    reader = _shader(usd_stage, path.AppendChild("TextureCoordinates"), "UsdPrimvarReader_float2")
-    reader.CreateInput("varname", _TYPES.String).Set("st")
-    coordinates = reader.CreateOutput("result", _TYPES.Float2)
+    coordinates = define_coordinates(layers, path)
     for name, texture in read.items():
         if texture is None:
             continue
         value_type, channel, channel_type = _INPUT_TYPES[name]
-        image = _shader(usd_stage, path.AppendChild(name[0].upper() + name[1:]), "UsdUVTexture")
-        file = image.CreateInput("file", _TYPES.Asset)
-        file.Set(Sdf.AssetPath(f"{layers.texture_folder}/{texture.file_name}"))
-        file.GetAttr().SetColorSpace(texture.color_space)
-        image.CreateInput("st", _TYPES.Float2).ConnectToSource(coordinates)
-        image.CreateInput("sourceColorSpace", _TYPES.Token).Set("sRGB" if texture.color_space == DISPLAY_SPACE else "raw")
-        image.CreateInput("wrapS", _TYPES.Token).Set("clamp")
-        image.CreateInput("wrapT", _TYPES.Token).Set("clamp")
+        image = define_image(layers, path.AppendChild(name[0].upper() + name[1:]), {1: texture.file_name}, texture.color_space, coordinates)
         if name == "normal":
             image.CreateInput("scale", _TYPES.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
             image.CreateInput("bias", _TYPES.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
@@ -106,11 +117,35 @@ def _define_material(layers: AssetLayers, look: str, name: str, textures: Mappin
     return material
 
 
+def define_coordinates(layers: AssetLayers, material: Sdf.Path) -> UsdShade.Output:
+    """Define the reader of the texture coordinates of a material, and return its output."""
+    reader = define_shader(layers.materials, material.AppendChild("TextureCoordinates"), "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", _TYPES.String).Set("st")
+    return reader.CreateOutput("result", _TYPES.Float2)
+
+
+def define_image(layers: AssetLayers, path: Sdf.Path, files: Mapping[int, str], color_space: str,
+                 coordinates: UsdShade.Output) -> UsdShade.Shader:
+    """Define a texture whose file is that of the time code, and the first without a time."""
+    image = define_shader(layers.materials, path, "UsdUVTexture")
+    file = image.CreateInput("file", _TYPES.Asset)
+    file.Set(Sdf.AssetPath(f"{layers.texture_folder}/{files[min(files)]}"))
+    if len(files) > 1:
+        for number, name in files.items():
+            file.Set(Sdf.AssetPath(f"{layers.texture_folder}/{name}"), number)
+    file.GetAttr().SetColorSpace(color_space)
+    image.CreateInput("st", _TYPES.Float2).ConnectToSource(coordinates)
+    image.CreateInput("sourceColorSpace", _TYPES.Token).Set("sRGB" if color_space == DISPLAY_SPACE else "raw")
+    image.CreateInput("wrapS", _TYPES.Token).Set("clamp")
+    image.CreateInput("wrapT", _TYPES.Token).Set("clamp")
+    return image
+
+
 def define_display_color_material(usd_stage: Usd.Stage, path: Sdf.Path) -> UsdShade.Material:
     """Define a Lambertian material at `path` that takes its colour from the primvar displayColor."""
     material = UsdShade.Material.Define(usd_stage, path)
-    surface = _shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
-    reader = _shader(usd_stage, path.AppendChild("DisplayColor"), "UsdPrimvarReader_float3")
+    surface = define_shader(usd_stage, path.AppendChild("Surface"), "UsdPreviewSurface")
+    reader = define_shader(usd_stage, path.AppendChild("DisplayColor"), "UsdPrimvarReader_float3")
     reader.CreateInput("varname", _TYPES.String).Set("displayColor")
     surface.CreateInput("diffuseColor", _TYPES.Color3f).ConnectToSource(reader.CreateOutput("result", _TYPES.Float3))
     surface.CreateInput("useSpecularWorkflow", _TYPES.Int).Set(1)
@@ -120,7 +155,8 @@ def define_display_color_material(usd_stage: Usd.Stage, path: Sdf.Path) -> UsdSh
     return material
 
 
-def _shader(usd_stage: Usd.Stage, path: Sdf.Path, identifier: str) -> UsdShade.Shader:
+def define_shader(usd_stage: Usd.Stage, path: Sdf.Path, identifier: str) -> UsdShade.Shader:
+    """Define a shader."""
     shader = UsdShade.Shader.Define(usd_stage, path)
     shader.CreateIdAttr(identifier)
     return shader

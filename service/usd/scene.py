@@ -1,51 +1,14 @@
-"""The prims of an asset of solved maps: below /Name, Geom/Mesh, Looks/Material and Camera.
+"""The prims of geometry: meshes, points and their primvars.
 
-Source: OpenUSD: UsdGeom (meshes, primvars).
+Source: OpenUSD, UsdGeomMesh, UsdGeomPoints, UsdGeomPrimvar ("Indexed Primvars"): validators ask for indices where a value repeats.
 """
-
-from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from service.asset.mesh import SurfaceMesh
-from service.asset.textures import Texture
-from service.asset.units import SCALE_NOTE
-from service.usd.camera import define_cameras
-from service.usd.layers import AssetLayers
-from service.usd.materials import define_looks
-from stage.maps import SurfaceMaps
 
-
-def define_asset(layers: AssetLayers, maps: SurfaceMaps, meshes: Sequence[SurfaceMesh], textures: Mapping[str, Texture], *,
-                 ior: float, openpbr: Any) -> None:
-    """Define the prims of an asset of solved maps.
-
-    Args:
-        meshes: the full mesh, then its levels of detail.
-        textures: written into the folder that `layers` names.
-        ior: index of refraction of the dielectric share of the surface.
-        openpbr: MaterialX.Document of the surface, or None.
-
-    Convention:
-        The asset is in the camera frame.
-    """
-    if not maps.camera.metric:
-        layers.geometry.GetPrimAtPath(layers.root).SetCustomDataByKey("relit:scale", SCALE_NOTE)
-    with layers.geometry_variant("mesh") as geom:
-        layers.add_surface(define_mesh(layers.geometry, geom.AppendChild("Mesh"), meshes[0]).GetPath())
-    for number, level in enumerate(meshes[1:], start=1):
-        with layers.geometry_variant(level_name(number)) as geom:
-            layers.add_surface(define_mesh(layers.geometry, geom.AppendChild(level_name(number).capitalize()), level).GetPath())
-    UsdGeom.Scope.Define(layers.materials, layers.looks)
-    define_looks(layers, textures, ior=ior, openpbr=openpbr)
-    define_cameras(layers.geometry, layers.root, maps.camera, meshes[0].extent)
-
-
-def level_name(number: int) -> str:
-    """Return the variant of a level of detail, 1 the finest."""
-    return f"lod{number}"
+_ARRAYS = {Sdf.ValueTypeNames.FloatArray: Vt.FloatArray, Sdf.ValueTypeNames.Color3fArray: Vt.Vec3fArray}
 
 
 def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdGeom.Mesh:
@@ -75,3 +38,55 @@ def define_polygons(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, no
     usd_mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals))
     usd_mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     return usd_mesh
+
+
+def set_primvar(prim: UsdGeom.Gprim, name: str, kind: Sdf.ValueTypeName, values: np.ndarray) -> None:
+    """Set a primvar of vertices or points, or of the whole prim where one value is given.
+
+    Args:
+        prim: a mesh or points.
+        name: without "primvars:".
+        kind: FloatArray or Color3fArray.
+        values: [n] or [n, 3]; n is the count of vertices or points, or 1.
+    """
+    interpolation = UsdGeom.Tokens.constant if len(values) == 1 else UsdGeom.Tokens.vertex
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation)
+    first, index = distinct(values)
+    repeated = len(first) < len(values)
+    primvar.Set(_ARRAYS[kind].FromNumpy(np.ascontiguousarray(values[first] if repeated else values, dtype=np.float32)))
+    if repeated:
+        primvar.SetIndices(Vt.IntArray.FromNumpy(index.astype(np.int32)))
+
+
+def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where each different value stands first, and for each value the number of the one that it equals."""
+    columns = values.reshape(len(values), -1).T
+    key = np.zeros(len(values), dtype=np.int64)
+    for column in columns:  # at most as many keys as values, so that the product of two counts stays below 2^63
+        _, part = np.unique(column, return_inverse=True)
+        _, key = np.unique(key * (int(part.max(initial=0)) + 1) + part, return_inverse=True)
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    return first, index
+
+
+def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widths: np.ndarray, *,
+                  normals: np.ndarray | None) -> UsdGeom.Points:
+    """Define points at `path`.
+
+    Args:
+        usd_stage: the stage.
+        path: of the prim.
+        points: [n, 3] in scene units.
+        widths: [n], or [1] for points of one width.
+        normals: [n, 3] unit vectors, or None.
+    """
+    prim = UsdGeom.Points.Define(usd_stage, path)
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
+    each_width = Vt.FloatArray.FromNumpy(np.broadcast_to(widths, len(points)).astype(np.float32))
+    prim.CreateWidthsAttr(each_width)  # one a point: readers that compute an extent give up on one for all
+    prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+    prim.CreateExtentAttr(UsdGeom.Points.ComputeExtent(prim.GetPointsAttr().Get(), each_width))
+    if normals is not None:
+        prim.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32)))
+        prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return prim

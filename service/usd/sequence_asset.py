@@ -7,7 +7,7 @@ Source: OpenUSD, UsdGeomMesh ("Topology, varying"), UsdGeomPointBased, time code
 another.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +17,9 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 from service.asset.errors import AssetError
 from service.usd.camera import define_cameras
 from service.usd.files import write_layer
-from service.usd.layers import PURPOSES, describe_root, pose_matrix
+from service.usd.layers import CAMERA_FRAME, Description, define_root, describe_root, pose_matrix, prim_name, set_extents_hint
 from service.usd.materials import define_display_color_material
-from service.usd.names import prim_name
-from service.usd.primvars import distinct
-from stage.camera import Camera
+from service.usd.scene import distinct
 
 SUFFIXES = (".usdc", ".usdz")
 TIME_DIGITS = 6
@@ -55,24 +53,15 @@ class SequenceSizes(NamedTuple):
     faces: int
 
 
-class SequenceDescription(NamedTuple):
-    """What the asset says about itself."""
-
-    name: str
-    camera: Camera
-    provenance: Mapping[str, str]
-    unit_m: float
-    version: str
-    frames_per_second: float
-
-
-def write_sequence_asset(moments: Iterator[Moment], target: Path, description: SequenceDescription) -> SequenceSizes:
+def write_sequence_asset(moments: Iterator[Moment], target: Path, description: Description, *,
+                         frames_per_second: float) -> SequenceSizes:
     """Write the steps of a sequence as time samples, whole or not at all.
 
     Args:
         moments: in the order of time, one step or more, all with faces or none; each is held only while it is written.
         target: .usdc or .usdz.
-        description: goes into the root prim and the layer.
+        description: goes into the root prim and the layer; it has a camera.
+        frames_per_second: time codes a second.
 
     Raises:
         AssetError: another suffix, no step, or a step without a vertex.
@@ -83,14 +72,22 @@ def write_sequence_asset(moments: Iterator[Moment], target: Path, description: S
     sizes: list[SequenceSizes] = []
 
     def define(usd_stage: Usd.Stage) -> None:
-        sizes.append(_define(usd_stage, moments, target, description))
+        sizes.append(_define(usd_stage, moments, target, description, frames_per_second))
 
     write_layer(target, define)
     return sizes[0]
 
 
-def _define(usd_stage: Usd.Stage, moments: Iterator[Moment], target: Path, description: SequenceDescription) -> SequenceSizes:
-    root = _define_root(usd_stage, target, description)
+def _define(usd_stage: Usd.Stage, moments: Iterator[Moment], target: Path, description: Description,
+            frames_per_second: float) -> SequenceSizes:
+    assert description.camera is not None
+    root = define_root(
+        usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name)), unit_m=description.unit_m,
+        provenance={**description.provenance, "relit:camera": description.camera.model_dump_json()},
+        documentation=f"{description.name}: a measured sequence, exported by Relit. {CAMERA_FRAME}")
+    describe_root(root, name=description.name, identifier=target.name, version=description.version, provenance=description.provenance)
+    if description.camera.world_from_camera is not None:
+        root.AddTransformOp().Set(pose_matrix(description.camera.world_from_camera, description.unit_m))
     steps = vertices = faces = 0
     low, high, first, last = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0.0
     for moment in moments:
@@ -110,30 +107,12 @@ def _define(usd_stage: Usd.Stage, moments: Iterator[Moment], target: Path, descr
         raise AssetError(f"{target}: the sequence has no step")
     usd_stage.SetStartTimeCode(first)
     usd_stage.SetEndTimeCode(last)
-    usd_stage.SetTimeCodesPerSecond(description.frames_per_second)
-    usd_stage.SetFramesPerSecond(description.frames_per_second)
+    usd_stage.SetTimeCodesPerSecond(frames_per_second)
+    usd_stage.SetFramesPerSecond(frames_per_second)
     extent = np.stack([low, high])
     define_cameras(usd_stage, root.GetPath(), description.camera, extent)
-    model = UsdGeom.ModelAPI.Apply(root.GetPrim())
-    model.SetExtentsHint(model.ComputeExtentsHint(UsdGeom.BBoxCache(Usd.TimeCode.Default(), PURPOSES)))
+    set_extents_hint(root.GetPrim())
     return SequenceSizes(steps, vertices, faces)
-
-
-def _define_root(usd_stage: Usd.Stage, target: Path, description: SequenceDescription) -> UsdGeom.Xform:
-    """Define the root prim with its pose, and what the layer says about itself."""
-    UsdGeom.SetStageUpAxis(usd_stage, UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(usd_stage, description.unit_m)
-    usd_stage.GetRootLayer().documentation = (
-        f"{description.name}: a measured sequence, exported by Relit. Camera frame: +x right, +y up, +z towards the viewer. "
-        "Where it comes from is in customLayerData.")
-    for key, value in sorted({**description.provenance, "relit:camera": description.camera.model_dump_json()}.items()):
-        usd_stage.SetMetadataByDictKey("customLayerData", key, value)
-    root = UsdGeom.Xform.Define(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(description.name)))
-    usd_stage.SetDefaultPrim(root.GetPrim())
-    describe_root(root, name=description.name, identifier=target.name, version=description.version, provenance=description.provenance)
-    if description.camera.world_from_camera is not None:
-        root.AddTransformOp().Set(pose_matrix(description.camera.world_from_camera, description.unit_m))
-    return root
 
 
 def _define_geometry(usd_stage: Usd.Stage, root: Sdf.Path, moment: Moment) -> Any:

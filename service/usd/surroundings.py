@@ -1,7 +1,8 @@
-"""What an asset brings along beside its surface, each as a variant that is not selected: lights, an environment, relit frames."""
+"""The files of an asset, and what it brings along as variants that are not selected: lights, an environment, relit frames."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,9 +12,9 @@ from service.asset import card as card_images
 from service.asset.openpbr import DOCUMENT
 from service.asset.textures import FILE_NAMES
 from service.usd.card import define_card
-from service.usd.environment import define_dome, write_dome_texture
-from service.usd.layers import ENVIRONMENT, LAYER_FILES, RIG, AssetLayers, light_folder, texture_folder
-from service.usd.rig import define_rig
+from service.usd.files import install, temporary_folder_beside
+from service.usd.layers import ENVIRONMENT, LAYER_FILES, RIG, AssetLayers, Description, light_folder, texture_folder
+from service.usd.rig import define_dome, define_rig, write_dome_texture
 from stage.camera import Camera
 from stage.capture import Capture
 
@@ -34,45 +35,64 @@ class Surroundings(NamedTuple):
     """As in stage.environment_maps.read_environment, for lat-long maps."""
 
 
-class Written(NamedTuple):
-    """The files of the surroundings."""
+class AssetFiles(NamedTuple):
+    """The files of an asset while it is written."""
 
-    images: list[Path]  # of a card
-    lights: list[Path]  # layers and textures
-    clipped_pixels: dict[str, int]  # what → pixels that did not fit into 0…1
+    layers: AssetLayers
+    textures: Path  # temporary folder of the textures
+    beside: list[Path]  # the files in it that the asset has, in the order in which a package holds them
+    lights: list[Path]  # layers of lights and their textures
 
 
-def define_surroundings(layers: AssetLayers, surroundings: Surroundings, camera: Camera, extent: np.ndarray, folder: Path, *,
-                        packed: bool) -> Written:
+@contextmanager
+def writing_asset(target: Path, description: Description) -> Iterator[AssetFiles]:
+    """Yield the empty layers of an asset, which replaces `target`, whole or not at all, when the block ends.
+
+    Raises:
+        AssetError: another suffix, or what the block raises.
+        StorageError: the disk refuses; what was there before is left as it was.
+    """
+    with temporary_folder_beside(target) as temporary:
+        files = AssetFiles(AssetLayers(temporary, target, description), temporary / texture_folder(target), [], [])
+        files.textures.mkdir()
+        yield files
+        files.layers.save()
+        first, *others = files.layers.files
+        install(target, first, [*others, *files.beside], ours=files_of_assets(target), apart=files.lights)
+
+
+def define_surroundings(files: AssetFiles, surroundings: Surroundings, camera: Camera, extent: np.ndarray) -> dict[str, int]:
     """Define the variants of `light` and `geo` that are asked for, and write their textures.
 
     Args:
+        files: of the asset, to which those of the surroundings are added.
+        surroundings: what the asset brings along.
+        camera: of the asset.
         extent: [2, 3] bounding box of the surface, camera frame, scene units.
-        folder: temporary, of the textures of the surface.
-        packed: for a .usdz, which holds the images of a card as PNG.
+
+    Returns:
+        By what they are, the pixels that did not fit into 0…1.
 
     Raises:
         AssetError: lights that cannot be placed.
         ImageError: an environment or a frame that cannot be used.
         StorageError: a file cannot be read or written.
     """
-    images: list[Path] = []
-    lights: list[Path] = []
-    clipped_pixels: dict[str, int] = {}
+    layers, clipped_pixels = files.layers, {}
     if surroundings.card is not None:
-        written = card_images.write_card(surroundings.card, folder, as_png=packed)
+        written = card_images.write_card(surroundings.card, files.textures, as_png=layers.packed)
         define_card(layers, written, camera, extent)
-        images = [folder / name for names in (written.colours, written.opacities) for name in names.values()]
+        files.beside[:0] = [files.textures / name for names in (written.colours, written.opacities) for name in names.values()]
         clipped_pixels["card"] = written.clipped_pixels
-    if surroundings.rig is not None:
-        lights += define_rig(layers, surroundings.rig, extent)
+    textures = [] if surroundings.rig is None else define_rig(layers, surroundings.rig, extent)
     if surroundings.environment is not None:
         with layers.lighting(ENVIRONMENT) as usd_stage:
             texture = layers.lights / f"{ENVIRONMENT}.exr"
             write_dome_texture(surroundings.environment, texture, clipped=surroundings.clipped)
             define_dome(usd_stage, layers.root.AppendChild(ENVIRONMENT.capitalize()), f"./{texture.name}")
-        lights.append(texture)
-    return Written(images, [*layers.light_files, *lights], clipped_pixels)
+        textures.append(texture)
+    files.lights.extend([*layers.light_files, *textures])
+    return clipped_pixels
 
 
 def files_of_assets(target: Path) -> list[str]:

@@ -10,16 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import packs
+from kernels.errors import ArrayError
 from kernels.relight.basis import gram
-from kernels.relight.beyond import reach
+from kernels.relight.beyond import reach, share_beyond
+from kernels.relight.kernel_quadrature import quadrature_of
+from kernels.relight.latlong import first_of_equals
+from kernels.relight.smooth import share_smooth
 from kernels.relight.tile_basis import light_factor, tile_bases
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
 from service.viewing.held_out import HeldOutLights
-from service.viewing.quadrature import write_quadrature
 from service.viewing.reduction import plane_means, step_within
 from service.viewing.tiling import Tiling, put_together, tile_rows, tiling_of
-from service.viewing.transfer import COLS, FULL, ROWS, transfer_of
+from service.viewing.transfer import COLS, FULL, ROWS, grid_directions, transfer_of
 from stage.ingest import TOP_EXPONENT
 from stage.light_basis import numbers
 from stage.matte import Matte
@@ -149,3 +152,32 @@ def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBa
         whole += float((row.images**2).sum(dtype=np.float64))
         held_out.compare(row.images, shown, inside.reshape(side, -1, side).swapaxes(0, 1)[row.columns].reshape(len(row.columns), -1))
     return float(np.sqrt(left / whole)) if whole > 0 else 0.0
+
+
+def write_quadrature(lights: DistantLights, file: BlockFile) -> dict[str, Any]:
+    """Write what a page needs to share light out as `relit relight --weights kernel` does, and return what view.json says of it.
+
+    Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with
+    them gives the energies of the lights, none below 0 (kernels.relight.kernel_quadrature). Light from beyond them is shared by a table
+    over the grid of directions, since its parts add up (kernels.relight.smooth).
+
+    Args:
+        lights: of the captured images.
+        file: for the blocks.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    kept = first_of_equals(lights.direction)
+    towards = np.ascontiguousarray(lights.direction[kept], dtype=np.float64)
+    solved = quadrature_of(towards)
+    directions = grid_directions(1)[:, 0]
+    beyond = share_beyond(towards, directions)
+    outside = np.zeros((len(directions), len(kept)))
+    try:
+        outside[:] = share_smooth(directions, np.diag(beyond), towards).T
+    except ArrayError:  # too few lights for triangles: the kernel shares that light too
+        beyond = np.zeros(len(directions))
+    return {"range": numbers(solved.range), "kept": [int(index) for index in kept],
+            "inverse": file.append(np.asarray(solved.inverse, dtype=np.float64)),
+            "beyond": file.append(beyond.astype(np.float32)), "outside": file.append(outside.astype(np.float32))}

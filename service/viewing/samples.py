@@ -14,9 +14,9 @@ from service.light.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
 from service.reporting.provenance import other_inputs
 from service.viewing.block_file import BlockFile
-from service.viewing.reduction import step_within
+from service.viewing.reduction import row_bands, step_within
 from service.viewing.result_layers import ResultLayers
-from service.viewing.row_bands import row_bands
+from stage.errors import ResultError
 from stage.ingest import TOP_EXPONENT
 from stage.maps import LOBES, SurfaceMaps
 from stage.point_lights import DistantLights, PlacedLights

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from service.reporting.provenance import REPORT_FILE
 from stage.errors import ResultError, storage
@@ -17,28 +17,20 @@ class _Suspect(BaseModel):
 
 
 class _Factors(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     believed: bool
     factors: list[float] = []
 
 
 class _Estimated(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     factors: list[float] | None = None
 
 
 class _Found(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     light_intensities: _Estimated = _Estimated()
     light_factors: _Factors | None = None
 
 
 class _Report(BaseModel):
-    model_config = ConfigDict(extra="ignore")
-
     warnings: list[str] = []
     suspect_lights: list[_Suspect] = []
     found: _Found = _Found()

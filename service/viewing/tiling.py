@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.reporting.progress import Timings
-from service.viewing.reduction import block_sums, plane_means
-from service.viewing.row_bands import row_bands
+from service.viewing.reduction import block_sums, plane_means, row_bands
 from stage.stack import Stack
 
 LEAST_SIDE = 8

@@ -55,7 +55,7 @@ def find_holes(points: np.ndarray, faces: np.ndarray) -> Holes:
 def area_vectors(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return for each face the vector along its normal that is twice as long as the face is large, [F, 3] float64."""
     first, second, third = (points[corner].astype(np.float64) for corner in faces.T)
-    return _cross(second - first, third - first)
+    return np.cross(second - first, third - first)
 
 
 def _face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -64,12 +64,6 @@ def _face_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     for start in range(0, len(faces), BATCH):
         areas[start:start + BATCH] = np.linalg.norm(area_vectors(points, faces[start:start + BATCH]), axis=1) / 2
     return areas
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross products of vectors [n, 3]."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def _border(count: int, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
@@ -140,6 +134,6 @@ def _measured(a: np.ndarray, b: np.ndarray, edges: np.ndarray, closed: list[bool
     first = np.cumsum(edges) - edges
     centre = np.add.reduceat(a, first) / edges[:, None]
     middle = np.repeat(centre, edges, axis=0)
-    fan = np.add.reduceat(np.linalg.norm(_cross(a - middle, b - middle), axis=1), first) / 2
+    fan = np.add.reduceat(np.linalg.norm(np.cross(a - middle, b - middle), axis=1), first) / 2
     length = np.add.reduceat(np.linalg.norm(b - a, axis=1), first)
     return [Hole(float(length[k]), float(fan[k]), int(edges[k]), centre[k], closed[k]) for k in range(len(edges))]

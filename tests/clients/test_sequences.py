@@ -9,7 +9,8 @@ from pxr import Usd, UsdGeom
 
 from benchmarks.clients import installed
 from benchmarks.clients.render import Client
-from service.usd.sequence_asset import Faces, Moment, SequenceDescription, write_sequence_asset
+from service.usd.layers import Description
+from service.usd.sequence_asset import Faces, Moment, write_sequence_asset
 from stage.camera import Camera
 from tests.clients.programs import require
 
@@ -49,7 +50,7 @@ def test_blender_shows_each_step(faces, suffix, tmp_path):
     require(Client.BLENDER)
     asset = tmp_path / f"walk.{suffix}"
     camera = Camera(projection="orthographic", resolution=(8, 8), pixel_size_m=0.1)
-    write_sequence_asset(moments(faces), asset, SequenceDescription("walk", camera, {}, 1.0, "1", 24))
+    write_sequence_asset(moments(faces), asset, Description("walk", camera, {}), frames_per_second=24)
     python = installed.python_with("bpy", "RELIT_TEST_BLENDER_PYTHON")
     told = subprocess.run([python, "-c", SCRIPT, asset], capture_output=True, text=True, check=True, timeout=300).stdout
     found = json.loads(next(line for line in told.splitlines() if line.startswith("FOUND "))[6:])

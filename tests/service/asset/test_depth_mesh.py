@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.asset.depth_mesh import depth_mesh
+from service.asset.depth import depth_mesh
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps
 

@@ -5,14 +5,16 @@ import OpenImageIO as oiio
 import pytest
 
 from service.captures.inspect import inspect
-from service.captures.picture import MARGIN, REACH, RED, SIDE, SIZE
+from service.captures.picture import BINS, REACH, RED, SIZE, TILE
+from service.light.sheet import GAP, MARGIN, TITLE
 from service.requests.captures import InfoRequest
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
 
 SCENE = make_scene(size=48, lights=12)
-BESIDE = SIZE + 2 * MARGIN
-"""Where what stands beside the dome begins."""
+TOP, LEFT = MARGIN + TITLE, MARGIN
+BELOW, BESIDE = TOP + SIZE + GAP + TITLE, LEFT + SIZE + GAP
+"""Where the first row and column of panels begin, and the second ones."""
 
 
 def drawn(folder, path):
@@ -30,8 +32,7 @@ def red(image):
 
 def frames_of_lights(image):
     """The rows and columns of the solid red frames on the dome: 4 pixels wide, as no letter is."""
-    solid = red(image)[:, :BESIDE]
-    lines = np.lib.stride_tricks.sliding_window_view(solid, (4, 4)).all(axis=(2, 3))
+    lines = np.lib.stride_tricks.sliding_window_view(red(image[TOP:TOP + SIZE, LEFT:LEFT + SIZE]), (4, 4)).all(axis=(2, 3))
     return np.argwhere(lines)
 
 
@@ -48,8 +49,7 @@ def test_a_light_that_disagrees_is_red_where_it_stands(tmp_path):
     assert finding.startswith("frames[].light: readings disagree with those under the other lights in 004.exr (by ")
     assert found.faults == []  # a suspicion
     places = frames_of_lights(image)
-    top, left = MARGIN + 20 + SIZE / 2, MARGIN + SIZE / 2
-    row, col = (places.min(axis=0) + places.max(axis=0) + 3) / 2 - (top, left)
+    row, col = (places.min(axis=0) + places.max(axis=0) + 3) / 2 - SIZE / 2
     assert np.degrees(np.arctan2(-row, col)) == pytest.approx(-135, abs=1)
     assert np.hypot(row, col) == pytest.approx(REACH, abs=4)  # that of the widest light
 
@@ -64,7 +64,7 @@ def test_the_lights_are_where_the_camera_sees_them(tmp_path):
     write_exr(tmp_path / "cap" / "001.exr", dark + [0, 1, 0])
     write_exr(tmp_path / "cap" / "002.exr", dark + [0, 0, 1])
     _, image = drawn(tmp_path / "cap", tmp_path / "a.png")
-    dome = image[MARGIN + 20 : MARGIN + 20 + SIZE, MARGIN : MARGIN + SIZE]
+    dome = image[TOP:TOP + SIZE, LEFT:LEFT + SIZE]
     green, blue = (np.argwhere(dome[..., channel] > dome[..., other] + 0.2) - SIZE / 2 for channel, other in ((1, 2), (2, 1)))
     assert abs(green[:, 0].mean()) < 3 and green[:, 1].mean() == pytest.approx(REACH, abs=3)
     assert abs(blue[:, 1].mean()) < 3 and blue[:, 0].mean() == pytest.approx(-REACH, abs=3)
@@ -76,21 +76,18 @@ def test_saturation_is_red_where_it_is(tmp_path):
     whole[20:28, 24:32] = 20.0
     write_exr(tmp_path / "cap" / "000.exr", whole)
     _, image = drawn(tmp_path / "cap", tmp_path / "a.png")
-    column = image[:, BESIDE:]
-    strong = (column[..., 0] > column[..., 1] + 0.15) & (column[..., 0] > column[..., 2] + 0.15)
-    rows = np.flatnonzero(strong[SIZE // 3 : 2 * SIZE // 3].sum(axis=1) > 20) + SIZE // 3
-    assert len(rows) > 30
-    cols = np.flatnonzero(strong[rows].any(axis=0))
-    share = (cols.max() - cols.min()) / (rows.max() - rows.min())
-    assert share == pytest.approx(1, abs=0.15)  # a square of eight pixels
+    panel = image[BELOW:BELOW + SIZE, LEFT:LEFT + SIZE]
+    strong = (panel[..., 0] > panel[..., 1] + 0.3) & (panel[..., 0] > panel[..., 2] + 0.3)
+    (top, left), (bottom, right) = np.argwhere(strong).min(axis=0), np.argwhere(strong).max(axis=0)
+    assert (top, left, bottom, right) == pytest.approx(np.array([20, 24, 28, 32]) * SIZE / 48, abs=SIZE / 48)
     edit_manifest(tmp_path / "cap", saturation=30.0)
     _, image = drawn(tmp_path / "cap", tmp_path / "b.png")
-    column = image[SIZE // 3 : 2 * SIZE // 3, BESIDE:]
-    assert not ((column[..., 0] > column[..., 1] + 0.3) & (column[..., 0] > column[..., 2] + 0.3)).any()
+    panel = image[BELOW:BELOW + SIZE, LEFT:LEFT + SIZE]
+    assert not ((panel[..., 0] > panel[..., 1] + 0.3) & (panel[..., 0] > panel[..., 2] + 0.3)).any()
 
 
 def test_frames_without_directions_are_in_their_order(tmp_path):
-    """Patterns; one that cannot be read is crossed in red, and the fault is named below."""
+    """Patterns; one that cannot be read is crossed in red."""
     frames = [{"image": f"{i}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)]
     for i in range(4):
         write_exr(tmp_path / "cap" / f"{i}.exr", np.full((12, 16, 3), 0.2 * (i + 1)))
@@ -98,14 +95,14 @@ def test_frames_without_directions_are_in_their_order(tmp_path):
                                       "camera": {"projection": "orthographic", "resolution": [16, 12]}})
     found, image = drawn(tmp_path / "cap", tmp_path / "a.png")
     assert found.faults == [] and not red(image).any()
-    rows, cols = (MARGIN + 100, MARGIN + 100 + SIZE // 2), (MARGIN + 100, MARGIN + 100 + SIZE // 2)
-    levels = [image[row, col, 0] for row in rows for col in cols]
+    row, width = MARGIN + TITLE + TILE + GAP + TITLE + TILE // 2, TILE * 16 // 12 + GAP
+    levels = [image[row, MARGIN + number * width + TILE // 2, 0] for number in range(4)]
     assert levels == sorted(levels) and len(set(levels)) == 4
     write_exr(tmp_path / "cap" / "2.exr", np.full((12, 16, 3), np.nan))
     found, image = drawn(tmp_path / "cap", tmp_path / "b.png")
     assert len(found.faults) == 1 and "2.exr" in found.faults[0]
-    crossed = np.argwhere(red(image[: SIZE + MARGIN]))
-    assert crossed[:, 0].min() > MARGIN + SIZE // 3 and crossed[:, 1].max() < MARGIN + SIZE // 2  # the third of four
+    crossed = np.argwhere(red(image))
+    assert crossed[:, 1].min() >= MARGIN + 2 * width and crossed[:, 1].max() < MARGIN + 3 * width  # the third of four
 
 
 def test_what_is_refused(relit, tmp_path):
@@ -128,8 +125,8 @@ def test_the_histogram_has_every_reading(tmp_path):
     for index in range(4):
         write_exr(folder / f"{index:03d}.exr", np.full((8, 8, 3), (0.6, 0.0375)[index % 2]))
     _, image = drawn(folder, tmp_path / "a.png")
-    bars = image[2 * SIZE // 3 + 60 : SIZE, BESIDE : BESIDE + SIDE].min(axis=-1) > 0.5
+    bars = image[BELOW:BELOW + SIZE, BESIDE:BESIDE + SIZE].min(axis=-1) > 0.5
     lit = np.flatnonzero(bars.sum(axis=0) > 100)
     groups = np.split(lit, np.flatnonzero(np.diff(lit) > 1) + 1)
     assert len(groups) == 2
-    assert groups[1].mean() - groups[0].mean() == pytest.approx(4 * 4 * SIDE / 96, abs=1.5)  # four bins a stop, 96 bins
+    assert groups[1].mean() - groups[0].mean() == pytest.approx(4 * 4 * SIZE / BINS, abs=1.5)  # four bins a stop

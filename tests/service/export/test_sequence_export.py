@@ -130,7 +130,8 @@ SCRIPT = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from service.usd.sequence_asset import Faces, Moment, SequenceDescription, write_sequence_asset
+from service.usd.layers import Description
+from service.usd.sequence_asset import Faces, Moment, write_sequence_asset
 from stage.camera import Camera
 rows, cols = np.indices((300, 300))
 corner = (rows[:-1, :-1] * 300 + cols[:-1, :-1]).ravel()
@@ -140,7 +141,7 @@ def moments():
         points = np.stack([cols, -rows, np.sin(cols / 30 + step)], axis=-1).reshape(-1, 3).astype(np.float32)
         yield Moment(step, points, np.random.default_rng(step).random(points.shape).astype(np.float32), points, faces, None)
 camera = Camera(projection="orthographic", resolution=(300, 300), pixel_size_m=1.0)
-write_sequence_asset(moments(), Path(sys.argv[2]), SequenceDescription("m", camera, {}, 1.0, "1", 24))
+write_sequence_asset(moments(), Path(sys.argv[2]), Description("m", camera, {}), frames_per_second=24)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
 """
 

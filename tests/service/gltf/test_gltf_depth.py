@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from service.asset.depth_mesh import depth_mesh
+from service.asset.depth import depth_mesh
 from service.asset.errors import AssetError
-from service.gltf.depth_asset import write_depth
+from service.gltf.asset import write_depth
 from service.requests.export import Geometry, TextureFormat
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.asset.errors import AssetError
-from service.gltf import container, textures
+from service.gltf import container, materials
 from service.gltf.asset import write_asset
 from service.gltf.container import read_glb
 from stage.errors import StorageError
@@ -28,14 +28,14 @@ def test_full_disk_in_a_texture_leaves_no_trace(older, tmp_path, monkeypatch):
     if older:
         write_asset(SURFACES["diffuse only"], target, name="A")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    written = textures.write_png
+    written = materials.write_png
 
     def fail(path, codes, *, srgb):
         if path.name == "normal.png":  # the last
             raise OSError(errno.ENOSPC, "No space left on device")
         written(path, codes, srgb=srgb)
 
-    monkeypatch.setattr(textures, "write_png", fail)
+    monkeypatch.setattr(materials, "write_png", fail)
     with pytest.raises(StorageError, match="no space left on device") as raised:
         write_asset(SURFACES["everything"], target, name="A")
     assert str(target) in str(raised.value)

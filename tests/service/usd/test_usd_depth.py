@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
-from service.asset.depth_mesh import depth_mesh
+from service.asset.depth import depth_mesh
 from service.asset.errors import AssetError
 from service.requests.export import Geometry
 from service.usd.depth_asset import write_depth

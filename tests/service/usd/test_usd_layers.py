@@ -8,8 +8,7 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 
 from service.usd.files import install, temporary_folder_beside
-from service.usd.layers import LAYER_FILES, AssetLayers, Description
-from service.usd.names import prim_name
+from service.usd.layers import LAYER_FILES, AssetLayers, Description, prim_name
 from service.usd.points import define_points
 from stage.camera import Camera
 from stage.fingerprint import digest

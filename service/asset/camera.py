@@ -1,4 +1,4 @@
-"""Where the capturing camera of an asset stands, and between which distances it sees."""
+"""The capturing camera of an asset: where it stands, between which distances it sees, and the length of a unit of the surface."""
 
 from typing import NamedTuple
 
@@ -29,3 +29,14 @@ def view_of(camera: Camera, extent: np.ndarray) -> View:
         return View(0.0, -nearest / 2, -farthest * 2)
     clearance = ORTHOGRAPHIC_CLEARANCE * camera.width * (camera.pixel_size_m or 1.0)
     return View(nearest + clearance, clearance / 2, 2 * (clearance + nearest - farthest))
+
+
+UNIT_WITHOUT_SCALE_M = 0.001
+"""Metres of a pixel where the capture has no scale, so that the asset has a visible size."""
+
+SCALE_NOTE = "unknown: the capture gives no scale, so one pixel is taken as one millimetre"
+
+
+def unit_in_metres(camera: Camera) -> float:
+    """Return the metres of a unit of the height map: 1, or that of a pixel where the capture has no scale."""
+    return 1.0 if camera.metric else UNIT_WITHOUT_SCALE_M

@@ -1,0 +1,42 @@
+"""The formats that meshes are written in.
+
+To add one, write the functions that its field here names, put a Writer of them into WRITERS under its suffixes, and where `relit export`
+writes it, its suffix into AssetFormat of service/requests/export.py.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, NoReturn
+
+from service.asset.errors import AssetError
+from service.asset.surface import AssetReport
+from service.gltf import asset as gltf
+from service.usd import asset as usd
+from service.usd.depth_asset import write_depth
+from service.usd.fused_asset import write_fused
+from stage.meshes.mesh import write_mesh_ply
+
+
+def _refuse(*given: Any, **options: Any) -> NoReturn:
+    raise AssetError("this format has no place for such a mesh")
+
+
+class Writer(NamedTuple):
+    """The functions that write files of a format, whole or not at all; one that is left out refuses."""
+
+    surface: Callable[..., AssetReport] = _refuse
+    """(SurfaceMaps, path, *, name, version, textures): solved maps with their material and camera."""
+    depth: Callable[..., tuple[str, ...]] = _refuse
+    """(DepthMaps, PointCloud | None, path, *, name, geometry, version, textures): a depth; returns sentences on what the asset lacks."""
+    fused: Callable[..., None] = _refuse
+    """(UnwrappedMesh, BakedImages, path, *, name, provenance): a fused surface with textures."""
+    mesh: Callable[..., None] = _refuse
+    """(TriangleMesh, path, *, comments): a fused surface, or a tile of one, with colours and other values at its vertices."""
+    variants: bool = False
+    """Whether `surface` takes levels and surroundings too: levels of detail, lights, an environment and relit frames."""
+
+
+USD = Writer(usd.write_asset, write_depth, write_fused, variants=True)
+GLTF = Writer(gltf.write_asset, gltf.write_depth)
+PLY = Writer(mesh=write_mesh_ply)
+WRITERS = {".usda": USD, ".usdc": USD, ".usdz": USD, ".glb": GLTF, ".ply": PLY}
+"""By the suffix of the file."""
