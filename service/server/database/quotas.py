@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.errors import RequestError
-from service.server.database import exclusive
+from service.server.database.engine import lock_project
 from service.server.database.tables import intakes, jobs, uploads
 from service.server.settings import Settings
 from service.views.states import ACTIVE, READY
@@ -43,7 +43,7 @@ def require(connection: sa.Connection, settings: Settings, quota: str, project: 
     limit = settings.quota_of(project, quota)
     if limit is None:
         return
-    exclusive.lock(connection, exclusive.PROJECT, project)
+    lock_project(connection, project)
     used = USED[quota](connection, project)
     if used + more > limit:
         raise QuotaExceeded(quota, project, limit, used, more)

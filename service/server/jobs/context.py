@@ -1,10 +1,12 @@
 """What the steps of a job are given: the worker that does them, and the job."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
@@ -59,12 +61,14 @@ class Job(NamedTuple):
     request: JobRequest
     chunk_frames: int
     attempt: int = 1
+    is_resumed: bool = False
+    """Whether it has lost a worker since it last made progress."""
 
     @classmethod
-    def of(cls, row: "dict[str, object]") -> "Job":
+    def of(cls, row: sa.RowMapping | Mapping[str, Any]) -> "Job":
         """Read a row of the jobs table."""
-        return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])),
-                   int(str(row["attempt"])))
+        return cls(row["id"], row["project"], ANY_JOB.validate_python(row["request"]), row["chunk_frames"], row["attempt"],
+                   row["lost"] > 0 or row["lost_repeating"] > 0)
 
 
 SEQUENCE = "sequence"
@@ -78,5 +82,7 @@ class JobStep(NamedTuple):
     run: Callable[[Progress], None]
     frames: int = 0
     """Number of frames that the step makes, at the same time as other workers make those of other steps."""
+    made: Callable[[], int] = lambda: 0
+    """Returns how many of these frames this machine has."""
     help: Callable[[Progress], None] | None = None
     """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""

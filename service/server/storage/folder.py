@@ -1,4 +1,7 @@
-"""Storage in the data folder. Writers rename complete files into place: a file whose name has no leading dot is complete."""
+"""The storage that the settings name, and storage in the data folder.
+
+Writers rename complete files into place: a file whose name has no leading dot is complete.
+"""
 
 import os
 import secrets
@@ -9,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from service.reporting.progress import Progress
+from service.server.settings import Settings
 from stage.errors import storage
 
 REMOVED = "removed"
@@ -16,6 +20,10 @@ REMOVED = "removed"
 MARKS = "projects/*/*/*"
 REMEMBERED_S = 3 * 86_400.0
 """Seconds for which a removed prefix is remembered: longer than a writer that was under way goes on."""
+
+
+SCRATCH = "scratch"
+"""Name of the folder, in the data folder, for copies of objects."""
 
 
 class StoredFile(NamedTuple):
@@ -162,12 +170,13 @@ class FolderStorage:
         return OpenFile(descriptor, status.st_size, status.st_mtime, f"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}")
 
     def remove(self, prefix: str) -> None:
-        """Delete the folder; it is hidden first, so that a part of it is not shown. A mark of the prefix stays for REMEMBERED_S."""
+        """Delete the folder, if there is one; it is hidden first, so that a part of it is not shown. A mark stays for REMEMBERED_S."""
         folder, mark = self._root / prefix, self._root / REMOVED / prefix
-        with storage("remove", folder):
-            mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.touch()
-            drop_folder(folder)
+        if folder.is_dir():
+            with storage("remove", folder):
+                mark.parent.mkdir(parents=True, exist_ok=True)
+                mark.touch()
+                drop_folder(folder)
 
     def leftovers(self) -> list[str]:
         """Return the prefixes that are marked as removed and are folders again."""
@@ -187,6 +196,21 @@ class FolderStorage:
         with storage("write in", self._root):
             probe.write_bytes(b"relit")
             probe.unlink()
+
+
+def open_storage(settings: Settings) -> Storage:
+    """Open the storage that the settings name; nothing is written into it.
+
+    Raises:
+        RequestError: storage_url cannot be used.
+    """
+    if settings.storage_url is None:
+        return FolderStorage(settings.data)
+    from service.server.storage.bucket import Bucket
+    from service.server.storage.objects import ObjectStorage
+    from service.server.storage.scratch import Scratch
+
+    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))
 
 
 def _sync(folder: Path) -> None:
@@ -220,9 +244,11 @@ def drop_hidden(root: Path) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Delete the temporary files that a killed writer left."""
-    for path in folder.rglob(".*"):
-        if path.is_file():
+    """Delete the temporary files and folders that a killed writer left; no writer that lives may have any there."""
+    for path in list(folder.rglob(".*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 

@@ -21,7 +21,7 @@ from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.folder import Storage
-from service.server.storage.part_files import READ, PartFile, PartFileLocked, part_files_folder, stored_bytes
+from service.server.storage.part_files import READ, PartFile, PartFileLocked, leftovers, part_files_folder, stored_bytes
 from stage.errors import storage as storage_errors
 
 LEASE_S, RENEW_S = 30.0, 10.0
@@ -95,8 +95,10 @@ class FolderParts:
         PartFile.discard(self._folder, upload)
 
     def expire(self, before: float) -> int:
-        """Delete rows and part files."""
-        return uploads.expire(self._database, self._folder, before)
+        """Delete rows that no request has locked, with their part files, and part files without a row."""
+        removed = _drop_untouched(self, self._database, before)
+        _drop_leftovers(self._database, self._folder, before)
+        return removed
 
 
 class StoredPart(PartFile):
@@ -223,20 +225,11 @@ class StoredParts:
 
     def expire(self, before: float) -> int:
         """Delete rows that no request has locked, with their pieces, and pieces and files without a row."""
-        removed = 0
-        for row in uploads.untouched(self._database, before):
-            try:
-                part = self.open(row)
-            except PartFileLocked:
-                continue
-            with part:
-                if uploads.drop_untouched(self._database, row["id"], before):
-                    part.drop()
-                    removed += 1
+        removed = _drop_untouched(self, self._database, before)
         old = {found.name.partition("/")[0] for found in self._storage.files(layout.PIECES) if found.modified_at < before}
         for upload in old - uploads.unfinished_of(self._database, old):
             self.discard(upload)
-        uploads.drop_leftovers(self._database, self._folder, before)
+        _drop_leftovers(self._database, self._folder, before)
         return removed
 
     def fetched(self, upload: Row) -> list[Path]:
@@ -275,6 +268,28 @@ class StoredParts:
                 uploads.renew(self._database, writers, time.time() + LEASE_S)
             except UNANSWERED as error:
                 logger.warning("locks of uploads are not renewed", error=message_of(error))
+
+
+def _drop_untouched(parts: UploadParts, database: Database, before: float) -> int:
+    """Delete the uploads that were not continued since a time and that no request has locked; return their number."""
+    removed = 0
+    for row in uploads.untouched(database, before):
+        try:
+            part = parts.open(row)
+        except PartFileLocked:
+            continue
+        with part:
+            if uploads.drop_untouched(database, row["id"], before):
+                part.drop()
+                removed += 1
+    return removed
+
+
+def _drop_leftovers(database: Database, folder: Path, before: float) -> None:
+    """Delete the part files that were not written since a time and have no upload."""
+    old = set(leftovers(folder, before))
+    for identifier in old - uploads.unfinished_of(database, old):
+        PartFile.discard(folder, identifier)
 
 
 def open_upload_parts(settings: Settings, database: Database, storage: Storage) -> UploadParts:
