@@ -10,10 +10,8 @@ from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, local_command
 from service.cli.sequences import check_single, print_sequence
 from service.errors import RequestError
-from service.requests.depth import DepthRequest
+from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
-from service.requests.scan import ScanRequest
-from service.requests.separate import SeparateRequest
 from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest
 
 PlanOption = Annotated[bool, typer.Option("--plan", help="Print images, time and precision of every code.")]

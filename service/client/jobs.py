@@ -9,7 +9,7 @@ from service.client.errors import FileError, JobEnded
 from service.client.events import follow
 from service.client.transfer import TransferProgress
 from service.reporting.progress import Progress
-from service.requests.job import JobRequest
+from service.requests.base import JobRequest
 from service.views.jobs import JobPage, JobView, ResultPage, ResultView
 from service.views.states import SUCCEEDED, JobState
 

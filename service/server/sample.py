@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from service.requests.base import JobRequest
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
-from service.requests.job import JobRequest
 from service.requests.jobs import CheckJob, PipelineJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server.database import intakes, jobs

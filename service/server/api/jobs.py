@@ -10,8 +10,8 @@ from fastapi.openapi.models import Example
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
 from pydantic_core import CoreSchema, core_schema
 
+from service.requests.base import JobRequest
 from service.requests.identifiers import JobId
-from service.requests.job import JobRequest
 from service.requests.jobs import CheckJob, UserJob
 from service.server.api.context import (
     FOR_WORK,

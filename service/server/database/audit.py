@@ -27,14 +27,7 @@ TRIGGERS = {"sqlite": ("relit_audit_update", "relit_audit_delete"), "postgresql"
 
 
 def record(connection: sa.Connection, caller: Caller, action: str, target: str) -> None:
-    """Write that a caller changed an object, in the transaction of the change.
-
-    Args:
-        connection: of the transaction.
-        caller: who sent the request.
-        action: such as `job.cancel`.
-        target: identifier of the object.
-    """
+    """Write that a caller changed an object, in the transaction of the change; an action is such as `job.cancel`."""
     request = structlog.contextvars.get_contextvars().get("request")
     _insert(connection, caller.project, caller.key or ANONYMOUS, action, target, request)
 

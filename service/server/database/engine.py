@@ -86,11 +86,7 @@ class Database:
 
 
 def connect(url: str, *, connections: int = 10) -> Database:
-    """Open a database; nothing is created.
-
-    Args:
-        url: of SQLAlchemy: sqlite:///path or postgresql+psycopg://….
-        connections: number of connections at most.
+    """Open a database by its URL for SQLAlchemy (sqlite:///path or postgresql+psycopg://…); nothing is created.
 
     Raises:
         DatabaseError: the URL is malformed or of another database.
@@ -112,11 +108,7 @@ def connect(url: str, *, connections: int = 10) -> Database:
 
 
 def open_database(settings: Settings, prepare: Callable[[Settings, Database], None]) -> Database:
-    """Open the database that the settings name.
-
-    Args:
-        settings: of the service.
-        prepare: makes the tables, or checks that they exist.
+    """Open the database that the settings name; `prepare` makes the tables, or checks that they exist.
 
     Raises:
         RequestError: the data folder or the database cannot be used.

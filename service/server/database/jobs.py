@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from service import __version__
+from service.requests.base import JobRequest
 from service.requests.identifiers import JOB, new_id
-from service.requests.job import JobRequest
 from service.server.database.engine import Database, lock_project, storable
 from service.server.database.tables import intakes, job_inputs, job_log, jobs, newest_first
 from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
@@ -92,15 +92,7 @@ def find(database: Database, job: str, project: str | None = None) -> sa.RowMapp
 
 def latest(database: Database, project: str, *, states: Sequence[str] = (), limit: int, before: tuple[float, str] | None = None,
            ) -> list[sa.RowMapping]:
-    """Return a page of the jobs of a project, the newest first.
-
-    Args:
-        database: of the service.
-        project: of the jobs.
-        states: only jobs in these states; empty: all jobs.
-        limit: number of jobs at most.
-        before: creation time and identifier of the last job of the previous page.
-    """
+    """Return a page of the jobs of a project, the newest first; `before` has time and identifier of the last of the page before."""
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
         query = query.where(jobs.c.state.in_(states))
@@ -108,12 +100,7 @@ def latest(database: Database, project: str, *, states: Sequence[str] = (), limi
 
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
-    """Return identifier, project and revision of jobs.
-
-    Args:
-        database: of the service.
-        topics: identifiers of jobs, and projects: of a project, the jobs that have not ended or ended lately.
-    """
+    """Return identifier, project and revision of jobs, and of those of projects that have not ended or ended lately."""
     return database.rows(WATCHED, topics=list(topics), since=time.time() - LATELY_S)
 
 
@@ -231,15 +218,10 @@ def end(database: Database, claim: Claim, state: str, error: str | None = None) 
 
 
 def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> str | None:
-    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost too many workers without progress.
+    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost more than `limit`.
 
     A worker that died in a stage that an earlier worker came through was hardly killed by the job. So it does not count, unless there are
     REPEATED times `limit` of them.
-
-    Args:
-        connection: of the caller's transaction.
-        claim: of the dead worker.
-        limit: number of workers that a job may lose without progress.
 
     Returns:
         The new state of the job; None if it had ended.

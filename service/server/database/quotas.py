@@ -30,12 +30,7 @@ class QuotaExceeded(RequestError):
 def require(connection: sa.Connection, settings: Settings, quota: str, project: str, more: int) -> None:
     """Check a quota before something is added in the caller's transaction; other requests of the project wait for its end.
 
-    Args:
-        connection: of the transaction.
-        settings: of the service.
-        quota: BYTES, CAPTURES, JOBS or PIXELS.
-        project: that is to have more.
-        more: what will be added, in the unit of the quota.
+    `more` is what will be added, in the unit of the quota, which is BYTES, CAPTURES, JOBS or PIXELS.
 
     Raises:
         QuotaExceeded: the project would have more than it may.

@@ -167,14 +167,7 @@ clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's
 
 
 def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
-    """Return the query of one page of rows, the newest first.
-
-    Args:
-        query: selects rows of the table.
-        table: jobs or intakes.
-        limit: number of rows at most.
-        before: creation time and identifier of the last row of the previous page; None: the first page.
-    """
+    """Return the query of one page of rows, the newest first; `before` has creation time and identifier of the last of the page before."""
     if before is not None:
         query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(*before))
     return query.order_by(table.c.created_at.desc(), table.c.id.desc()).limit(limit)

@@ -26,14 +26,6 @@ class PathTaken(Exception):
 def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
     """Insert an upload without bytes; the caller has locked the intake.
 
-    Args:
-        connection: of the caller's transaction.
-        identifier: of the upload.
-        project, intake: to which it belongs.
-        path: within the capture, checked.
-        length: of the complete file, bytes.
-        sha256: of the complete file; None: it is not known.
-
     Raises:
         PathTaken: another file has the path.
     """

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from service.requests.base import JobRequest
 from service.requests.calibration_jobs import (
     BallJob,
     CalibrationJob,
@@ -21,7 +22,6 @@ from service.requests.calibration_jobs import (
     TofCalibrationJob,
     WhiteBalanceJob,
 )
-from service.requests.job import JobRequest
 from service.server.jobs.places import StepFiles, file_within, files_within
 from stage.manifest import FILE_NAME
 

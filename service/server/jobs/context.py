@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.requests.job import JobRequest
+from service.requests.base import JobRequest
 from service.requests.jobs import ANY_JOB
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue

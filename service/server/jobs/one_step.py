@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from service.reporting.provenance import name_place
+from service.requests.base import JobRequest
 from service.requests.basis import BasisKind
-from service.requests.job import JobRequest
 from service.requests.jobs import (
     BasisJob,
     ExportJob,
@@ -45,7 +45,7 @@ def export(request: ExportJob, files: StepFiles) -> None:
 
 def _join(request: JoinJob, files: StepFiles) -> None:
     from service.joining.join import join
-    from service.requests.join import JoinRequest
+    from service.requests.solve import JoinRequest
 
     join(JoinRequest(maps=files.maps(request.maps), depth=files.maps(request.depth), out=files.out, device=files.device), files.progress)
 
@@ -85,7 +85,7 @@ def _basis(request: BasisJob, files: StepFiles) -> None:
 
 def _separate(request: SeparateJob, files: StepFiles) -> None:
     from service.depth.separate import separate
-    from service.requests.separate import SeparateRequest
+    from service.requests.depth import SeparateRequest
 
     separate(SeparateRequest(capture=files.intake(request.capture), out=files.out, device=files.device,
                              cache=files.cache(request.capture), **dict(request.options)), files.progress)
@@ -93,7 +93,7 @@ def _separate(request: SeparateJob, files: StepFiles) -> None:
 
 def _scan(request: ScanJob, files: StepFiles) -> None:
     from service.depth.scan import scan
-    from service.requests.scan import ScanRequest
+    from service.requests.depth import ScanRequest
 
     scan(ScanRequest(scan=files.intake(request.capture), out=files.out, device=files.device, **dict(request.options)), files.progress)
 
@@ -121,7 +121,7 @@ def _inspect_board(request: InspectBoardJob, files: StepFiles) -> None:
 
 def _gauge_board(request: GaugeBoardJob, files: StepFiles) -> None:
     from service.boards.gauge_board import gauge_board
-    from service.requests.gauge_board import GaugeBoardRequest
+    from service.requests.inspect_board import GaugeBoardRequest
 
     with tempfile.TemporaryDirectory(prefix="relit-gauge-") as made:
         folder = Path(made)

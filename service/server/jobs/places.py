@@ -94,11 +94,6 @@ class StepFiles(NamedTuple):
 def file_within(capture: Path, name: str, field: str) -> Path:
     """Return the path of a file in the folder of a capture, beside those that the manifest names.
 
-    Args:
-        capture: folder of the capture.
-        name: path of the file relative to it, as the job gives it.
-        field: field of the job, for the message.
-
     Raises:
         RequestError: the name leads out of the folder, or there is no such file.
     """

@@ -10,7 +10,7 @@ import time
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
 
-from service.requests.job import JobRequest
+from service.requests.base import JobRequest
 from service.requests.jobs import CheckJob
 from service.server.database import jobs
 from service.server.database.engine import Database

@@ -2,7 +2,7 @@
 
 DBOS 3.4 sets the priority of a workflow only when it is queued, and a new attempt would lose the place among equals. With SQLite it counts
 whole seconds, and orders the jobs of one second and one priority by their random names. So this writes the two columns by which DBOS orders
-its queues; tests/service/server/jobs/test_queue_order.py fails if a later version orders them otherwise.
+its queues; `test_workers_take_jobs_by_priority_and_time_and_projects_take_turns` fails if a later version orders them otherwise.
 """
 
 import sqlalchemy as sa
@@ -12,13 +12,7 @@ SCHEMAS = {"sqlite": None, "postgresql": "dbos"}
 
 
 def set_order(connection: sa.Connection, workflow: str, **values: int) -> None:
-    """Set the priority of a queued workflow, of which the lowest goes first, or the time at which it was queued.
-
-    Args:
-        connection: of the caller's transaction.
-        workflow: its name.
-        values: `priority`, or `created_at` in milliseconds since 1970.
-    """
+    """Set the priority of a queued workflow, of which the lowest goes first, or `created_at`, in milliseconds since 1970."""
     workflows = sa.table("workflow_status", sa.column("workflow_uuid", sa.Text), *map(sa.column, values),
                          schema=SCHEMAS[connection.dialect.name])
     connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(**values))

@@ -22,13 +22,7 @@ TIME_STEP = "step"
 
 
 def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> list[JobStep]:
-    """Return the steps of a solve or a depth.
-
-    Args:
-        job: the job, or a part of it is the solve.
-        request: names the capture.
-        context: of the worker.
-    """
+    """Return the steps of a solve or a depth."""
     def step(name: str, number: int | None) -> JobStep:
         """Return the step that does the capture, or the time step `number` of a sequence."""
         if isinstance(request, SolveJob):

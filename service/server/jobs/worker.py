@@ -33,13 +33,7 @@ NICENESS = 5
 
 
 def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
-    """Do jobs until SIGTERM or until the parent process ends, then end this process.
-
-    Args:
-        settings: of the service.
-        device: cpu, cuda:0, …
-        heartbeat: shared with the supervisor.
-    """
+    """Do jobs until SIGTERM or until the parent process ends, then end this process."""
     os.nice(NICENESS)
     ending = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())

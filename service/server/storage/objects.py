@@ -163,12 +163,7 @@ def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], No
               progress: Progress | None) -> None:
     """Transfer files, several at one time; the first error ends all transfers, as does an exception of `progress`.
 
-    Args:
-        stage: name of the stage.
-        items: to transfer.
-        move: transfers one item, calls its second argument after every piece, and returns name and version.
-        entry: records name and version.
-        progress: called whenever bytes were transferred, so that silence means that nothing moves.
+    `move` transfers one item, calls its second argument after every piece, and returns the name and the version.
     """
     if not items:
         return

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from service.server.database import uploads
 from service.server.database.engine import UNANSWERED, Database, message_of
@@ -28,70 +28,47 @@ LEASE_S, RENEW_S = 30.0, 10.0
 """Seconds after which a writer that no longer says that it lives counts as dead, and between two times that it says so."""
 
 
-class UploadParts(Protocol):
-    """The part files of all incomplete uploads."""
-
-    saves_while_writing: bool
-    """Whether bytes can be counted before a request has ended."""
-
-    def open(self, upload: Row) -> PartFile:
-        """Open and lock the part file of an upload.
-
-        Raises:
-            PartFileLocked: another request has locked it.
-            StorageError: it cannot be written.
-        """
-
-    def save(self, part: PartFile, upload: str, at: int) -> bool:
-        """Count the first `at` bytes, which are on the disk; return False if the upload was deleted, or another request has it now."""
-
-    def whole(self, part: PartFile) -> Path:
-        """Return the complete file, all bytes of which have come."""
-
-    def finish(self, part: PartFile, upload: str, length: int) -> bool:
-        """Record that the complete file is in the storage; return False if the upload was deleted, or another request has it now."""
-
-    def size(self, upload: Row) -> int:
-        """Return the number of bytes that are kept of an upload, of which some may not be counted yet."""
-
-    def discard(self, upload: str) -> None:
-        """Delete what is kept of an upload that was deleted, whether or not it is locked."""
-
-    def expire(self, before: float) -> int:
-        """Delete uploads that were not continued since a time (seconds since 1970), and parts without an upload; return their number."""
+UploadParts: TypeAlias = "FolderParts | StoredParts"
+"""The bytes of all incomplete uploads."""
 
 
 class FolderParts:
     """Part files in the data folder, which all API processes of a service share."""
 
     saves_while_writing = True
+    """Whether bytes can be counted before a request has ended."""
 
     def __init__(self, folder: Path, database: Database) -> None:
         """Args: folder: of the part files. database: of the service."""
         self._folder, self._database = folder, database
 
     def open(self, upload: Row) -> PartFile:
-        """Open and lock the file, which is made if there is none."""
+        """Open and lock the part file of an upload, which is made if there is none.
+
+        Raises:
+            PartFileLocked: another request has locked it.
+            StorageError: it cannot be written.
+        """
         return PartFile.open(self._folder, upload["id"])
 
     def save(self, part: PartFile, upload: str, at: int) -> bool:
-        """Record the offset."""
+        """Count the first `at` bytes, which are on the disk; return False if the upload was deleted, or another request has it now."""
         return uploads.advance(self._database, upload, at)
 
     def whole(self, part: PartFile) -> Path:
-        """Return the part file."""
+        """Return the complete file, all bytes of which have come."""
         return part.path
 
     def finish(self, part: PartFile, upload: str, length: int) -> bool:
-        """Record that the upload is complete."""
+        """Record that the complete file is in the storage; return as `save` does."""
         return uploads.finish(self._database, upload, length)
 
     def size(self, upload: Row) -> int:
-        """Return the size of the part file."""
+        """Return the number of bytes that are kept of an upload, of which some may not be counted yet."""
         return stored_bytes(self._folder, upload["id"])
 
     def discard(self, upload: str) -> None:
-        """Delete the part file."""
+        """Delete what is kept of an upload that was deleted, whether or not it is locked."""
         PartFile.discard(self._folder, upload)
 
     def expire(self, before: float) -> int:

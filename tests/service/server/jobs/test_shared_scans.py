@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.fuse import FuseOptions, FuseRequest
 from service.requests.identifiers import JOB, new_id
 from service.requests.jobs import FuseJob, RegisterJob
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseOptions, FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from service.server.database import jobs
