@@ -21,7 +21,8 @@ from service.server.jobs.worker_lock import FileWorkerLock
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.folder import Storage, drop_folder
+from service.server.storage.folder import drop_folder
+from service.server.storage.objects import Storage
 from service.server.storage.upload_parts import open_upload_parts
 from stage.errors import StorageError
 

@@ -30,7 +30,7 @@ from service.server.log import logger
 from service.server.malloc import keep_freed_blocks, share_one_arena
 from service.server.processes import configure, hear_signals
 from service.server.settings import Settings
-from service.server.storage.folder import Storage, open_storage
+from service.server.storage.objects import Storage, open_storage
 
 CLOSE_S = 5
 """Seconds that open requests, streams of events among them, may take to end when the service ends."""

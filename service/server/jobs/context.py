@@ -15,7 +15,7 @@ from service.requests.jobs import ANY_JOB
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
-from service.server.storage.folder import Storage
+from service.server.storage.objects import Storage
 
 
 class WorkerContext(NamedTuple):

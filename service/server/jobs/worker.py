@@ -21,7 +21,7 @@ from service.server.jobs.takeover import Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
 from service.server.log import logger
 from service.server.settings import Settings
-from service.server.storage.folder import open_storage
+from service.server.storage.objects import open_storage
 
 POLL_S = 0.5
 """Seconds between two looks into a queue."""

@@ -1,7 +1,4 @@
-"""The storage that the settings name, and storage in the data folder.
-
-Writers rename complete files into place: a file whose name has no leading dot is complete.
-"""
+"""Storage in the data folder. Writers rename complete files into place: a file whose name has no leading dot is complete."""
 
 import os
 import secrets
@@ -9,24 +6,16 @@ import shutil
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from service.reporting.progress import Progress
-from service.server.settings import Settings
 from stage.errors import storage
-
-if TYPE_CHECKING:
-    from service.server.storage.objects import ObjectStorage
 
 REMOVED = "removed"
 """What precedes the marks of prefixes that are removed: in the data folder an empty file for each that was removed lately."""
 MARKS = "projects/*/*/*"
 REMEMBERED_S = 3 * 86_400.0
 """Seconds for which a removed prefix is remembered: longer than a writer that was under way goes on."""
-
-
-SCRATCH = "scratch"
-"""Name of the folder, in the data folder, for copies of objects."""
 
 
 class StoredFile(NamedTuple):
@@ -46,10 +35,6 @@ class OpenFile(NamedTuple):
     modified_at: float
     version: str
     """The same from every machine as long as the content is the same: letters, digits and hyphens."""
-
-
-Storage: TypeAlias = "FolderStorage | ObjectStorage"
-"""Where files of the service lie. A prefix is one of service.server.storage.layout."""
 
 
 class FolderStorage:
@@ -158,21 +143,6 @@ class FolderStorage:
         with storage("write in", self._root):
             probe.write_bytes(b"relit")
             probe.unlink()
-
-
-def open_storage(settings: Settings) -> Storage:
-    """Open the storage that the settings name; nothing is written into it.
-
-    Raises:
-        RequestError: storage_url cannot be used.
-    """
-    if settings.storage_url is None:
-        return FolderStorage(settings.data)
-    from service.server.storage.bucket import Bucket
-    from service.server.storage.objects import ObjectStorage
-    from service.server.storage.scratch import Scratch
-
-    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))
 
 
 def _sync(folder: Path) -> None:

@@ -20,7 +20,7 @@ from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.folder import Storage
+from service.server.storage.objects import Storage
 from service.server.storage.part_files import READ, PartFile, PartFileLocked, leftovers, part_files_folder, stored_bytes
 from stage.errors import storage as storage_errors
 

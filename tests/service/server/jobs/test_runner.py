@@ -11,7 +11,7 @@ from service.server.jobs import runner as runner_module
 from service.server.jobs.context import JobStep, WorkerContext
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
 from service.server.storage import layout
-from service.server.storage.folder import open_storage
+from service.server.storage.objects import open_storage
 from stage.errors import StorageError
 from stage.files import write_text
 from tests.service.server.jobs.harness import PROJECT

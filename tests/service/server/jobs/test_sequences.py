@@ -17,7 +17,7 @@ from service.server.database import jobs
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
 from service.server.settings import Settings
-from service.server.storage.folder import open_storage
+from service.server.storage.objects import open_storage
 from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step

@@ -14,7 +14,7 @@ from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import _parts, steps_of
 from service.server.storage import layout
-from service.server.storage.folder import open_storage
+from service.server.storage.objects import open_storage
 from stage import exr
 from stage.errors import StageError
 from tests.scenes.captures import make_scene, write_capture

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from service.server.storage.bucket import PIECE_BYTES
-from service.server.storage.folder import FolderStorage, Storage
+from service.server.storage.folder import FolderStorage
+from service.server.storage.objects import Storage
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
