@@ -102,8 +102,7 @@ class JobQueue:
 
     def workers_on(self, job: str) -> set[str]:
         """Return the names of the workers that do a job or help with it."""
-        return {status.executor_id or "" for status in self._client.list_workflows(
-            workflow_id_prefix=f"{job}.", status="PENDING", app_version=VERSION, load_input=False, load_output=False)}
+        return {worker for worker, workflows in self.taken_by().items() if any(name.startswith(f"{job}.") for name in workflows)}
 
     def end_help(self, workflow: str) -> None:
         """Queue the help of a worker that died no more: the worker that has the job does what is left."""
