@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
 from stage.scans.ply_points import read_ply_points
 from tests.scenes.clouds import all_around, entry

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.file_mutations import write_between
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
 from stage.camera import Camera
 from stage.maps import SurfaceMaps

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.file_mutations import write_between
-from service.requests.fuse import FuseRequest
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from stage.depth_maps import DepthMaps

@@ -18,8 +18,7 @@ import OpenImageIO as oiio
 
 from benchmarks.many_views import off_surface, write_scans
 from service.light.sheet import BACKGROUND, INK, write_sheet
-from service.requests.fuse import FuseRequest
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from stage.colour import pixels_of

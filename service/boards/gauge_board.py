@@ -10,7 +10,7 @@ import numpy as np
 
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
-from service.requests.gauge_board import GaugeBoardRequest
+from service.requests.inspect_board import GaugeBoardRequest
 from stage import inputs
 from stage.board.gauge import GaugeStudy, gauge_study
 from stage.board.records import STUDY_SCHEMA, GaugeRuns

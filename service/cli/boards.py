@@ -5,8 +5,7 @@ import typer
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.requests.gauge_board import GaugeBoardRequest
-from service.requests.inspect_board import InspectBoardRequest
+from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
 
 MOST_PRINTED = 10
 """Findings that are printed; the table has all."""

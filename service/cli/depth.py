@@ -9,10 +9,8 @@ from service.cli.printing import check_single, counted, print_sequence, print_wa
 from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import Given, local_command
 from service.errors import RequestError
-from service.requests.depth import DepthRequest
+from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
-from service.requests.scan import ScanRequest
-from service.requests.separate import SeparateRequest
 from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest
 
 PlanOption = Annotated[bool, typer.Option("--plan", help="Print images, time and precision of every code.")]

@@ -7,7 +7,7 @@ from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest
-from service.requests.join import JoinRequest
+from service.requests.solve import JoinRequest
 
 
 def register(app: typer.Typer) -> None:

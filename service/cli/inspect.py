@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from service.cli.request_commands import local_command
-from service.requests.inspect import InspectRequest
+from service.requests.export import InspectRequest
 
 if TYPE_CHECKING:
     from service.asset.inspection import Inspection, Part

@@ -5,8 +5,7 @@ import typer
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.requests.fuse import FuseRequest
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseRequest, RegisterRequest
 
 
 def register(app: typer.Typer) -> None:

@@ -13,9 +13,9 @@ from service.cli.progress import ProgressBar
 from service.cli.request_commands import Given, command
 from service.cli.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, WaitOption, connected, make_folder, wait_for
 from service.requests.address import DEFAULT_SERVER
+from service.requests.base import JobRequest
 from service.requests.frame_range import frame_numbers
 from service.requests.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
-from service.requests.job import JobRequest
 from service.requests.jobs import JOBS
 from service.requests.options import Option, help_text, is_document, options_of
 from stage.records import read_record, schema_of

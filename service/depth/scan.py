@@ -17,7 +17,7 @@ from service.depth.solution import srgb_bytes, white_of
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.scan import ScanRequest
+from service.requests.depth import ScanRequest
 from service.usd.points import write_points
 from stage.files import write_text
 from stage.fingerprint import Fingerprints

@@ -19,7 +19,7 @@ from service.depth.solution import statistics
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.separate import SeparateRequest
+from service.requests.depth import SeparateRequest
 from stage import exr
 from stage.capture import Capture
 from stage.colour_spaces import linear_space

@@ -13,7 +13,7 @@ from kernels.surface.joined import Joined, join_depth
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
-from service.requests.join import JoinRequest
+from service.requests.solve import JoinRequest
 from service.solve.parts import numbered
 from stage.camera import Camera
 from stage.depth_maps import DEPTH_FILE, DepthMaps

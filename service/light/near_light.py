@@ -8,7 +8,7 @@ import numpy as np
 from kernels.relight import sources
 from kernels.relight.marching import grouped
 from kernels.relight.sources import Sources, far, join
-from service.requests.near_lights import PointLight, RectangleLight, SphereLight
+from service.requests.shade import PointLight, RectangleLight, SphereLight
 
 NEAR_MARCHES = 48
 """Number of places on an area light to which shadows are marched: its penumbra has steps of 2 %."""

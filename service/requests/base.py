@@ -9,7 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, GetJsonSchemaHandler
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -166,3 +166,12 @@ class StackOptions(PixelOptions):
     def aligned(self) -> bool:
         """Return whether frames are warped."""
         return self.align or self.align_to is not None
+
+
+class JobRequest(Options):
+    """Base of every job."""
+
+    name: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$"), Role.RUN, Spelling(flag="--job-name", metavar="TEXT")] = ""
+    """Name of the job, shown in lists; it need not be unique."""
+    priority: Annotated[int, Field(ge=0, le=100), Role.RUN] = 50
+    """0 to 100: jobs of higher priority are done first, those of equal priority in the order of submission."""

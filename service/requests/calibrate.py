@@ -1,5 +1,6 @@
 """What `relit calibrate` takes: one frozen model for each kind."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, Self
 
@@ -69,11 +70,15 @@ def board_corners(given: Any) -> Any:
     return tuple(map(int, parts))
 
 
-def _square(side_m: float) -> float:
-    if side_m > LARGEST_SQUARE_M:
-        _refuse(f"--square-m {side_m:g}: is {side_m:g} m, more than a square of a chessboard has: give metres, such as "
-                f"{side_m / 1000:g} for {side_m:g} mm")
-    return side_m
+def _in_metres(given_m: float | None, *, option: str, what: str) -> Any:
+    """Return a length, which is refused where it seems to be in millimetres."""
+    if given_m is not None and given_m > LARGEST_SQUARE_M:
+        _refuse(f"{option} {given_m:g}: is {given_m:g} m, more than {what} has: give metres, such as {given_m / 1000:g} for {given_m:g} mm")
+    return given_m
+
+
+SquareSide = AfterValidator(partial(_in_metres, option="--square-m", what="a square of a chessboard"))
+StepHeight = AfterValidator(partial(_in_metres, option="--step-m", what="a step"))
 
 
 def _levels(given: Any) -> Any:
@@ -222,7 +227,7 @@ class BoardOptions(Options):
 
     board: Annotated[tuple[Corners, Corners], BeforeValidator(board_corners), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
-    square_m: Annotated[Positive, AfterValidator(_square)]
+    square_m: Annotated[Positive, SquareSide]
     """Side of a square in metres."""
 
 
@@ -253,21 +258,14 @@ class StereoRequest(BoardOptions):
     """Another capture of the same cameras, whose manifest is written too; may be repeated."""
 
 
-def _height(height_m: float | None) -> float | None:
-    if height_m is not None and height_m > LARGEST_SQUARE_M:
-        _refuse(f"--step-m {height_m:g}: is {height_m:g} m, more than a step has: give metres, such as {height_m / 1000:g} for "
-                f"{height_m:g} mm")
-    return height_m
-
-
 class LaserPlanesOptions(Options):
     """What the stripes of the laser fall on: a chessboard, or a step."""
 
     board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
     """Inner corners of the chessboard, across and down."""
-    square_m: Annotated[Positive | None, AfterValidator(lambda side: side and _square(side))] = None
+    square_m: Annotated[Positive | None, SquareSide] = None
     """Side of a square of the chessboard in metres."""
-    step_m: Annotated[Positive | None, AfterValidator(_height)] = None
+    step_m: Annotated[Positive | None, StepHeight] = None
     """Height in metres of a right-angled block on a flat base, which needs no board."""
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Role, Spelling
+from service.requests.base import CAPTURE, JobRequest, Role, Spelling
 from service.requests.calibrate import (
     IMAGES,
     LEAST_GREYS,
@@ -20,7 +20,6 @@ from service.requests.calibrate import (
     WhiteBalanceOptions,
 )
 from service.requests.identifiers import CaptureId
-from service.requests.job import JobRequest
 from stage.model import Line
 
 MOST_CAPTURES = 100

@@ -1,11 +1,11 @@
-"""What `relit depth` takes."""
+"""What `relit depth`, `relit scan` and `relit separate` take."""
 
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
-from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, SequenceRequest, Spelling
+from service.requests.base import CAPTURE, Choice, Commas, DeviceRequest, Options, PixelOptions, Request, Role, SequenceRequest, Spelling
 from stage.model import Finite, Fraction, NotNegative, Positive
 
 
@@ -102,3 +102,41 @@ class DepthRequest(DepthOptions, SequenceRequest):
     of its pixels sees the same place, and both cameras are triangulated by their `world_from_camera`."""
     tof: TofOptions = TofOptions()
     """How time of flight is solved, with the camera's calibration; `near_m` and `far_m` are ranges along the ray there."""
+
+
+class ScanOptions(Options):
+    """Which returns count, and what is written."""
+
+    near_m: Positive | None = None
+    """Returns nearer than this, in metres, are left out."""
+    far_m: Positive | None = None
+    """Returns farther than this, in metres, are left out."""
+    las: bool = False
+    """Write points.las (LAS 1.4) too; needs laspy: pip install 'relit[las]'."""
+
+
+class ScanRequest(ScanOptions, DeviceRequest):
+    """Shots of a scanning laser, from a platform that may move, as one point cloud."""
+
+    scan: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
+    """A folder with a scan.json, or the file."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for points.ply, points.usdc and report.json, and points.las if `las` is given."""
+
+
+class SeparateOptions(PixelOptions):
+    """Which frames are used, and how."""
+
+    period_px: Positive | None = None
+    """Period of the phase frames to use, in projector pixels; None: the shortest of the capture, which must not exceed 64."""
+    black_level: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
+    """Light of the projector's black as a fraction of its white, for a capture without a black frame."""
+
+
+class SeparateRequest(SeparateOptions, Request):
+    """Direct and global light of a capture under fine, shifted phase patterns."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for separation.exr and report.json."""

@@ -1,11 +1,11 @@
-"""What `relit export` takes."""
+"""What `relit export` and `relit inspect` take."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.requests.base import Choice, PixelOptions, Role, Spelling
+from service.requests.base import Choice, Options, PixelOptions, Role, Spelling
 from stage.model import Line
 
 AssetFormat = Literal["usdz", "usda", "usdc", "glb"]
@@ -65,3 +65,12 @@ class ExportRequest(ExportOptions):
     card: Annotated[Path | None, Role.INPUT, Spelling(metavar="FRAMES")] = None
     """Relit frames of the capture, such as frame.####.exr: they come along on a rectangle in the plane of the image, as a variant of the
     geometry. For .usdz, .usda and .usdc of solved maps."""
+
+
+class InspectRequest(Options):
+    """Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, provenance, validators."""
+
+    asset: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="ASSET")]
+    """The asset: .usdz, .usda, .usdc, .usd or .glb."""
+    as_json: Annotated[bool, Role.RUN, Spelling(flag="--json")] = False
+    """Print JSON, with whole texts and every number."""

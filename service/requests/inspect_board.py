@@ -1,4 +1,4 @@
-"""What `relit inspect-board` takes."""
+"""What `relit inspect-board` and `relit gauge-board` take."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -63,3 +63,12 @@ class InspectBoardRequest(InspectBoardOptions, DeviceRequest):
         if self.regions is not None and self.golden is None:
             raise ValueError("regions are given without golden: they are judged on the height map of a good board; a design has its own")
         return self
+
+
+class GaugeBoardRequest(Options):
+    """Repeatability and reproducibility of inspections of the same boards (gauge R&R)."""
+
+    study: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="STUDY")]
+    """The study: which result of relit inspect-board is of which board and operator (JSON, schema relit.gauge-study/1)."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for gauge.csv and report.json."""

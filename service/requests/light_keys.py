@@ -1,6 +1,6 @@
 """Light keys: a JSON file that animates lights, environment, captured images and exposure (schema relit.keys/1, docs/relight.md)."""
 
-from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -73,20 +73,11 @@ def _in_order(keys: tuple[AnyKey, ...]) -> tuple[AnyKey, ...]:
     return keys
 
 
-def _no_opposites(keys: Sequence[Key], field: str) -> None:
+def _no_opposites(keys: tuple[AnyKey, ...], *, field: str) -> tuple[AnyKey, ...]:
     for index, (one, other) in enumerate(pairwise(keys), start=1):
         cosine = sum(a * b for a, b in zip(getattr(one, field), getattr(other, field), strict=True))
         if one.interpolation == "linear" and cosine < OPPOSITE:
             raise ValueError(f"key {index}: its {field} is opposite to the one before: give a key between, so that the way is known")
-
-
-def _ways(keys: tuple[LightKey, ...]) -> tuple[LightKey, ...]:
-    _no_opposites(keys, "direction")
-    return keys
-
-
-def _axes(keys: tuple[EnvironmentKey, ...]) -> tuple[EnvironmentKey, ...]:
-    _no_opposites(keys, "axis")
     return keys
 
 
@@ -106,7 +97,7 @@ class LightTrack(Strict):
     name: Text
     color_space: Annotated[ColorSpaceName, AfterValidator(_linear)] = "lin_rec709_scene"
     """The colour space of the irradiance."""
-    keys: Annotated[tuple[LightKey, ...], Some, FirstFault, InOrder, AfterValidator(_ways)]
+    keys: Annotated[tuple[LightKey, ...], Some, FirstFault, InOrder, AfterValidator(partial(_no_opposites, field="direction"))]
 
 
 class CapturedTrack(Strict):
@@ -122,7 +113,7 @@ class LightKeys(Strict):
     schema_: Literal["relit.keys/1"] = Field(alias="schema")
     frames_per_second: FrameRate | None = None
     """Frames per second, for whoever plays the frames: keys stand at frame numbers."""
-    environment: Annotated[tuple[EnvironmentKey, ...], FirstFault, InOrder, AfterValidator(_axes)] = ()
+    environment: Annotated[tuple[EnvironmentKey, ...], FirstFault, InOrder, AfterValidator(partial(_no_opposites, field="axis"))] = ()
     lights: Annotated[tuple[LightTrack, ...], FirstFault] = ()
     captured: Annotated[tuple[CapturedTrack, ...], FirstFault] = ()
     exposure: Annotated[tuple[ExposureKey, ...], FirstFault, InOrder] = ()

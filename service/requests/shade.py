@@ -1,12 +1,122 @@
 """What `relit shade` takes."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple, Self
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from service.requests.base import PixelOptions, Request, Role, Spelling
-from service.requests.near_lights import POINT_FORM, RECTANGLE_FORM, SPHERE_FORM, GivenPoint, GivenRectangle, GivenSphere
 from service.requests.picture import PictureOptions
 from stage.model import Finite, FirstFault
+
+Vector = tuple[float, float, float]
+RIGHT_ANGLE = 1e-3
+"""How far the cosine between the edges of a rectangle may be from 0."""
+
+
+BRIGHTEST = 1e15
+"""The largest value of a light: far brighter than half can show, and safe from overflow."""
+
+
+class _Member(NamedTuple):
+    name: str
+    numbers: int
+
+
+def _light(value: Vector) -> Vector:
+    if min(value) < 0 or max(value) > BRIGHTEST:
+        raise ValueError(f"light is 0 or more in every channel, and {BRIGHTEST:g} at the most")
+    return value
+
+
+Light = Annotated[Vector, AfterValidator(_light)]
+
+
+class _NearLight(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class PointLight(_NearLight):
+    """A point light: irradiance = intensity · cos^anisotropy / distance²."""
+
+    position_m: Vector
+    """Position in the camera frame, in metres; in pixels where the maps have no scale."""
+    intensity: Light
+    axis: Vector | None = None
+    """Direction in which it shines; None: evenly in all."""
+    anisotropy: float = Field(default=0.0, ge=0)
+    """Exponent of the cosine about the axis."""
+
+    @model_validator(mode="after")
+    def _aimed(self) -> Self:
+        if (self.axis is None) != (self.anisotropy == 0):
+            raise ValueError("a lobe has an axis and an anisotropy above 0: give both or neither")
+        if self.axis is not None and not any(self.axis):
+            raise ValueError("the axis has no direction")
+        return self
+
+
+class SphereLight(_NearLight):
+    """A sphere of even radiance."""
+
+    center_m: Vector
+    radius_m: float = Field(gt=0)
+    radiance: Light
+
+
+class RectangleLight(_NearLight):
+    """A rectangle of even radiance that shines to one side, against edge_u × edge_v, as a UsdLux RectLight does."""
+
+    center_m: Vector
+    edge_u_m: Vector
+    """Vector from one end of the edge to the other."""
+    edge_v_m: Vector
+    radiance: Light
+
+    @model_validator(mode="after")
+    def _right_angle(self) -> Self:
+        u, v = (sum(x * x for x in edge) for edge in (self.edge_u_m, self.edge_v_m))
+        across = sum(a * b for a, b in zip(self.edge_u_m, self.edge_v_m, strict=True))
+        if not u * v > 0 or abs(across) > RIGHT_ANGLE * (u * v) ** 0.5:
+            raise ValueError("edges of a rectangle have a length and stand at a right angle")
+        return self
+
+
+def _read(form: str, parts: tuple[_Member, ...], optional: int = 0) -> Any:
+    """Return a validator that reads `a,b,c,…`; lists of JSON become tuples."""
+    whole, least = sum(part.numbers for part in parts), sum(part.numbers for part in parts[: len(parts) - optional])
+
+    def read(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+        if not isinstance(given, str):
+            return given
+        try:
+            numbers = [float(word) for word in given.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (least, whole):
+            raise ValueError(f"{given!r} is not {form}")
+        found: dict[str, Any] = {}
+        for part in parts:
+            taken, numbers = numbers[: part.numbers], numbers[part.numbers :]
+            if taken:
+                found[part.name] = taken[0] if part.numbers == 1 else tuple(taken)
+        return found
+
+    return read
+
+
+POINT_FORM = "x,y,z,r,g,b[,ax,ay,az,anisotropy]"
+SPHERE_FORM = "x,y,z,radius,r,g,b"
+RECTANGLE_FORM = "x,y,z,ux,uy,uz,vx,vy,vz,r,g,b"
+
+GivenPoint = Annotated[PointLight, BeforeValidator(_read(POINT_FORM, (
+    _Member("position_m", 3), _Member("intensity", 3), _Member("axis", 3), _Member("anisotropy", 1)), optional=2))]
+GivenSphere = Annotated[SphereLight, BeforeValidator(_read(SPHERE_FORM, (
+    _Member("center_m", 3), _Member("radius_m", 1), _Member("radiance", 3))))]
+GivenRectangle = Annotated[RectangleLight, BeforeValidator(_read(RECTANGLE_FORM, (
+    _Member("center_m", 3), _Member("edge_u_m", 3), _Member("edge_v_m", 3), _Member("radiance", 3))))]
 
 
 class ShadeOptions(PictureOptions, PixelOptions):

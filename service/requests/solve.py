@@ -1,11 +1,11 @@
-"""What `relit solve` takes."""
+"""What `relit solve` and `relit join` take."""
 
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Choice, Role, SequenceRequest, Spelling, StackOptions
+from service.requests.base import CAPTURE, Choice, Request, Role, SequenceRequest, Spelling, StackOptions
 from stage.model import Fraction, Line, Positive
 
 SVBRDF_LIGHTS = 12
@@ -72,3 +72,14 @@ class SolveRequest(SolveOptions, SequenceRequest):
     device, else the CPU."""
     reference_ball: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """Capture of a ball of the object's material under the same lights, for the method reference."""
+
+
+class JoinRequest(Request):
+    """One surface from solved maps and a depth of the same view: the detail of the normals, and the shape and place of the depth."""
+
+    maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="MAPS")]
+    """Folder with the maps.exr of `relit solve`, or the file."""
+    depth: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DEPTH")]
+    """Folder with the depth.exr of `relit depth` by the same camera from the same place, or the file."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for maps.exr and report.json."""

@@ -13,7 +13,7 @@ from service.errors import RequestError
 from service.export.writers import WRITERS
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.bake import bake
 from service.scans.fused_bricks import FusedBricks, fused_bricks
 from service.scans.fused_mesh import SEEN_BY, scan_facts, short, triangle_mesh

@@ -17,7 +17,7 @@ from kernels import device as devices
 from kernels.fusion.bricks import BRICK_VOXELS
 from service.errors import RequestError
 from service.reporting.progress import Timings
-from service.requests.fuse import FuseRequest, Misplaced
+from service.requests.register import FuseRequest, Misplaced
 from service.scans.misplaced import Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.scans.placing_words import placing_warnings

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from service.requests.fuse import Misplaced
+from service.requests.register import Misplaced
 from service.scans.misplaced import LEAST_COMMON, Placing
 
 

@@ -13,7 +13,7 @@ from service.server.database import jobs, keys, workers
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import require_current
 from service.server.settings import Settings, unknown_variables
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from service.views.states import ACTIVE, ENDED
 from stage.errors import StorageError
 

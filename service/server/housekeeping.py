@@ -13,7 +13,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from service.server.database import idempotency, intakes, jobs, workers
+from service.server.database import audit, idempotency, intakes, jobs, workers
 from service.server.database.clock import ClockWatch
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.jobs.queue import JobQueue
@@ -21,7 +21,8 @@ from service.server.jobs.worker_lock import FileWorkerLock
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.folder import Storage, drop_folder
+from service.server.storage.folder import drop_folder
+from service.server.storage.objects import Storage
 from service.server.storage.upload_parts import open_upload_parts
 from stage.errors import StorageError
 
@@ -94,7 +95,7 @@ class Housekeeper:
     def _aged(self) -> None:
         """Remove what is old, unless the clock that says so has jumped."""
         if self._watch.steady():
-            for piece in (self._jobs, self._uploads, self._tokens):
+            for piece in (self._jobs, self._uploads, self._tokens, self._audit):
                 self._try(piece.__name__.strip("_"), piece)
 
     def _jobs(self) -> None:
@@ -109,7 +110,7 @@ class Housekeeper:
         if self._database.transact(partial(_forget, job=row["id"])):
             self._storage.remove(layout.results(row["project"], row["id"]))
             self._storage.remove(layout.shared(row["project"], row["id"]))
-            self._queue.forget(row["id"], row["attempt"])
+            self._queue.forget(row["id"])
             logger.info("job removed", job=row["id"], project=row["project"])
 
     def _uploads(self) -> None:
@@ -119,6 +120,12 @@ class Housekeeper:
 
     def _tokens(self) -> None:
         self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
+
+    def _audit(self) -> None:
+        now = self._clock()
+        removed = audit.prune(self._database, before=now - self._settings.audit_days * DAY_S, now=now)
+        if removed:
+            logger.info("lines of the audit log removed", count=removed)
 
     def _workers(self) -> None:
         silent = {row["id"] for row in workers.not_seen_since(self._database, self._clock() - FORGET_S)}

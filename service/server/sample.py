@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from service.requests.base import JobRequest
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
-from service.requests.job import JobRequest
 from service.requests.jobs import CheckJob, PipelineJob, ViewJob
 from service.requests.relight import RelightOptions
 from service.server.database import intakes, jobs
@@ -17,7 +17,7 @@ from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT
 from service.server.jobs.queue import JobQueue
 from service.server.storage import layout
-from service.server.storage.folder import Storage
+from service.server.storage.objects import Storage
 from service.views.states import REFUSED, SUCCEEDED
 
 OPTIONS = RelightOptions(frames="1-24", spin_degrees=360.0)

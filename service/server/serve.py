@@ -27,8 +27,7 @@ from service.server.jobs.supervisor import Supervisor
 from service.server.log import logger
 from service.server.processes import configure, hear_signals
 from service.server.settings import Settings
-from service.server.storage.folder import Storage
-from service.server.storage.open import open_storage
+from service.server.storage.objects import Storage, open_storage
 
 CLOSE_S = 5
 """Seconds that open requests, streams of events among them, may take to end when the service ends."""
@@ -54,8 +53,6 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     limits = limits_of(settings, raise_descriptors())
     listening = _listen(settings)
     database = open_database(settings, prepare)
-    if database.is_sqlite:  # a server of PostgreSQL has connections for several processes, which others may need
-        database.open_connections()
     supervisor = Supervisor(settings, devices.of_workers(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)

@@ -181,6 +181,8 @@ class Settings(BaseSettings):
     """Hours after which an upload that was not continued is deleted."""
     retention_days: Positive | None = None
     """Days after which an ended job and its results are deleted; without it never."""
+    audit_days: Positive = 400.0
+    """Days after which lines of the audit log are deleted."""
     cache_bytes: Count | None = None
     """Bytes of image stacks that are cached at most, beyond which the longest unused go; without it only those of deleted captures."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"

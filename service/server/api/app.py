@@ -17,7 +17,7 @@ from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
 from service.server.settings import Settings
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts
 
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""

@@ -23,7 +23,7 @@ from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings, is_loopback
-from service.server.storage.folder import Storage
+from service.server.storage.objects import Storage
 from service.server.storage.upload_parts import UploadParts
 
 ANONYMOUS = Caller(DEFAULT_PROJECT, Scope.ADMIN, None)

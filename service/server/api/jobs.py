@@ -10,15 +10,15 @@ from fastapi.openapi.models import Example
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
 from pydantic_core import CoreSchema, core_schema
 
+from service.requests.base import JobRequest
 from service.requests.identifiers import JobId
-from service.requests.job import JobRequest
 from service.requests.jobs import CheckJob, UserJob
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.api.views import job_view, log_view
-from service.server.database import audit, idempotency, job_log, jobs, quotas
+from service.server.database import audit, idempotency, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from service.views import states
@@ -110,7 +110,7 @@ def get_job(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
 def get_log(service: ServiceDep, caller: Reader, job: JobName) -> JobLog:
     """Return what happened to a job and when: its stages, workers that it lost, and how it ended."""
     view(service, caller, job)
-    return log_view(job_log.read(service.database, job))
+    return log_view(jobs.log_of(service.database, job))
 
 
 @router.post("/{job}/cancel", status_code=202, responses=responses(404, 409), summary="Cancel a job")
@@ -167,7 +167,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
         raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
     service.storage.remove(layout.results(caller.project, job))
     service.storage.remove(layout.shared(caller.project, job))
-    service.queue.forget(job, before.attempt)
+    service.queue.forget(job)
 
 
 def view(service: Service, caller: Caller, job: str) -> JobView:

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 
 import sqlalchemy as sa
 
-from service.requests.base import SequenceOptions
+from service.requests.base import JobRequest, SequenceOptions
 from service.requests.calibration_jobs import TofCalibrationJob
 from service.requests.export import AssetFormat
 from service.requests.frame_range import frame_numbers
-from service.requests.job import JobRequest
 from service.requests.jobs import (
     CheckJob,
     DepthJob,

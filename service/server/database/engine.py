@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -15,9 +15,8 @@ from service.server.settings import Settings
 T = TypeVar("T")
 BUSY_MS = 30_000
 """Milliseconds for which a write on SQLite waits for that of another process."""
-STATEMENTS = 24
-"""Prepared statements that a connection of SQLite keeps: the 128 of Python in each connection take minutes to fill, and 2 MB; with these a
-request takes no more processor time."""
+PROJECT = 11
+"""Seed of the hash of projects' names, so that these advisory locks do not coincide with those of other programs."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 UNANSWERED = (OperationalError, InterfaceError, InternalError, PoolTimeoutError)
 """Exceptions of a database that may answer later: it restarts, its disk is full, or it is locked for long."""
@@ -81,29 +80,13 @@ class Database:
         with self.engine.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
 
-    def open_connections(self) -> None:
-        """Open all connections that the pool may keep, so that none is opened, and fills its caches, when requests first coincide.
-
-        Raises:
-            DBAPIError: the database does not answer.
-        """
-        pool = self.engine.pool
-        assert isinstance(pool, sa.QueuePool), "connect makes it"
-        with ExitStack() as opened:
-            for _ in range(pool.size()):
-                opened.enter_context(self.engine.connect())
-
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
 
 
 def connect(url: str, *, connections: int = 10) -> Database:
-    """Open a database; nothing is created.
-
-    Args:
-        url: of SQLAlchemy: sqlite:///path or postgresql+psycopg://….
-        connections: number of connections at most.
+    """Open a database by its URL for SQLAlchemy (sqlite:///path or postgresql+psycopg://…); nothing is created.
 
     Raises:
         DatabaseError: the URL is malformed or of another database.
@@ -111,8 +94,7 @@ def connect(url: str, *, connections: int = 10) -> Database:
     try:
         parsed = sa.make_url(url)
         if parsed.get_backend_name() == "sqlite":
-            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30,
-                                      connect_args={"cached_statements": STATEMENTS})
+            engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30)
             sa.event.listen(engine, "connect", _sqlite)
         elif parsed.get_backend_name() == "postgresql":
             engine = sa.create_engine(parsed, pool_size=connections, max_overflow=0, pool_timeout=30, pool_pre_ping=True,
@@ -126,11 +108,7 @@ def connect(url: str, *, connections: int = 10) -> Database:
 
 
 def open_database(settings: Settings, prepare: Callable[[Settings, Database], None]) -> Database:
-    """Open the database that the settings name.
-
-    Args:
-        settings: of the service.
-        prepare: makes the tables, or checks that they exist.
+    """Open the database that the settings name; `prepare` makes the tables, or checks that they exist.
 
     Raises:
         RequestError: the data folder or the database cannot be used.
@@ -163,6 +141,24 @@ def _sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = "IMMEDIATE"  # a write takes the lock at its beginning, so that none fails halfway
     for pragma in (f"busy_timeout={BUSY_MS}", "journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
         connection.execute(f"PRAGMA {pragma}")
+
+
+def lock_project(connection: sa.Connection, project: str) -> None:
+    """Wait until no other transaction has the lock of a project, and keep it until this one ends; what the others wrote is then seen.
+
+    So a transaction can count what a project has before it adds to it, whichever API process runs it.
+    """
+    if connection.dialect.name == "postgresql":
+        connection.execute(sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :space))"), {"name": project, "space": PROJECT})
+    else:
+        begin_writing(connection)
+
+
+def begin_writing(connection: sa.Connection) -> None:
+    """Begin the transaction on SQLite, which has one writer at a time; its driver would begin at the first statement that changes rows."""
+    driver = connection.connection.dbapi_connection
+    if connection.dialect.name == "sqlite" and driver is not None and not driver.in_transaction:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 def storable(text: str) -> str:

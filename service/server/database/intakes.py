@@ -72,14 +72,7 @@ def begin_check(connection: sa.Connection, identifier: str) -> bool:
 
 
 def accept(database: Database, identifier: str, facts: dict[str, Any], allow: Callable[[sa.Connection], None] | None = None) -> None:
-    """Record that the check found nothing wrong, and the facts that it found.
-
-    Args:
-        database: of the service.
-        identifier: of the intake.
-        facts: of the check.
-        allow: called in the transaction; raises if the project may not have it. None: it may.
-    """
+    """Record the facts of a check that found nothing wrong; `allow` is called in the transaction, and raises if the project may not."""
     _judge(database, identifier, allow, state=READY, facts=facts, problem=None)
 
 

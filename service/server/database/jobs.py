@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
+from service import __version__
+from service.requests.base import JobRequest
 from service.requests.identifiers import JOB, new_id
-from service.requests.job import JobRequest
-from service.server.database import exclusive, job_log
-from service.server.database.engine import Database, storable
-from service.server.database.tables import intakes, job_inputs, jobs, newest_first
+from service.server.database.engine import Database, lock_project, storable
+from service.server.database.tables import intakes, job_inputs, job_log, jobs, newest_first
 from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 
 FRAMES = "frames"
@@ -23,6 +23,8 @@ PATIENCE_S = 600.0
 """How long a change by a worker waits for a database that does not answer."""
 LATELY_S = 60.0
 """How long `watched` returns a job after it ended; the clocks of workers may differ by this much."""
+MOST_ENTRIES = 1000
+"""Most entries of the log of a job; what comes after is not recorded."""
 OF_IDENTIFIERS = sa.select(jobs).where(jobs.c.id.in_(sa.bindparam("jobs", expanding=True)))
 WATCHED = sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(sa.or_(
     jobs.c.id.in_(sa.bindparam("topics", expanding=True)),
@@ -90,15 +92,7 @@ def find(database: Database, job: str, project: str | None = None) -> sa.RowMapp
 
 def latest(database: Database, project: str, *, states: Sequence[str] = (), limit: int, before: tuple[float, str] | None = None,
            ) -> list[sa.RowMapping]:
-    """Return a page of the jobs of a project, the newest first.
-
-    Args:
-        database: of the service.
-        project: of the jobs.
-        states: only jobs in these states; empty: all jobs.
-        limit: number of jobs at most.
-        before: creation time and identifier of the last job of the previous page.
-    """
+    """Return a page of the jobs of a project, the newest first; `before` has time and identifier of the last of the page before."""
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
         query = query.where(jobs.c.state.in_(states))
@@ -106,12 +100,7 @@ def latest(database: Database, project: str, *, states: Sequence[str] = (), limi
 
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
-    """Return identifier, project and revision of jobs.
-
-    Args:
-        database: of the service.
-        topics: identifiers of jobs, and projects: of a project, the jobs that have not ended or ended lately.
-    """
+    """Return identifier, project and revision of jobs, and of those of projects that have not ended or ended lately."""
     return database.rows(WATCHED, topics=list(topics), since=time.time() - LATELY_S)
 
 
@@ -122,7 +111,7 @@ def revisions(database: Database, identifiers: Sequence[str]) -> dict[str, sa.Ro
 
 def count_queued(connection: sa.Connection, project: str, key: str | None) -> int:
     """Return how many jobs of a key are queued; other requests of the project wait for the end of the caller's transaction."""
-    exclusive.lock(connection, exclusive.PROJECT, project)
+    lock_project(connection, project)
     query = sa.select(sa.func.count()).where(jobs.c.project == project, jobs.c.state == QUEUED,
                                              jobs.c.key.is_(None) if key is None else jobs.c.key == key)
     return int(connection.execute(query).scalar_one())
@@ -160,7 +149,13 @@ def begin(database: Database, claim: Claim) -> bool:
     """Let a worker begin a job; return False if the job was cancelled or another worker has it."""
     free = sa.or_(jobs.c.worker.is_(None), jobs.c.worker == claim.worker)
     return _change(database, claim, free, entry="begun by a worker", state=RUNNING, worker=claim.worker,
-                   started_at=sa.func.coalesce(jobs.c.started_at, time.time()))
+                   started_at=sa.func.coalesce(jobs.c.started_at, time.time()), version=sa.func.coalesce(jobs.c.version, __version__))
+
+
+def begin_anew(database: Database, claim: Claim) -> bool:
+    """Begin a job from its first step, as this version of the program does it; return False if the worker no longer has it."""
+    return _change(database, claim, entry="begun anew: another version of relit had begun it", version=__version__, finished_steps=[],
+                   reached=0, **NOTHING_LOST)
 
 
 def is_claimed(database: Database, claim: Claim) -> bool:
@@ -168,7 +163,12 @@ def is_claimed(database: Database, claim: Claim) -> bool:
     return database.row(sa.select(jobs.c.id).where(*_held(claim))) is not None
 
 
-def advance(database: Database, claim: Claim, progress: StageProgress, *, repeating: bool | None = None,
+def correct_reached(database: Database, claim: Claim, frames: int) -> bool:
+    """Record how many frames a worker that takes over has found; return False if it no longer has the job."""
+    return _change(database, claim, reached=frames)
+
+
+def advance(database: Database, claim: Claim, progress: StageProgress, *, frames: int | None = None, repeating: bool | None = None,
             begun: Sequence[str] | None = None, entered: bool = False) -> bool:
     """Record the progress of a running job; return False if the worker no longer has it.
 
@@ -178,7 +178,8 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, repeat
     Args:
         database: of the service.
         claim: of the worker.
-        progress: of the stage under way.
+        progress: of the stage under way, as users see it.
+        frames: frames that the job has, where users see more; None: those of `progress`.
         repeating: whether an earlier worker went on from this stage to a further one; None: as recorded.
         begun: names of the stages that the step has come to, where one is new; None: as recorded.
         entered: whether the log gets an entry for the stage.
@@ -188,8 +189,9 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, repeat
     """
     values: dict[str, Any] = progress._asdict()
     if progress.stage == FRAMES:
-        further = jobs.c.reached < progress.done
-        values |= {"reached": sa.case((further, progress.done), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost),
+        made = progress.done if frames is None else frames
+        further = jobs.c.reached < made
+        values |= {"reached": sa.case((further, made), else_=jobs.c.reached), "lost": sa.case((further, 0), else_=jobs.c.lost),
                    "lost_repeating": sa.case((further, 0), else_=jobs.c.lost_repeating)}
     if repeating is not None:
         values["repeating"] = repeating
@@ -216,15 +218,10 @@ def end(database: Database, claim: Claim, state: str, error: str | None = None) 
 
 
 def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> str | None:
-    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost too many workers without progress.
+    """Record that a worker died while it had a job: the job is queued again, or fails if it has lost more than `limit`.
 
     A worker that died in a stage that an earlier worker came through was hardly killed by the job. So it does not count, unless there are
     REPEATED times `limit` of them.
-
-    Args:
-        connection: of the caller's transaction.
-        claim: of the dead worker.
-        limit: number of workers that a job may lose without progress.
 
     Returns:
         The new state of the job; None if it had ended.
@@ -241,7 +238,7 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
         state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, updated_at=now,
         revision=jobs.c.revision + 1,
         **({"error": sentence, "finished_at": now} if state == FAILED else {})))
-    job_log.write(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
+    _log(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
     if state == FAILED:
         _end_check(connection, claim.job, sentence)
     return state if done.rowcount == 1 else None
@@ -254,7 +251,7 @@ def release(connection: sa.Connection, claim: Claim) -> bool:
         jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
         state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1)).rowcount == 1
     if done:
-        job_log.write(connection, claim.job, "given back by its worker, queued again")
+        _log(connection, claim.job, "given back by its worker, queued again")
     return done
 
 
@@ -264,7 +261,7 @@ def cancel(connection: sa.Connection, job: str) -> bool:
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
         state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
     if done.rowcount == 1:
-        job_log.write(connection, job, CANCELLED)
+        _log(connection, job, CANCELLED)
         _end_check(connection, job, "its check was cancelled: validate it again")
     return done.rowcount == 1
 
@@ -280,7 +277,7 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
         error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
     if done.rowcount != 1:
         return None
-    job_log.write(connection, job, "queued again")
+    _log(connection, job, "queued again")
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())
 
 
@@ -297,8 +294,13 @@ def set_priority(connection: sa.Connection, job: str, priority: int) -> int | No
 def remove(connection: sa.Connection, job: str) -> bool:
     """Delete a job; return False if it has not ended."""
     connection.execute(job_inputs.delete().where(job_inputs.c.job == job))
-    job_log.remove(connection, job)
+    connection.execute(job_log.delete().where(job_log.c.job == job))
     return connection.execute(jobs.delete().where(jobs.c.id == job, jobs.c.state.in_(ENDED))).rowcount == 1
+
+
+def log_of(database: Database, job: str) -> list[sa.RowMapping]:
+    """Return the entries of the log of a job, the oldest first."""
+    return database.rows(sa.select(job_log.c.at, job_log.c.attempt, job_log.c.text).where(job_log.c.job == job).order_by(job_log.c.number))
 
 
 def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
@@ -308,6 +310,14 @@ def ended_before(database: Database, when: float) -> list[sa.RowMapping]:
 
 def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
     return [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.worker == claim.worker, jobs.c.state.in_(ACTIVE)]
+
+
+def _log(connection: sa.Connection, job: str, text: str) -> None:
+    """Add an entry to the log of a job: a text for a person, which names nothing of the machine."""
+    count = sa.select(sa.func.count()).where(job_log.c.job == job).scalar_subquery()
+    entry = sa.select(jobs.c.id, sa.literal(time.time()), jobs.c.attempt, sa.literal(storable(text))).where(
+        jobs.c.id == job, count < MOST_ENTRIES)
+    connection.execute(job_log.insert().from_select(["job", "at", "attempt", "text"], entry))
 
 
 def _end_check(connection: sa.Connection, job: str, problem: str) -> None:
@@ -326,7 +336,7 @@ def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | Non
     def work(connection: sa.Connection) -> bool:
         changed = connection.execute(statement).rowcount == 1
         if changed and entry is not None:
-            job_log.write(connection, claim.job, entry)
+            _log(connection, claim.job, entry)
         return changed
 
     return database.transact(work, patience_s=patience_s)

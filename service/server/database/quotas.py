@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.errors import RequestError
-from service.server.database import exclusive
+from service.server.database.engine import lock_project
 from service.server.database.tables import intakes, jobs, uploads
 from service.server.settings import Settings
 from service.views.states import ACTIVE, READY
@@ -30,12 +30,7 @@ class QuotaExceeded(RequestError):
 def require(connection: sa.Connection, settings: Settings, quota: str, project: str, more: int) -> None:
     """Check a quota before something is added in the caller's transaction; other requests of the project wait for its end.
 
-    Args:
-        connection: of the transaction.
-        settings: of the service.
-        quota: BYTES, CAPTURES, JOBS or PIXELS.
-        project: that is to have more.
-        more: what will be added, in the unit of the quota.
+    `more` is what will be added, in the unit of the quota, which is BYTES, CAPTURES, JOBS or PIXELS.
 
     Raises:
         QuotaExceeded: the project would have more than it may.
@@ -43,7 +38,7 @@ def require(connection: sa.Connection, settings: Settings, quota: str, project: 
     limit = settings.quota_of(project, quota)
     if limit is None:
         return
-    exclusive.lock(connection, exclusive.PROJECT, project)
+    lock_project(connection, project)
     used = USED[quota](connection, project)
     if used + more > limit:
         raise QuotaExceeded(quota, project, limit, used, more)

@@ -1,8 +1,8 @@
 """The schema of the database: made anew, or upgraded by Alembic when a newer program opens the database.
 
-A new database gets the tables of `tables` as they are. Each change of them since the first release is a revision in `migrations/versions`,
-which `upgrade` applies to a database that lacks it, in one transaction. To write one: change `tables`, add a file with the next number
-there, and run tests/service/server/database, which compare an upgraded database with a new one.
+A new database gets the tables of `tables` as they are. Each change of them since relit 0.1.0 is a revision in `migrations/versions`, which
+`upgrade` applies to a database that lacks it, in one transaction. To write one: change `tables`, add a file with the next number there,
+and run tests/service/server/database, which compare an upgraded database with a new one.
 
 Alembic is imported only to make or upgrade tables: its import takes a tenth of the start of a worker, and a database is seldom old.
 """
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 REVISIONS = "relit_schema"
 """Table in which Alembic keeps the revision of the database."""
 MIGRATIONS = Path(__file__).parent / "migrations"
-ABOUT = sa.Table("relit_about", sa.MetaData(), sa.Column("version", sa.Integer, primary_key=True))
-"""How programs without migrations knew the schema: they made databases with the number 1, and refuse every other number."""
-BEFORE_MIGRATIONS, SINCE_MIGRATIONS = 1, 2
 UPGRADE_LOCK = 0x72656C6974
 """Number of the advisory lock of PostgreSQL under which the tables are made and changed."""
 
@@ -32,7 +29,7 @@ def upgrade(database: Database) -> None:
     """Make the tables if there are none, or change those of an older program.
 
     Raises:
-        DatabaseError: the tables are those of a newer program.
+        DatabaseError: the tables are those of a newer program, or older than relit 0.1.0.
     """
     with database.engine.begin() as connection:
         if database.is_sqlite:
@@ -45,16 +42,13 @@ def upgrade(database: Database) -> None:
         from alembic import command
 
         config = _alembic(connection)
-        if found is None and not sa.inspect(connection).has_table(ABOUT.name):
+        if found is None and not _has_tables(connection):
             tables.metadata.create_all(connection)
-            ABOUT.create(connection)
-            connection.execute(ABOUT.insert().values(version=SINCE_MIGRATIONS))
             command.stamp(config, "head")
-            audit.protect(connection)
         else:
             _require_known(found)
             command.upgrade(config, "head")
-            audit.protect(connection)
+        audit.protect(connection)
 
 
 def is_current(database: Database) -> bool:
@@ -70,12 +64,16 @@ def require_current(database: Database) -> None:
         DatabaseError: there are no tables, or they are those of an older or newer program.
     """
     with database.engine.connect() as connection:
-        if not sa.inspect(connection).has_table(ABOUT.name):
+        if not _has_tables(connection):
             raise DatabaseError("the database has no tables of relit: relit serve makes them")
         found = _revision(connection)
     if found != _newest():
         _require_known(found)
         raise DatabaseError("the database has the tables of an older relit: relit serve of this version upgrades them")
+
+
+def _has_tables(connection: sa.Connection) -> bool:
+    return sa.inspect(connection).has_table(tables.jobs.name)
 
 
 def _revision(connection: sa.Connection) -> str | None:
@@ -96,7 +94,10 @@ def _newest() -> str:
 
 
 def _require_known(found: str | None) -> None:
-    if found is not None and found not in _known():
+    if found is None or found < _known()[0]:
+        raise DatabaseError(f"the database has the tables of an early relit (revision {found or 'none'}): start relit serve of version "
+                            "0.1.0 with it once, which upgrades them to those that this version knows")
+    if found not in _known():
         raise DatabaseError(f"the database has the tables of a newer relit (revision {found}): "
                             "use that program, or another data folder or database")
 

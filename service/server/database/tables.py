@@ -30,14 +30,14 @@ keys = sa.Table(
     sa.Column("expires_at", sa.Float),  # NULL: never
     sa.Column("used_at", sa.Float))  # of the last request, to a minute
 
-audit = sa.Table(  # who did what to which object; triggers refuse every other statement than INSERT (service.server.database.audit)
+audit = sa.Table(  # who did what to which object; triggers refuse to change lines (service.server.database.audit)
     "relit_audit", metadata, sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True), _project(),
     sa.Column("at", sa.Float, nullable=False),
     sa.Column("actor", sa.String(200), nullable=False),  # a key, a user of an identity provider, anonymous, or an operator
     sa.Column("action", sa.String(40), nullable=False),
     sa.Column("object", sa.String(40), nullable=False),  # identifier
     sa.Column("request", sa.String(32)),  # identifier of the HTTP request, which the log has too; NULL: the command line
-    sa.Index("relit_audit_of_project", "project", "id"))
+    sa.Index("relit_audit_of_time", "at"))
 
 intakes = sa.Table(  # captures and environments
     "relit_intakes", metadata, _id(), _project(),
@@ -100,6 +100,7 @@ jobs = sa.Table(
     sa.Column("stages_begun", sa.JSON, nullable=False, server_default="[]"),
     sa.Column("repeating", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("lost_repeating", sa.Integer, nullable=False, server_default="0"),
+    sa.Column("version", sa.String(64)),  # of the program whose steps these are
     # names, of all attempts. DBOS could record the steps of one workflow. To keep them for a retry the workflow would have to be forked,
     # which DBOS does not do in a transaction of ours, and which drops the priority; and it records Python names, so that a renamed
     # function would end the jobs that are under way (test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left)
@@ -150,14 +151,7 @@ clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's
 
 
 def newest_first(query: "sa.Select[Any]", table: sa.Table, *, limit: int, before: tuple[float, str] | None) -> "sa.Select[Any]":
-    """Return the query of one page of rows, the newest first.
-
-    Args:
-        query: selects rows of the table.
-        table: jobs or intakes.
-        limit: number of rows at most.
-        before: creation time and identifier of the last row of the previous page; None: the first page.
-    """
+    """Return the query of one page of rows, the newest first; `before` has creation time and identifier of the last of the page before."""
     if before is not None:
         query = query.where(sa.tuple_(table.c.created_at, table.c.id) < sa.tuple_(*before))
     return query.order_by(table.c.created_at.desc(), table.c.id.desc()).limit(limit)

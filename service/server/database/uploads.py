@@ -5,7 +5,6 @@
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
@@ -13,7 +12,6 @@ import sqlalchemy as sa
 from service.server.database.engine import Database
 from service.server.database.tables import uploads
 from service.server.safe_names import folded, folders_of, shown
-from service.server.storage.part_files import PartFile, PartFileLocked, leftovers
 
 Row = Mapping[str, Any]
 """A row of the uploads table."""
@@ -27,14 +25,6 @@ class PathTaken(Exception):
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
     """Insert an upload without bytes; the caller has locked the intake.
-
-    Args:
-        connection: of the caller's transaction.
-        identifier: of the upload.
-        project, intake: to which it belongs.
-        path: within the capture, checked.
-        length: of the complete file, bytes.
-        sha256: of the complete file; None: it is not known.
 
     Raises:
         PathTaken: another file has the path.
@@ -121,24 +111,6 @@ def remove(connection: sa.Connection, identifier: str) -> bool:
     return connection.execute(uploads.delete().where(uploads.c.id == identifier)).rowcount == 1
 
 
-def expire(database: Database, folder: Path, before: float) -> int:
-    """Delete uploads that were not continued since a time, and part files without an upload.
-
-    Args:
-        database: of the service.
-        folder: of the part files.
-        before: the time, seconds since 1970.
-
-    Returns:
-        The number of deleted uploads.
-    """
-    removed = 0
-    for row in untouched(database, before):
-        removed += _expire(database, folder, row["id"], before)
-    drop_leftovers(database, folder, before)
-    return removed
-
-
 def untouched(database: Database, before: float) -> list[Row]:
     """Return the uploads that were not continued since a time."""
     return [dict(row) for row in database.rows(sa.select(uploads).where(uploads.c.done.is_(False), uploads.c.touched_at < before))]
@@ -149,29 +121,10 @@ def unfinished_of(database: Database, identifiers: Collection[str]) -> set[str]:
     return {row["id"] for row in database.rows(sa.select(uploads.c.id).where(uploads.c.id.in_(identifiers), uploads.c.done.is_(False)))}
 
 
-def drop_leftovers(database: Database, folder: Path, before: float) -> None:
-    """Delete the part files that were not written since a time and have no upload."""
-    old = set(leftovers(folder, before))
-    for identifier in old - unfinished_of(database, old):
-        PartFile.discard(folder, identifier)
-
-
 def drop_untouched(database: Database, identifier: str, before: float) -> bool:
     """Delete the row of an upload unless it was continued since a time; return whether it was deleted."""
     return database.transact(lambda connection: connection.execute(uploads.delete().where(
         uploads.c.id == identifier, uploads.c.done.is_(False), uploads.c.touched_at < before))).rowcount == 1
-
-
-def _expire(database: Database, folder: Path, identifier: str, before: float) -> bool:
-    try:
-        part = PartFile.open(folder, identifier)
-    except PartFileLocked:  # a request is adding to it
-        return False
-    with part:
-        gone = drop_untouched(database, identifier, before)
-        if gone:
-            part.drop()
-    return gone
 
 
 def _require_free(connection: sa.Connection, intake: str, path: str) -> None:

@@ -1,19 +1,21 @@
 """What the steps of a job are given: the worker that does them, and the job."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.requests.job import JobRequest
+from service.requests.base import JobRequest
 from service.requests.jobs import ANY_JOB
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.settings import Settings
-from service.server.storage.folder import Storage
+from service.server.storage.objects import Storage
 
 
 class WorkerContext(NamedTuple):
@@ -55,12 +57,14 @@ class Job(NamedTuple):
     request: JobRequest
     chunk_frames: int
     attempt: int = 1
+    is_resumed: bool = False
+    """Whether it has lost a worker since it last made progress."""
 
     @classmethod
-    def of(cls, row: "dict[str, object]") -> "Job":
+    def of(cls, row: sa.RowMapping | Mapping[str, Any]) -> "Job":
         """Read a row of the jobs table."""
-        return cls(str(row["id"]), str(row["project"]), ANY_JOB.validate_python(row["request"]), int(str(row["chunk_frames"])),
-                   int(str(row["attempt"])))
+        return cls(row["id"], row["project"], ANY_JOB.validate_python(row["request"]), row["chunk_frames"], row["attempt"],
+                   row["lost"] > 0 or row["lost_repeating"] > 0)
 
 
 SEQUENCE = "sequence"
@@ -74,5 +78,7 @@ class JobStep(NamedTuple):
     run: Callable[[Progress], None]
     frames: int = 0
     """Number of frames that the step makes, at the same time as other workers make those of other steps."""
+    made: Callable[[], int] = lambda: 0
+    """Returns how many of these frames this machine has."""
     help: Callable[[Progress], None] | None = None
     """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""

@@ -18,14 +18,7 @@ class HelpProgress:
     """A Progress that ends the help when the job is not running any more or this worker is asked to end; nothing is recorded."""
 
     def __init__(self, context: WorkerContext, job: Job, *, alive: Callable[[], None], ending: Callable[[], bool]) -> None:
-        """Create the progress of a help.
-
-        Args:
-            context: of the worker that helps.
-            job: of another worker.
-            alive: called at every sign of progress.
-            ending: returns whether this worker is asked to end.
-        """
+        """Create the progress of a help."""
         self._context, self._job, self._alive, self._ending = context, job, alive, ending
         self._look_at = 0.0
 
@@ -53,13 +46,7 @@ class HelpProgress:
 
 
 def help_with(job: Job, context: WorkerContext, progress: Progress) -> None:
-    """Do what can be done beside the worker that has a job, until nothing is left to take.
-
-    Args:
-        job: of another worker.
-        context: of this worker.
-        progress: ends the help by an exception.
-    """
+    """Do what can be done beside the worker that has a job, until nothing is left to take."""
     progress.advance(0)
     steps, pieces = steps_of(job, context), JobPieces(context, job)
     finished = _finished(job, context)

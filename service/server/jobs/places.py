@@ -1,6 +1,8 @@
 """Where the files are that a job reads and writes: captures, environments and results of other jobs, as folders of this machine."""
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
@@ -11,81 +13,101 @@ from service.server.jobs.context import Job, WorkerContext
 from service.server.storage import layout
 from stage import inputs
 from stage.files import resolved
-from stage.sequence import SEQUENCE_FILE, TimeStep, read_sequence
+from stage.sequence import SEQUENCE_FILE, read_sequence
 
 
-def results_folder(job: Job, context: WorkerContext) -> Path:
-    """Return the folder into which the results of a job are written."""
-    return _named(context.storage.workspace(layout.results(job.project, job.id)), job.id)
+class StepFiles(NamedTuple):
+    """The files of a step that runs, and what else its product is given."""
+
+    job: Job
+    context: WorkerContext
+    progress: Progress
+
+    @property
+    def device(self) -> str:
+        """Name of the device to compute on."""
+        return self.context.device
+
+    def cache(self, capture: str) -> Path:
+        """Return the folder of the image stack of a capture."""
+        return self.context.cache / capture
+
+    @property
+    def out(self) -> Path:
+        """Folder into which the results of the job are written."""
+        return _named(self.context.storage.workspace(layout.results(self.job.project, self.job.id)), self.job.id)
+
+    def maps(self, job: str) -> Path:
+        """Return the folder with the maps of a job of the same project, or of this job; of a sequence with those of each time step."""
+        storage, prefix = self.context.storage, layout.results(self.job.project, job)
+        folder = _named(storage.local(prefix, layout.SOLVED, self.progress), job)
+        if (folder / SEQUENCE_FILE).is_file():
+            storage.local(prefix, [f"{step.name}/{name}" for step in read_sequence(folder).steps for name in layout.SOLVED], self.progress)
+        return folder
+
+    def intake(self, identifier: str, number: int | None = None) -> Path:
+        """Return the folder of a capture or environment of the job's project; a registered one is checked again, as it may have changed.
+
+        Args:
+            identifier: of the intake.
+            number: of the only time step of a sequence whose images are read, from 1; None: all are.
+        """
+        from service.captures.admit import admit_environment, recheck_capture
+
+        folder, root = self.intake_place(identifier)
+        if root is not None and identifier.startswith(CAPTURE):
+            recheck_capture(folder, max_pixels=self.context.max_pixels, number=number)
+        elif root is not None:
+            admit_environment(folder, max_pixels=self.context.max_pixels)
+        return folder
+
+    def intakes(self, identifiers: Iterable[str]) -> tuple[Path, ...]:
+        """Return the folders of several captures."""
+        return tuple(map(self.intake, identifiers))
+
+    def intake_place(self, identifier: str) -> tuple[Path, Path | None]:
+        """Return the folder (or the file of an environment) of an intake of the job's project, and the root of a registered one.
+
+        The files of a registered one are opened beneath its folder until the step ends, whatever becomes links meanwhile.
+        """
+        project, context = self.job.project, self.context
+        row = intakes.find(context.database, identifier, project)
+        if row is None:
+            raise RequestError(f"{identifier}: is not there any more")
+        if row["folder"] is None:
+            return _named(context.storage.local(layout.intake(project, identifier), progress=self.progress), identifier), None
+        folder = Path(row["folder"])
+        root = next((root for root in context.roots_of(project) if folder.is_relative_to(root)), None)
+        if resolved(folder) != folder or root is None:
+            raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
+        top = folder if identifier.startswith(CAPTURE) else folder.parent
+        context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
+        return _named(folder, identifier), root
+
+    def environment_image(self, identifier: str | None) -> Path | None:
+        """Return the image of an environment, or None where there is none."""
+        from service.captures.admit import environment_file
+
+        return None if identifier is None else environment_file(self.intake(identifier))
 
 
-def job_maps(job: Job, maps: str, context: WorkerContext, progress: Progress) -> Path:
-    """Return the folder with the maps of `maps`, a job of the same project or this job; of a sequence with those of each time step."""
-    prefix = layout.results(job.project, maps)
-    folder = _named(context.storage.local(prefix, layout.SOLVED, progress), maps)
-    if (folder / SEQUENCE_FILE).is_file():
-        steps = read_sequence(folder).steps
-        context.storage.local(prefix, [f"{step.name}/{name}" for step in steps for name in layout.SOLVED], progress)
-    return folder
-
-
-def intake_folder(job: Job, identifier: str, context: WorkerContext, progress: Progress, number: int | None = None) -> Path:
-    """Return the folder of a capture or environment of the job's project; a registered one is checked again, as it may have changed.
-
-    Args:
-        job: reads it.
-        identifier: of the intake.
-        context: of the worker.
-        progress: of files that are fetched.
-        number: of the only time step of a sequence whose images are read, from 1; None: all are.
-    """
-    from service.captures.admit import admit_environment, recheck_capture
-
-    folder, root = intake_place(job, identifier, context, progress)
-    if root is not None and identifier.startswith(CAPTURE):
-        recheck_capture(folder, max_pixels=context.max_pixels, number=number)
-    elif root is not None:
-        admit_environment(folder, max_pixels=context.max_pixels)
-    return folder
-
-
-def time_step(sequence: Path, number: int) -> TimeStep:
-    """Return a time step of a sequence of captures.
-
-    Args:
-        sequence: folder of its capture.
-        number: of the step, from 1.
+def file_within(capture: Path, name: str, field: str) -> Path:
+    """Return the path of a file in the folder of a capture, beside those that the manifest names.
 
     Raises:
-        ManifestError: it has fewer steps by now.
+        RequestError: the name leads out of the folder, or there is no such file.
     """
-    return read_sequence(sequence).step(number, sequence)
+    place = None if "\0" in name else resolved(capture / name)
+    if place is None or not place.is_relative_to(capture.resolve()):
+        raise RequestError(f"{field}: {name!r} leads out of the capture's folder")
+    if not place.is_file():
+        raise RequestError(f"{field}: {name!r} is no file of the capture")
+    return capture / name
 
 
-def intake_place(job: Job, identifier: str, context: WorkerContext, progress: Progress) -> tuple[Path, Path | None]:
-    """Return the folder (or the file of an environment) of an intake of the job's project, and the root of a registered one.
-
-    The files of a registered one are opened beneath its folder until the step ends, whatever becomes links meanwhile.
-    """
-    row = intakes.find(context.database, identifier, job.project)
-    if row is None:
-        raise RequestError(f"{identifier}: is not there any more")
-    if row["folder"] is None:
-        return _named(context.storage.local(layout.intake(job.project, identifier), progress=progress), identifier), None
-    folder = Path(row["folder"])
-    root = next((root for root in context.roots_of(job.project) if folder.is_relative_to(root)), None)
-    if resolved(folder) != folder or root is None:
-        raise RequestError(f"{identifier}: lies in none of the folders that the operator allows any more")
-    top = folder if identifier.startswith(CAPTURE) else folder.parent
-    context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
-    return _named(folder, identifier), root
-
-
-def environment_image(job: Job, identifier: str | None, context: WorkerContext, progress: Progress) -> Path | None:
-    """Return the image of an environment, or None where there is none."""
-    from service.captures.admit import environment_file
-
-    return None if identifier is None else environment_file(intake_folder(job, identifier, context, progress))
+def files_within(capture: Path, names: Iterable[str], field: str) -> tuple[Path, ...]:
+    """Return the paths of several files, as `file_within` does."""
+    return tuple(file_within(capture, name, field) for name in names)
 
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:

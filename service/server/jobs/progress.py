@@ -98,12 +98,10 @@ class JobProgress:
             spent = now - self._began
             counted = self._counted
             rate = counted / spent if counted and spent > 0 else None
-            shown = self._offset + counted
-            if self._stage == FRAMES:
-                shown = max(shown, self._shown)
-            progress = jobs.StageProgress(self._stage, shown, self._total, rate)
+            made = self._offset + counted
+            progress = jobs.StageProgress(self._stage, max(made, self._shown) if self._stage == FRAMES else made, self._total, rate)
             try:
-                self._stopped = not jobs.advance(self._database, self._claim, progress, repeating=self._repeating,
+                self._stopped = not jobs.advance(self._database, self._claim, progress, frames=made, repeating=self._repeating,
                                                  begun=self._begun if self._new_stage else None,
                                                  entered=self._stage != self._logged)
                 self._logged = self._stage

@@ -9,15 +9,14 @@ import time
 
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
-from dbos._schemas import SCHEMA_PLACEHOLDER
-from dbos._schemas.system_database import SystemSchema
 
-from service.requests.job import JobRequest
+from service.requests.base import JobRequest
 from service.requests.jobs import CheckJob
-from service.server.database import jobs, tables
+from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
+from service.server.jobs.queue_order import set_order
 from service.server.settings import Settings
 
 WORK, CHECKS = "work", "checks"
@@ -30,8 +29,6 @@ VERSION = "1"
 SERIALIZER = DBOSPortableJSONSerializer()
 HIGHEST = 101
 """DBOS starts the lowest priority first and counts from 1; a request's highest priority, 100, goes first."""
-POSTGRES_SCHEMA = "dbos"
-"""Where DBOS has its tables on PostgreSQL; SQLite has no schemas."""
 
 
 def prepare(settings: Settings, database: Database) -> None:
@@ -43,24 +40,6 @@ def prepare(settings: Settings, database: Database) -> None:
     settings.data.mkdir(parents=True, exist_ok=True)
     upgrade(database)
     DBOS.migrate(settings.sqlalchemy_url)
-    _assign_projects(database)
-
-
-def _assign_projects(database: Database) -> None:
-    """Give workflows their project that were queued before projects took turns; no worker takes them without."""
-    workflows = SystemSchema.workflow_status
-
-    def work(connection: sa.Connection) -> None:
-        schema = {SCHEMA_PLACEHOLDER: None if database.is_sqlite else POSTGRES_SCHEMA}
-        without = connection.execute(sa.select(workflows.c.workflow_uuid).where(
-            workflows.c.queue_name.in_((WORK, CHECKS)), workflows.c.queue_partition_key.is_(None)), execution_options={
-                "schema_translate_map": schema}).scalars().all()
-        for workflow in without:
-            project = connection.execute(sa.select(tables.jobs.c.project).where(tables.jobs.c.id == workflow.partition(".")[0])).scalar()
-            connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(queue_partition_key=project),
-                               execution_options={"schema_translate_map": schema})
-
-    database.transact(work)
 
 
 def workflow_id(job: str, attempt: int) -> str:
@@ -86,7 +65,6 @@ class JobQueue:
         """Args: database: of the service, prepared."""
         self._database = database
         self._client = DBOSClient(system_database_engine=database.engine, serializer=SERIALIZER, lazy=True, retry_connection_errors=False)
-        self._schema = {SCHEMA_PLACEHOLDER: None if database.is_sqlite else POSTGRES_SCHEMA}
 
     def submit(self, connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
                inputs: list[str], trace: str | None = None) -> str:
@@ -101,22 +79,11 @@ class JobQueue:
         self._client.enqueue_in_transaction(connection, {
             "workflow_name": WORKFLOW, "queue_name": _queue(isinstance(request, CheckJob)), "workflow_id": workflow_id(job, attempt),
             "app_version": VERSION, "priority": HIGHEST - priority, "queue_partition_key": project}, job, attempt)
-        # with SQLite, DBOS counts whole seconds, and orders jobs of one second and one priority by their random names
-        self._write(connection, job, attempt, created_at=int(time.time() * 1000))
+        set_order(connection, workflow_id(job, attempt), created_at=int(time.time() * 1000))
 
     def set_priority(self, connection: sa.Connection, job: str, attempt: int, priority: int) -> None:
-        """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays.
-
-        DBOS 3.4 sets a priority only when it queues, and a new attempt would lose the place. So this writes the column by which DBOS
-        orders its queues; `test_the_highest_priority_goes_first` fails if a later version orders them otherwise.
-        """
-        self._write(connection, job, attempt, priority=HIGHEST - priority)
-
-    def _write(self, connection: sa.Connection, job: str, attempt: int, **values: int) -> None:
-        """Change the row of an attempt's workflow."""
-        workflows = SystemSchema.workflow_status
-        connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow_id(job, attempt)).values(
-            **values).execution_options(schema_translate_map=self._schema))
+        """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays."""
+        set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
 
     def cancel(self, job: str, attempt: int) -> None:
         """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
@@ -135,8 +102,7 @@ class JobQueue:
 
     def workers_on(self, job: str) -> set[str]:
         """Return the names of the workers that do a job or help with it."""
-        return {status.executor_id or "" for status in self._client.list_workflows(
-            workflow_id_prefix=f"{job}.", status="PENDING", app_version=VERSION, load_input=False, load_output=False)}
+        return {worker for worker, workflows in self.taken_by().items() if any(name.startswith(f"{job}.") for name in workflows)}
 
     def end_help(self, workflow: str) -> None:
         """Queue the help of a worker that died no more: the worker that has the job does what is left."""
@@ -167,11 +133,10 @@ class JobQueue:
         if row is not None:
             self._client.resume_workflow(workflow, queue_name=_queue(row["request"]["kind"] == "check"))
 
-    def forget(self, job: str, attempts: int) -> None:
-        """Delete the workflows of a job, and those of the workers that helped."""
-        helped = self._client.list_workflows(workflow_id_prefix=f"{job}.", name=HELP, load_input=False, load_output=False)
-        self._client.delete_workflows([*(workflow_id(job, attempt) for attempt in range(1, attempts + 1)),
-                                       *(status.workflow_id for status in helped)])
+    def forget(self, job: str) -> None:
+        """Delete the workflows of all attempts of a job, and of the workers that helped."""
+        found = self._client.list_workflows(workflow_id_prefix=f"{job}.", load_input=False, load_output=False)
+        self._client.delete_workflows([status.workflow_id for status in found])
 
 
 def _queue(is_check: bool) -> str:

@@ -1,10 +1,11 @@
 """The workflow of a job: its steps, one after the other.
 
-DBOS starts the workflow, and starts it again from its beginning when the job goes to another worker. Steps that are finished are then
-skipped: `finished_steps` in service.server.database.tables says why that list is ours. So no step is a step of DBOS, which would record
-it a second time, under the name of a Python function.
+DBOS starts the workflow, and starts it again from its beginning when the job goes to another worker. Steps that the same version of relit
+has finished are then skipped: `finished_steps` in service.server.database.tables says why that list is ours. So no step is a step of
+DBOS, which would record it a second time, under the name of a Python function.
 """
 
+import re
 import threading
 import time
 import traceback
@@ -13,6 +14,7 @@ from typing import TypeVar
 
 from dbos import DBOS
 
+from service import __version__
 from service.errors import USER_ERRORS, DivergedError, sentence
 from service.reporting.provenance import places_named
 from service.requests.jobs import CheckJob
@@ -37,6 +39,9 @@ DONE, STOPPED, LATER = "done", "stopped", "later"
 """What became of a job or a step: it is done; this worker has the job no longer; another worker does the step."""
 LOOK_S = 0.5
 """Seconds between two looks for a step that another worker does."""
+
+NO_MEMORY = re.compile("failed to allocate|out of memory|insufficient memory|bad_alloc", re.IGNORECASE)
+"""What Warp, CUDA, OpenCV and the C++ library say where Python has a MemoryError."""
 
 
 class JobRunner:
@@ -98,7 +103,7 @@ class JobRunner:
         try:
             row = jobs.find(self._context.database, claim.job)
             if row is not None and row["attempt"] == claim.attempt and row["worker"] != self._worker:
-                self._help(Job.of(dict(row)), claim)
+                self._help(Job.of(row), claim)
         except Exception as error:
             log.warning("help failed", error=repr(error), trace=traceback.format_exc())
         finally:
@@ -152,7 +157,7 @@ class JobRunner:
             why = sentence(error)
         except Exception as error:
             log.error("job failed", error=repr(error), trace=traceback.format_exc())
-            why = f"an error of relit itself ({type(error).__name__}): its log has more"
+            why = _unexpected(error)
         return self._patiently(claim, lambda: self._fail(claim, why))
 
     def _begin(self, claim: Claim) -> list[str] | None:
@@ -160,7 +165,14 @@ class JobRunner:
         if not jobs.begin(self._context.database, claim):
             return None
         row = jobs.find(self._context.database, claim.job)
-        return None if row is None else [step.name for step in steps_of(Job.of(dict(row)), self._context)]
+        if row is None:
+            return None
+        job = Job.of(row)
+        if row["version"] != __version__:
+            JobPieces(self._context, job).remove()
+            if not jobs.begin_anew(self._context.database, claim):
+                return None
+        return [step.name for step in steps_of(job, self._context)]
 
     def _step(self, claim: Claim, name: str) -> str:
         if self._draining.is_set():
@@ -181,15 +193,19 @@ class JobRunner:
             return STOPPED
         if name in row["finished_steps"]:
             return DONE
-        job = Job.of(dict(row))
+        job = Job.of(row)
         steps = steps_of(job, self._context)
         step = next(step for step in steps if step.name == name)
         if step.frames or step.help is not None:
             self._pieces.setdefault(claim, JobPieces(self._context, job))
-        progress = JobProgress(database, claim, alive=lambda: self._sign(claim),
-                               frame_offset=sum(other.frames for other in steps if other.name in row["finished_steps"]),
+        finished_frames = sum(other.frames for other in steps if other.name in row["finished_steps"])
+        reached = None
+        if job.is_resumed:  # the worker that died may have told of frames that were only half written
+            reached = finished_frames + step.made()
+            jobs.correct_reached(database, claim, reached)
+        progress = JobProgress(database, claim, alive=lambda: self._sign(claim), frame_offset=finished_frames,
                                frame_count=sum(other.frames for other in steps) if step.frames else None, begun=row["stages_begun"],
-                               reached=row["reached"] if row["lost"] or row["lost_repeating"] else None, shown=row["reached"])
+                               reached=reached, shown=max(row["reached"], row["done"] or 0 if row["stage"] == jobs.FRAMES else 0))
         log = logger.bind(job=job.id, project=job.project, step=name, attempt=claim.attempt, worker=self._worker)
         try:
             if step.frames and (outcome := self._leave_to_others(claim, step, steps, row["finished_steps"])) is not None:
@@ -216,7 +232,7 @@ class JobRunner:
             return self._fail(claim, sentence(error), job)
         except Exception as error:
             log.error("step failed", error=repr(error), trace=traceback.format_exc())
-            return self._fail(claim, f"{name}: an error of relit itself ({type(error).__name__}): its log has more", job)
+            return self._fail(claim, f"{name}: {_unexpected(error)}", job)
         if not jobs.finish_step(database, claim, [*row["finished_steps"], name], size):
             self._clear_if_deleted(job)
             return STOPPED
@@ -293,6 +309,13 @@ class JobRunner:
         with self._changed:
             self._signs[claim] = time.monotonic()
             self._alive(min(self._signs.values()))
+
+
+def _unexpected(error: Exception) -> str:
+    """Return the sentence for a person whose job ended by an error that is no fault of its request."""
+    if isinstance(error, MemoryError) or NO_MEMORY.search(str(error)):
+        return "the worker has too little memory for this job: retry it where more is free, or with smaller images"
+    return f"an error of relit itself ({type(error).__name__}): its log has more"
 
 
 def _wait_for_the_end() -> None:

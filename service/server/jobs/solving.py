@@ -6,13 +6,11 @@ to the storage when it ends; so a worker that takes over goes on with the time s
 
 from typing import TYPE_CHECKING
 
-from service.reporting.progress import Progress
 from service.requests.jobs import DepthJob, SolveJob
 from service.server.database import intakes
 from service.server.jobs.context import SEQUENCE, Job, JobStep, WorkerContext
-from service.server.jobs.named_files import file_within
 from service.server.jobs.pieces import JobPieces
-from service.server.jobs.places import intake_folder, results_folder
+from service.server.jobs.places import StepFiles, file_within
 from service.server.storage import layout
 
 if TYPE_CHECKING:
@@ -24,110 +22,101 @@ TIME_STEP = "step"
 
 
 def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> list[JobStep]:
-    """Return the steps of a solve or a depth.
+    """Return the steps of a solve or a depth."""
+    def step(name: str, number: int | None) -> JobStep:
+        """Return the step that does the capture, or the time step `number` of a sequence."""
+        if isinstance(request, SolveJob):
+            return JobStep(name, lambda progress: _solve(request, number, StepFiles(job, context, progress)),
+                           help=lambda progress: _help_solve(request, number, StepFiles(job, context, progress)))
+        return JobStep(name, lambda progress: _depth(request, number, StepFiles(job, context, progress)))
 
-    Args:
-        job: the job, or a part of it is the solve.
-        request: names the capture.
-        context: of the worker.
-    """
     count = intakes.time_steps(intakes.find(context.database, request.capture, job.project))
     if count == 0:
-        return [_step(job, request, context, "solve" if isinstance(request, SolveJob) else "depth", None)]
-    return [*(_step(job, request, context, f"{TIME_STEP} {number}", number) for number in range(1, count + 1)),
-            JobStep(SEQUENCE, lambda progress: _join(job, request, context, progress))]
+        return [step("solve" if isinstance(request, SolveJob) else "depth", None)]
+    return [*(step(f"{TIME_STEP} {number}", number) for number in range(1, count + 1)),
+            JobStep(SEQUENCE, lambda progress: _join(request, StepFiles(job, context, progress)))]
 
 
-def _step(job: Job, request: SolveJob | DepthJob, context: WorkerContext, name: str, number: int | None) -> JobStep:
-    """Return the step that does a capture, or the time step `number` of a sequence."""
-    if isinstance(request, SolveJob):
-        return JobStep(name, lambda progress: _solve(job, request, number, context, progress),
-                       help=lambda progress: _help_solve(job, request, number, context, progress))
-    return JobStep(name, lambda progress: _depth(job, request, number, context, progress))
-
-
-def _solve(job: Job, request: SolveJob, number: int | None, context: WorkerContext, progress: Progress) -> None:
+def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
     from service.sequences.one_step import solve_number
     from service.solve.sharing import SharedSolve
     from service.solve.solve import solve
 
-    pieces = JobPieces(context, job)
+    pieces = JobPieces(files.context, files.job)
     sharing = SharedSolve(pieces, leads=True, invite=pieces.invite)
-    wanted = _solve_request(job, request, number, context, progress)
+    wanted = _solve_request(request, number, files)
     if number is None:
-        solve(wanted, progress, sharing=sharing)
+        solve(wanted, files.progress, sharing=sharing)
     else:
-        _fetch(job, wanted, context, progress)
-        solve_number(wanted, number, progress, sharing)
+        _fetch(wanted, files)
+        solve_number(wanted, number, files.progress, sharing)
     pieces.remove()
 
 
-def _help_solve(job: Job, request: SolveJob, number: int | None, context: WorkerContext, progress: Progress) -> None:
+def _help_solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
     from service.sequences.one_step import help_solve_number
     from service.solve.sharing import SharedSolve
     from service.solve.solve import help_solve
 
-    sharing = SharedSolve(JobPieces(context, job), leads=False)
-    wanted = _solve_request(job, request, number, context, progress)
+    sharing = SharedSolve(JobPieces(files.context, files.job), leads=False)
+    wanted = _solve_request(request, number, files)
     if number is None:
-        help_solve(wanted, progress, sharing)
+        help_solve(wanted, files.progress, sharing)
     else:
-        _fetch(job, wanted, context, progress)
-        help_solve_number(wanted, number, progress, sharing)
+        _fetch(wanted, files)
+        help_solve_number(wanted, number, files.progress, sharing)
 
 
-def _depth(job: Job, request: DepthJob, number: int | None, context: WorkerContext, progress: Progress) -> None:
+def _depth(request: DepthJob, number: int | None, files: StepFiles) -> None:
     from service.depth.depth import depth
     from service.sequences.one_step import depth_number
 
-    wanted = _depth_request(job, request, number, context, progress)
+    wanted = _depth_request(request, number, files)
     if number is None:
-        depth(wanted, progress)
+        depth(wanted, files.progress)
     else:
-        depth_number(wanted, number, progress)
+        depth_number(wanted, number, files.progress)
 
 
-def _join(job: Job, request: SolveJob | DepthJob, context: WorkerContext, progress: Progress) -> None:
+def _join(request: SolveJob | DepthJob, files: StepFiles) -> None:
     """Join the time steps of a sequence, each of which is done, and report on all."""
     from service.sequences.run import depth_sequence, solve_sequence
 
     if isinstance(request, SolveJob):
-        solving = _solve_request(job, request, None, context, progress)
-        _fetch(job, solving, context, progress, layout.SOLVED)
-        solve_sequence(solving, progress)
+        solving = _solve_request(request, None, files)
+        _fetch(solving, files, layout.SOLVED)
+        solve_sequence(solving, files.progress)
     else:
-        measuring = _depth_request(job, request, None, context, progress)
-        _fetch(job, measuring, context, progress, layout.SOLVED)
-        depth_sequence(measuring, progress)
+        measuring = _depth_request(request, None, files)
+        _fetch(measuring, files, layout.SOLVED)
+        depth_sequence(measuring, files.progress)
 
 
-def _fetch(job: Job, request: "SolveRequest | DepthRequest", context: WorkerContext, progress: Progress,
-           files: tuple[str, ...] = ()) -> None:
+def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tuple[str, ...] = ()) -> None:
     """Put onto this machine what the time steps that are done have left for others, and some of their files."""
     from service.sequences.one_step import result_folder
     from service.sequences.steps import DONE_FILE
     from stage.sequence import read_sequence
 
     folders = [result_folder(request, step).relative_to(request.out) for step in read_sequence(request.capture).steps]
-    context.storage.local(layout.results(job.project, job.id), [f"{folder}/{name}" for folder in folders for name in (*files, DONE_FILE)],
-                          progress)
+    files.context.storage.local(layout.results(files.job.project, files.job.id),
+                                [f"{folder}/{name}" for folder in folders for name in (*names, DONE_FILE)], files.progress)
 
 
-def _solve_request(job: Job, request: SolveJob, number: int | None, context: WorkerContext, progress: Progress) -> "SolveRequest":
+def _solve_request(request: SolveJob, number: int | None, files: StepFiles) -> "SolveRequest":
     from service.requests.solve import SolveRequest
 
-    ball = None if request.reference_ball is None else intake_folder(job, request.reference_ball, context, progress)
-    return SolveRequest(capture=intake_folder(job, request.capture, context, progress, number), out=results_folder(job, context),
-                        reference_ball=ball, device=context.device, cache=context.cache / request.capture, **dict(request.options),
-                        **dict(request.sequence))
+    ball = None if request.reference_ball is None else files.intake(request.reference_ball)
+    return SolveRequest(capture=files.intake(request.capture, number), out=files.out, reference_ball=ball, device=files.device,
+                        cache=files.cache(request.capture), **dict(request.options), **dict(request.sequence))
 
 
-def _depth_request(job: Job, request: DepthJob, number: int | None, context: WorkerContext, progress: Progress) -> "DepthRequest":
+def _depth_request(request: DepthJob, number: int | None, files: StepFiles) -> "DepthRequest":
     from service.requests.depth import DepthRequest, TofOptions
 
-    capture = intake_folder(job, request.capture, context, progress, number)
+    capture = files.intake(request.capture, number)
     calibration = None if request.tof_calibration is None else file_within(capture, request.tof_calibration, "tof_calibration")
     options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
-    beside = None if request.beside is None else intake_folder(job, request.beside, context, progress)
-    return DepthRequest(capture=capture, beside=beside, out=results_folder(job, context), device=context.device,
-                        cache=context.cache / request.capture, **options, **dict(request.sequence))
+    beside = None if request.beside is None else files.intake(request.beside)
+    return DepthRequest(capture=capture, beside=beside, out=files.out, device=files.device, cache=files.cache(request.capture), **options,
+                        **dict(request.sequence))

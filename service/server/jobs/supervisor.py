@@ -1,12 +1,17 @@
-"""The supervisor starts worker processes, starts them again when they die, and kills them when they hang."""
+"""The supervisor starts worker processes, starts them again when they die, and kills them when they hang.
+
+It shares memory with each, in which the worker leaves signs of life. The memory has no lock: a worker that is killed while it holds one
+would stop the supervisor for ever. Each sign is one aligned double.
+"""
 
 import multiprocessing
 import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.context import SpawnProcess
+from multiprocessing.sharedctypes import RawArray
+from typing import Any
 
-from service.server.jobs.heartbeat import Heartbeat
 from service.server.log import logger
 from service.server.settings import Settings
 
@@ -16,6 +21,39 @@ PAUSES_S = (0.0, 1.0, 5.0, 15.0, 60.0)
 once: a job or a person killed it, and `max_lost` ends a job that kills workers."""
 KILL_AFTER_S = 10.0
 """Seconds beyond `drain_s` before a worker that does not end is killed."""
+
+
+READY, BEAT, STEP = range(3)
+
+
+class Heartbeat:
+    """Times of the last signs of one worker process, in monotonic seconds, which are the same in all processes of a machine."""
+
+    def __init__(self) -> None:
+        self._signs: Any = RawArray("d", 3)
+        self._signs[BEAT] = time.monotonic()
+
+    def ready(self) -> None:
+        """Record that the worker has started and takes jobs."""
+        self._signs[READY] = time.monotonic()
+
+    @property
+    def was_ready(self) -> bool:
+        """Whether the worker ever took jobs."""
+        return bool(self._signs[READY] > 0)
+
+    def beat(self) -> None:
+        """Record that the worker is alive, whether or not a step runs."""
+        self._signs[BEAT] = time.monotonic()
+
+    def step(self, oldest: float) -> None:
+        """Record the time of the oldest last sign of progress of the running steps; 0: no step runs."""
+        self._signs[STEP] = oldest
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the worker or a running step has given no sign."""
+        return float(time.monotonic() - min(self._signs[BEAT], self._signs[STEP] or self._signs[BEAT]))
 
 
 def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:

@@ -14,14 +14,14 @@ from service.server import log, telemetry
 from service.server.database import workers
 from service.server.database.engine import LONGEST_PAUSE_S, UNANSWERED, Database, connect, message_of
 from service.server.jobs.context import WorkerContext
-from service.server.jobs.heartbeat import Heartbeat
 from service.server.jobs.queue import CHECKS, SERIALIZER, VERSION, WORK, JobQueue, prepare
 from service.server.jobs.runner import JobRunner
+from service.server.jobs.supervisor import Heartbeat
 from service.server.jobs.takeover import Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
 from service.server.log import logger
 from service.server.settings import Settings
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 
 POLL_S = 0.5
 """Seconds between two looks into a queue."""
@@ -33,13 +33,7 @@ NICENESS = 5
 
 
 def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
-    """Do jobs until SIGTERM or until the parent process ends, then end this process.
-
-    Args:
-        settings: of the service.
-        device: cpu, cuda:0, …
-        heartbeat: shared with the supervisor.
-    """
+    """Do jobs until SIGTERM or until the parent process ends, then end this process."""
     os.nice(NICENESS)
     ending = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())

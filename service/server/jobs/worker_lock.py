@@ -7,10 +7,10 @@ over at once. Names of workers are never used again.
 
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import Path
-from typing import Protocol
+from typing import TypeAlias
 
 import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
@@ -34,17 +34,8 @@ class LockState(Enum):
     """Another process has the lock."""
 
 
-class WorkerLock(Protocol):
-    """The lock of this worker, and a look at those of others."""
-
-    def hold(self) -> LockState:
-        """Take the lock of this worker, or make sure that it is still held."""
-
-    def dead(self, worker: str) -> AbstractContextManager[bool]:
-        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
-
-    def close(self) -> None:
-        """Release the lock."""
+WorkerLock: TypeAlias = "FileWorkerLock | AdvisoryWorkerLock"
+"""The lock of this worker, and a look at those of others."""
 
 
 class FileWorkerLock:
@@ -66,7 +57,7 @@ class FileWorkerLock:
 
     @contextmanager
     def dead(self, worker: str) -> Iterator[bool]:
-        """Try to take the lock of a worker."""
+        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
         file = self._take(worker)
         try:
             yield file is not None
@@ -123,7 +114,7 @@ class AdvisoryWorkerLock:
 
     @contextmanager
     def dead(self, worker: str) -> Iterator[bool]:
-        """Try to take the lock of a worker."""
+        """Return whether a worker has lost its lock; if so, nobody else can take that lock within the context."""
         session = self._session
         assert session is not None, "hold the lock of this worker first"
         taken = self._take(session, worker)

@@ -11,9 +11,8 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 
-from service.requests.base import Choice, Commas, Role
+from service.requests.base import Choice, Commas, JobRequest, Role
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
-from service.requests.job import JobRequest
 from service.requests.jobs import JOBS
 from service.requests.options import Option, help_text, is_document, places_of, typed
 

@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from service.reporting.progress import Progress
 from stage.errors import storage
@@ -37,58 +37,6 @@ class OpenFile(NamedTuple):
     """The same from every machine as long as the content is the same: letters, digits and hyphens."""
 
 
-class Storage(Protocol):
-    """What the service needs of a storage. A prefix is one of service.server.storage.layout."""
-
-    def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """Return a folder of this machine with files of a prefix, for reading.
-
-        Args:
-            prefix: of the files.
-            names: files that are needed, if they exist; None: all files.
-            progress: of the files that are fetched.
-        """
-
-    def workspace(self, prefix: str) -> Path:
-        """Return a folder of this machine into which files of a prefix are written; `local` puts existing files there."""
-
-    def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
-        """Make the files in the workspace part of the storage.
-
-        Args:
-            prefix: of the files.
-            progress: of the files that are sent.
-            alone: whether no other worker writes there, so that temporary files are those of a killed one, and are deleted.
-        """
-
-    def put(self, file: Path, prefix: str, name: str) -> None:
-        """Move a complete file into the storage."""
-
-    def delete(self, prefix: str, name: str) -> None:
-        """Delete one file, if there is one."""
-
-    def files(self, prefix: str) -> list[StoredFile]:
-        """Return the files of a prefix, by name."""
-
-    def open(self, prefix: str, name: str) -> Path | None:
-        """Return a file of this machine with the content of one file; None: there is no such file."""
-
-    def open_file(self, prefix: str, name: str) -> OpenFile | None:
-        """Open one file for reading; None: there is no such file."""
-
-    def remove(self, prefix: str) -> None:
-        """Delete all files of a prefix."""
-
-    def leftovers(self) -> list[str]:
-        """Return the prefixes that were removed in the last days and have files again, which a writer that was under way has made."""
-
-    def tidy(self) -> None:
-        """Finish deletions that were interrupted."""
-
-    def check(self) -> None:
-        """Raises: StorageError: nothing can be written."""
-
-
 class FolderStorage:
     """A storage whose prefixes are folders of the data folder."""
 
@@ -97,18 +45,25 @@ class FolderStorage:
         self._root = root
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """Return the folder of the prefix: nothing has to be fetched."""
+        """Return a folder of this machine with files of a prefix, for reading; here nothing has to be fetched.
+
+        `names` are the files that are needed, if they exist, None all files; `progress` is told of those that are fetched.
+        """
         return self._root / prefix
 
     def workspace(self, prefix: str) -> Path:
-        """Return the folder of the prefix, which is made if there is none."""
+        """Return a folder of this machine into which files of a prefix are written; `local` puts existing files there."""
         folder = self._root / prefix
         with storage("make", folder):
             folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
-        """Delete the temporary files of a killed writer, and flush the folder; the files are already in place."""
+        """Make the files in the workspace part of the storage: here they are in place, and the folder is flushed.
+
+        `progress` is told of files that are sent. `alone` says that no other worker writes there, so that temporary files are those of a
+        killed one, and are deleted.
+        """
         folder = self._root / prefix
         if folder.is_dir():
             if alone:
@@ -162,12 +117,13 @@ class FolderStorage:
         return OpenFile(descriptor, status.st_size, status.st_mtime, f"{status.st_ino:x}-{status.st_mtime_ns:x}-{status.st_size:x}")
 
     def remove(self, prefix: str) -> None:
-        """Delete the folder; it is hidden first, so that a part of it is not shown. A mark of the prefix stays for REMEMBERED_S."""
+        """Delete the folder, if there is one; it is hidden first, so that a part of it is not shown. A mark stays for REMEMBERED_S."""
         folder, mark = self._root / prefix, self._root / REMOVED / prefix
-        with storage("remove", folder):
-            mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.touch()
-            drop_folder(folder)
+        if folder.is_dir():
+            with storage("remove", folder):
+                mark.parent.mkdir(parents=True, exist_ok=True)
+                mark.touch()
+                drop_folder(folder)
 
     def leftovers(self) -> list[str]:
         """Return the prefixes that are marked as removed and are folders again."""
@@ -220,9 +176,11 @@ def drop_hidden(root: Path) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Delete the temporary files that a killed writer left."""
-    for path in folder.rglob(".*"):
-        if path.is_file():
+    """Delete the temporary files and folders that a killed writer left; no writer that lives may have any there."""
+    for path in list(folder.rglob(".*")):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
             path.unlink(missing_ok=True)
 
 

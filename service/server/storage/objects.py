@@ -1,4 +1,7 @@
-"""Storage in an object store. Workers read and write copies on their own disks; objects appear complete or not at all."""
+"""The storage that the settings name, and storage in an object store.
+
+Workers read and write copies of objects on their own disks; objects appear complete or not at all.
+"""
 
 import hashlib
 import os
@@ -10,8 +13,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from service.reporting.progress import Progress
+from service.server.settings import Settings
 from service.server.storage.bucket import Bucket, Object
-from service.server.storage.folder import REMOVED, OpenFile, StoredFile, is_shown, stored_below, sweep
+from service.server.storage.folder import REMOVED, FolderStorage, OpenFile, StoredFile, is_shown, stored_below, sweep
 from service.server.storage.scratch import Entry, Scratch
 from stage.files import replacing
 
@@ -20,6 +24,8 @@ TRANSFERS = 8
 """Files that are transferred at one time."""
 LOOK_S = 0.5
 """Seconds between two reports of progress."""
+SCRATCH = "scratch"
+"""Name of the folder, in the data folder, for copies of objects."""
 PROBE = "probe"
 CHECK_S = 30.0
 """Seconds for which the result of a check counts: each check costs two requests."""
@@ -155,6 +161,21 @@ class ObjectStorage:
         _transfer("download", list(missing.items()), fetch, entry, progress)
 
 
+Storage = FolderStorage | ObjectStorage
+"""Where the files of captures and results lie. A prefix is one of service.server.storage.layout."""
+
+
+def open_storage(settings: Settings) -> Storage:
+    """Open the storage that the settings name; nothing is written into it.
+
+    Raises:
+        RequestError: storage_url cannot be used.
+    """
+    if settings.storage_url is None:
+        return FolderStorage(settings.data)
+    return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))
+
+
 class _Ended(Exception):
     """Another transfer has failed."""
 
@@ -163,12 +184,7 @@ def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], No
               progress: Progress | None) -> None:
     """Transfer files, several at one time; the first error ends all transfers, as does an exception of `progress`.
 
-    Args:
-        stage: name of the stage.
-        items: to transfer.
-        move: transfers one item, calls its second argument after every piece, and returns name and version.
-        entry: records name and version.
-        progress: called whenever bytes were transferred, so that silence means that nothing moves.
+    `move` transfers one item, calls its second argument after every piece, and returns the name and the version.
     """
     if not items:
         return

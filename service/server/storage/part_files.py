@@ -74,7 +74,7 @@ class PartFile:
             while left:
                 written = os.writev(self._open(), pieces)
                 left -= written
-                pieces = _rest(pieces, written) if left else ()
+                pieces = [b"".join(pieces)[written:]] if left else ()
 
     def sync(self) -> None:
         """Flush the file to the disk."""
@@ -141,11 +141,6 @@ def leftovers(folder: Path, before: float) -> Iterator[str]:
                 yield path.name.removesuffix(SUFFIX)
         except FileNotFoundError:
             continue
-
-
-def _rest(pieces: Sequence[bytes], written: int) -> list[bytes]:
-    """Return the bytes that are left of pieces after `written` bytes."""
-    return [b"".join(pieces)[written:]]
 
 
 def _path(folder: Path, upload: str) -> Path:

@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from service.server.database import uploads
 from service.server.database.engine import UNANSWERED, Database, message_of
@@ -20,83 +20,62 @@ from service.server.database.uploads import Row
 from service.server.log import logger
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.folder import Storage
-from service.server.storage.part_files import READ, PartFile, PartFileLocked, part_files_folder, stored_bytes
+from service.server.storage.objects import Storage
+from service.server.storage.part_files import READ, PartFile, PartFileLocked, leftovers, part_files_folder, stored_bytes
 from stage.errors import storage as storage_errors
 
 LEASE_S, RENEW_S = 30.0, 10.0
 """Seconds after which a writer that no longer says that it lives counts as dead, and between two times that it says so."""
 
 
-class UploadParts(Protocol):
-    """The part files of all incomplete uploads."""
-
-    saves_while_writing: bool
-    """Whether bytes can be counted before a request has ended."""
-
-    def open(self, upload: Row) -> PartFile:
-        """Open and lock the part file of an upload.
-
-        Raises:
-            PartFileLocked: another request has locked it.
-            StorageError: it cannot be written.
-        """
-
-    def save(self, part: PartFile, upload: str, at: int) -> bool:
-        """Count the first `at` bytes, which are on the disk; return False if the upload was deleted, or another request has it now."""
-
-    def whole(self, part: PartFile) -> Path:
-        """Return the complete file, all bytes of which have come."""
-
-    def finish(self, part: PartFile, upload: str, length: int) -> bool:
-        """Record that the complete file is in the storage; return False if the upload was deleted, or another request has it now."""
-
-    def size(self, upload: Row) -> int:
-        """Return the number of bytes that are kept of an upload, of which some may not be counted yet."""
-
-    def discard(self, upload: str) -> None:
-        """Delete what is kept of an upload that was deleted, whether or not it is locked."""
-
-    def expire(self, before: float) -> int:
-        """Delete uploads that were not continued since a time (seconds since 1970), and parts without an upload; return their number."""
+UploadParts: TypeAlias = "FolderParts | StoredParts"
+"""The bytes of all incomplete uploads."""
 
 
 class FolderParts:
     """Part files in the data folder, which all API processes of a service share."""
 
     saves_while_writing = True
+    """Whether bytes can be counted before a request has ended."""
 
     def __init__(self, folder: Path, database: Database) -> None:
         """Args: folder: of the part files. database: of the service."""
         self._folder, self._database = folder, database
 
     def open(self, upload: Row) -> PartFile:
-        """Open and lock the file, which is made if there is none."""
+        """Open and lock the part file of an upload, which is made if there is none.
+
+        Raises:
+            PartFileLocked: another request has locked it.
+            StorageError: it cannot be written.
+        """
         return PartFile.open(self._folder, upload["id"])
 
     def save(self, part: PartFile, upload: str, at: int) -> bool:
-        """Record the offset."""
+        """Count the first `at` bytes, which are on the disk; return False if the upload was deleted, or another request has it now."""
         return uploads.advance(self._database, upload, at)
 
     def whole(self, part: PartFile) -> Path:
-        """Return the part file."""
+        """Return the complete file, all bytes of which have come."""
         return part.path
 
     def finish(self, part: PartFile, upload: str, length: int) -> bool:
-        """Record that the upload is complete."""
+        """Record that the complete file is in the storage; return as `save` does."""
         return uploads.finish(self._database, upload, length)
 
     def size(self, upload: Row) -> int:
-        """Return the size of the part file."""
+        """Return the number of bytes that are kept of an upload, of which some may not be counted yet."""
         return stored_bytes(self._folder, upload["id"])
 
     def discard(self, upload: str) -> None:
-        """Delete the part file."""
+        """Delete what is kept of an upload that was deleted, whether or not it is locked."""
         PartFile.discard(self._folder, upload)
 
     def expire(self, before: float) -> int:
-        """Delete rows and part files."""
-        return uploads.expire(self._database, self._folder, before)
+        """Delete rows that no request has locked, with their part files, and part files without a row."""
+        removed = _drop_untouched(self, self._database, before)
+        _drop_leftovers(self._database, self._folder, before)
+        return removed
 
 
 class StoredPart(PartFile):
@@ -223,20 +202,11 @@ class StoredParts:
 
     def expire(self, before: float) -> int:
         """Delete rows that no request has locked, with their pieces, and pieces and files without a row."""
-        removed = 0
-        for row in uploads.untouched(self._database, before):
-            try:
-                part = self.open(row)
-            except PartFileLocked:
-                continue
-            with part:
-                if uploads.drop_untouched(self._database, row["id"], before):
-                    part.drop()
-                    removed += 1
+        removed = _drop_untouched(self, self._database, before)
         old = {found.name.partition("/")[0] for found in self._storage.files(layout.PIECES) if found.modified_at < before}
         for upload in old - uploads.unfinished_of(self._database, old):
             self.discard(upload)
-        uploads.drop_leftovers(self._database, self._folder, before)
+        _drop_leftovers(self._database, self._folder, before)
         return removed
 
     def fetched(self, upload: Row) -> list[Path]:
@@ -275,6 +245,28 @@ class StoredParts:
                 uploads.renew(self._database, writers, time.time() + LEASE_S)
             except UNANSWERED as error:
                 logger.warning("locks of uploads are not renewed", error=message_of(error))
+
+
+def _drop_untouched(parts: UploadParts, database: Database, before: float) -> int:
+    """Delete the uploads that were not continued since a time and that no request has locked; return their number."""
+    removed = 0
+    for row in uploads.untouched(database, before):
+        try:
+            part = parts.open(row)
+        except PartFileLocked:
+            continue
+        with part:
+            if uploads.drop_untouched(database, row["id"], before):
+                part.drop()
+                removed += 1
+    return removed
+
+
+def _drop_leftovers(database: Database, folder: Path, before: float) -> None:
+    """Delete the part files that were not written since a time and have no upload."""
+    old = set(leftovers(folder, before))
+    for identifier in old - uploads.unfinished_of(database, old):
+        PartFile.discard(folder, identifier)
 
 
 def open_upload_parts(settings: Settings, database: Database, storage: Storage) -> UploadParts:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.depth.separate import separate
-from service.requests.separate import SeparateRequest
+from service.requests.depth import SeparateRequest
 from stage import exr
 from stage.capture import Capture
 from stage.depth_normals import depth_normals

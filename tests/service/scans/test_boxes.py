@@ -6,7 +6,7 @@ import pytest
 from kernels.fusion.bricks import BLOCK, BRICK_VOXELS
 from kernels.fusion.views import RangeImage
 from service.reporting.progress import Timings
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans import boxes
 from service.scans.fuse import fuse
 from service.scans.fused_bricks import fused_bricks

@@ -4,9 +4,8 @@ import json
 import re
 from pathlib import Path
 
-from service.requests.fuse import FuseRequest
 from service.requests.options import options_of
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseRequest, RegisterRequest
 from stage.scans.records import ScanSet
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "scans.md").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import pytest
 
 from service.asset.errors import AssetError
 from service.errors import RequestError
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
 from stage.camera import Camera
 from stage.depth_maps import DepthMaps

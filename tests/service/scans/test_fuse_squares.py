@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans import range_images
 from service.scans.fuse import FuseResult, fuse
 from stage.scans.ply_points import read_ply_points

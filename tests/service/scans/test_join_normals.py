@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.fuse import FuseResult, fuse
 from stage.camera import Camera
 from stage.maps import SurfaceMaps

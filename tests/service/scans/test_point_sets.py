@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.fuse import FuseRequest
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.point_sets import as_range_image
 from service.scans.read import read_scan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
 from stage.camera import Camera
 from stage.images import read_pixels

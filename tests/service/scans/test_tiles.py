@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
-from service.requests.fuse import FuseRequest
+from service.requests.register import FuseRequest
 from service.scans import fused_bricks
 from service.scans.fuse import FuseResult, fuse
 from service.usd.fused_asset import Tile, write_site

@@ -13,7 +13,7 @@ from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 
 DAYS = 30.0
 PROJECT = "larch"

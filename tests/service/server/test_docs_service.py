@@ -23,7 +23,7 @@ from service.server.jobs.queue import JobQueue, prepare
 from service.server.processes import PRIVATE
 from service.server.sample import show_sample
 from service.server.settings import Settings
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 
 HOME = Path(__file__).parents[3]
 TEXT = (HOME / "docs" / "service.md").read_text(encoding="utf-8")

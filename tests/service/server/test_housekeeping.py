@@ -7,7 +7,7 @@ import sqlalchemy as sa
 
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
 from service.requests.jobs import ExportJob
-from service.server.database import idempotency, intakes, jobs, tables, uploads, workers
+from service.server.database import audit, idempotency, intakes, jobs, tables, uploads, workers
 from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S
 from service.server.storage import layout
 from service.server.storage.part_files import PartFile, part_files_folder
@@ -89,6 +89,16 @@ def test_tokens_are_remembered_for_a_day(house):
     house.now += 0.2 * DAY_S
     house.keeper.round()
     assert ask() == made[1]
+
+
+def test_lines_of_the_audit_log_are_kept_for_audit_days(house):
+    house.database.transact(lambda connection: audit.record_operator(connection, PROJECT, "key.create", "key_1"))
+    house.now += 399 * DAY_S
+    house.keeper.round()
+    assert len(audit.listing(house.database, limit=9)) == 1
+    house.now += 2 * DAY_S
+    house.keeper.round()  # in which the clock jumps
+    assert len(audit.listing(house.database, limit=9)) == 0
 
 
 def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(house):
@@ -197,6 +207,8 @@ def test_what_a_writer_made_again_of_a_deleted_job_is_removed(house):
 def test_marks_of_removed_jobs_do_not_stay_for_ever(tmp_path):
     house = House(tmp_path / "data")
     house.storage.remove(layout.results(PROJECT, house.job()))
+    for kind in (CAPTURE, ENVIRONMENT):  # without a file, of which no writer is under way
+        house.storage.remove(layout.intake(PROJECT, house.capture(kind)))
     marks = [path for path in house.settings.data.glob("removed/**/*") if path.is_file()]
     assert len(marks) == 1
     house.keeper.round()

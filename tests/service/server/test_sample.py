@@ -11,7 +11,7 @@ from service.server.jobs.queue import JobQueue, prepare
 from service.server.sample import SampleResults, show_sample
 from service.server.settings import Settings
 from service.server.storage import layout
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 
 SAMPLE = Path(__file__).resolve().parents[3] / "samples" / "owl"
 

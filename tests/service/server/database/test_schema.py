@@ -11,13 +11,13 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
-from service.server.database import intakes, jobs, keys, schema, tables, uploads
+from service.server.database import audit, intakes, jobs, keys, schema, tables, uploads
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import REVISIONS, is_current, require_current, upgrade
 from service.server.jobs.queue import prepare
 from service.server.settings import Settings
 
-FIRST = Path(__file__).parent / "first_schema.sql"
+OLDEST = Path(__file__).parent / "schema_0009.sql"
 CAPTURE, RECEIVING, UPLOAD = "cap_0123456789abcdefghjk", "cap_1123456789abcdefghjk", "upl_0123456789abcdefghjk"
 DONE, WAITING, KEY = "job_0123456789abcdefghjk", "job_1123456789abcdefghjk", "key_0123456789abcdefghjk"
 
@@ -39,9 +39,11 @@ def database(settings):
 
 @pytest.fixture
 def yesterday(database) -> Database:
-    """The database of the first release, with something in every table."""
-    text = "\n".join(line for line in FIRST.read_text().splitlines() if not line.startswith("--"))
+    """The database of relit 0.1.0, with something in the tables that matter."""
+    text = "\n".join(line for line in OLDEST.read_text().splitlines() if not line.startswith("--"))
     text = text.replace("<BYTEWISE>", "" if database.is_sqlite else 'COLLATE "C"')
+    text = text.replace("<NUMBER>", "INTEGER NOT NULL" if database.is_sqlite else "SERIAL")
+    text = text.replace("<LARGE NUMBER>", "INTEGER NOT NULL" if database.is_sqlite else "BIGSERIAL")
     with database.engine.begin() as connection:
         for statement in text.split(";\n"):
             if statement.strip():
@@ -72,6 +74,8 @@ def test_yesterdays_database_is_upgraded_and_keeps_all_it_has(settings, yesterda
     assert (waiting["state"], waiting["attempt"], waiting["lost"], waiting["priority"]) == ("queued", 2, 2, 60)
     assert yesterday.transact(lambda connection: jobs.users_of(connection, CAPTURE, active=True)) == [WAITING]
     assert yesterday.row(sa.select(tables.idempotency.c.made))["made"] == DONE
+    assert [row["object"] for row in audit.listing(yesterday, limit=9)] == [DONE]
+    assert [row["text"] for row in jobs.log_of(yesterday, DONE)] == ["succeeded"]
     assert yesterday.transact(lambda connection: jobs.cancel(connection, WAITING))  # it can be changed, too
 
 
@@ -102,8 +106,8 @@ def test_an_upgrade_that_fails_changes_nothing(yesterday, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         upgrade(yesterday)
     with yesterday.engine.connect() as connection:
-        assert connection.exec_driver_sql("SELECT version FROM relit_about").scalar() == 1
-        assert not sa.inspect(connection).has_table(REVISIONS)
+        assert connection.exec_driver_sql("SELECT version FROM relit_about").scalar() == 2
+        assert connection.exec_driver_sql(f"SELECT version_num FROM {REVISIONS}").scalar() == "0009"
 
 
 def fail(config, _revision):
@@ -116,11 +120,13 @@ def test_who_only_reads_upgrades_nothing(yesterday):
         require_current(yesterday)
 
 
-def test_programs_without_migrations_are_kept_away(yesterday):
-    """They refuse every number but 1."""
-    upgrade(yesterday)
-    with yesterday.engine.connect() as connection:
-        assert connection.exec_driver_sql("SELECT version FROM relit_about").scalar() == 2
+@pytest.mark.parametrize("opened", [upgrade, require_current])
+@pytest.mark.parametrize("revision", ["0008", None])
+def test_a_database_from_before_the_oldest_revision_says_how_to_bring_it_over(yesterday, opened, revision):
+    with yesterday.engine.begin() as connection:
+        connection.exec_driver_sql(f"DROP TABLE {REVISIONS}" if revision is None else f"UPDATE {REVISIONS} SET version_num = '{revision}'")
+    with pytest.raises(DatabaseError, match=rf"early relit \(revision {revision or 'none'}\): start relit serve of version 0.1.0"):
+        opened(yesterday)
 
 
 @pytest.mark.parametrize("opened", [upgrade, require_current])

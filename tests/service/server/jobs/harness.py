@@ -15,8 +15,8 @@ from typing import Any
 import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus
 
+from service.requests.base import JobRequest
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
-from service.requests.job import JobRequest
 from service.requests.jobs import ANY_JOB, RelightJob
 from service.requests.relight import RelightOptions
 from service.server.database import intakes, jobs, workers

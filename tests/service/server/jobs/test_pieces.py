@@ -12,7 +12,7 @@ from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.pieces import JobPieces
 from service.server.jobs.progress import Stopped
 from service.server.storage import layout
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from stage.errors import StorageError
 from stage.files import replacing
 

@@ -3,6 +3,7 @@
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from service import __version__
 from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
@@ -10,7 +11,7 @@ from service.server.jobs import runner as runner_module
 from service.server.jobs.context import JobStep, WorkerContext
 from service.server.jobs.runner import DONE, STOPPED, JobRunner
 from service.server.storage import layout
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from stage.errors import StorageError
 from stage.files import write_text
 from tests.service.server.jobs.harness import PROJECT
@@ -76,16 +77,43 @@ def test_a_job_that_was_given_back_goes_on_with_the_steps_that_are_left(idle_har
     assert begun == NAMES[1:]
 
 
-def test_an_unexpected_error_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch):
+@pytest.mark.parametrize(("error", "told"), [
+    (RuntimeError("of another's making"), "an error of relit itself (RuntimeError)"),
+    (RuntimeError("Failed to allocate 4096 bytes on device 'cpu'"), "the worker has too little memory"),
+    (MemoryError(), "the worker has too little memory"),
+])
+@pytest.mark.parametrize("when", ["before the first step", "in a step"])
+def test_an_unexpected_error_ends_the_job_with_a_sentence(idle_harness, runner, monkeypatch, error, told, when):
     made, claim = runner
 
-    def fail(job, context):
-        raise RuntimeError("of another's making")
+    def fail(*_):
+        raise error
 
-    monkeypatch.setattr(runner_module, "steps_of", fail)
+    if when == "in a step":
+        do_nothing(monkeypatch, fail)
+    else:
+        monkeypatch.setattr(runner_module, "steps_of", fail)
     assert made.run(claim) == jobs.FAILED
     row = idle_harness.row(claim.job)
-    assert (row["state"], row["error"]) == (jobs.FAILED, "an error of relit itself (RuntimeError): its log has more")
+    assert row["state"] == jobs.FAILED
+    assert row["error"].startswith(told if when != "in a step" else f"{NAMES[0]}: {told}")
+
+
+def test_a_job_that_another_version_began_is_made_anew(idle_harness, runner, monkeypatch):
+    """So that its frames are all those of one version."""
+    made, claim = runner
+    with monkeypatch.context() as before:
+        before.setattr(jobs, "__version__", "0.0.1")
+        jobs.begin(idle_harness.database, claim)
+        jobs.finish_step(idle_harness.database, claim, NAMES[:1])
+    assert idle_harness.row(claim.job)["version"] == "0.0.1"
+    done = []
+    do_nothing(monkeypatch, lambda progress: done.append(progress))
+    assert made.run(claim) == DONE
+    assert len(done) == 2
+    row = idle_harness.row(claim.job)
+    assert (row["finished_steps"], row["version"]) == (NAMES, __version__)
+    assert any("another version" in entry["text"] for entry in jobs.log_of(idle_harness.database, claim.job))
 
 
 def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, runner, monkeypatch):

@@ -13,11 +13,11 @@ from service.requests.jobs import DepthJob, SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
 from service.sequences import one_step
 from service.sequences.run import solve_sequence
-from service.server.database import job_log, jobs
+from service.server.database import jobs
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
 from service.server.settings import Settings
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step
@@ -121,4 +121,4 @@ def test_a_killed_worker_loses_one_time_step_at_most(tmp_path, sequence, undistu
         begun = [event["step"] for event in made.events() if event["event"] == "step begins" and event["job"] == job]
         assert begun.count("step 1") == 1 and len(begun) <= STEPS + 2
         assert {f"{number}/{STEPS} ingest, {LIGHTS} to do" for number in range(1, STEPS + 1)} <= {
-            entry["text"] for entry in job_log.read(made.database, job)}
+            entry["text"] for entry in jobs.log_of(made.database, job)}

@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.fuse import FuseOptions, FuseRequest
 from service.requests.identifiers import JOB, new_id
 from service.requests.jobs import FuseJob, RegisterJob
-from service.requests.register import RegisterRequest
+from service.requests.register import FuseOptions, FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from service.server.database import jobs
@@ -109,7 +108,7 @@ def test_two_workers_find_the_same_poses_as_one_process(both, depths, alone):
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
     assert json.loads((both.results(job) / "report.json").read_text())["pairs"] == json.loads(
         (alone.parent / "report.json").read_text())["pairs"]
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
 
 
 def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tmp_path):
@@ -123,7 +122,7 @@ def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tm
     tiles = {path.name: path.read_bytes() for path in (expected / "tiles").glob("*.ply")}
     assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (both.results(job) / "tiles").glob("*.ply")} == tiles
     assert (both.results(job) / "site.usda").exists()
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
 
 
 @pytest.mark.long
@@ -134,4 +133,4 @@ def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths
     row = both.ended(job)
     assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job

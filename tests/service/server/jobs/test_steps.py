@@ -6,17 +6,27 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
+from service.requests.frame_range import numbered
 from service.requests.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob, SolveJob
 from service.requests.solve import SolveOptions
 from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
-from service.server.jobs.steps import steps_of
-from service.server.storage.open import open_storage
+from service.server.jobs.steps import _parts, steps_of
+from service.server.storage import layout
+from service.server.storage.objects import open_storage
 from stage import exr
 from stage.errors import StageError
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.server.jobs.harness import PROJECT
+
+
+@pytest.mark.parametrize(("there", "parts"), [
+    (0, [(1, 1), (2, 3), (4, 7), (8, 10)]), (5, [(1, 6), (7, 8), (9, 10)]), (10, [(1, 10)])])
+def test_after_a_loss_frames_are_made_in_small_parts_first(tmp_path, there, parts):
+    for number in range(1, there + 1):
+        (tmp_path / numbered(layout.FRAMES, number)).write_bytes(b"frame")
+    assert [(part[0], part[-1]) for part in _parts(list(range(1, 11)), tmp_path)] == parts
 
 
 class Silent:

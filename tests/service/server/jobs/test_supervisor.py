@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from service.server.jobs import heartbeat, supervisor
+from service.server.jobs import supervisor
 from service.server.settings import Settings
 from tests.service.server.jobs import stand_ins
 
@@ -70,8 +70,8 @@ def test_one_that_gives_no_sign_is_killed(monkeypatch, tmp_path, log, worker):
 
 def test_the_silence_of_a_worker_is_that_of_the_whole_or_of_its_oldest_step(monkeypatch):
     clock = iter(range(100, 200))
-    monkeypatch.setattr(heartbeat.time, "monotonic", lambda: float(next(clock)))
-    made = heartbeat.Heartbeat()  # at 100
+    monkeypatch.setattr(supervisor.time, "monotonic", lambda: float(next(clock)))
+    made = supervisor.Heartbeat()  # at 100
     assert made.silent_s == 1 and not made.was_ready
     made.beat()  # at 102
     assert made.silent_s == 1

@@ -9,10 +9,10 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim, StageProgress
 from service.server.jobs.progress import JobProgress
-from service.server.jobs.queue import job_and_attempt, prepare, workflow_id
+from service.server.jobs.queue import workflow_id
 from service.server.jobs.takeover import FORGOTTEN_ROUNDS, GRACE_ROUNDS, Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
-from tests.service.server.jobs.harness import PROJECT, harness
+from tests.service.server.jobs.harness import harness
 
 MAX_LOST = 3
 
@@ -108,43 +108,6 @@ def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_p
         late.join()
         assert ended == [False]
         assert made.row(job)["state"] == jobs.QUEUED
-
-
-def test_a_changed_priority_is_that_of_the_queue(idle_harness):
-    """Without another attempt, and among equal priorities the job keeps its place."""
-    first, second, third = (idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5) for _ in range(3))
-    before = idle_harness.row(second)
-
-    def change(connection, job, priority):
-        assert jobs.set_priority(connection, job, priority) == 1
-        idle_harness.queue.set_priority(connection, job, 1, priority)
-
-    def order():
-        sorted_as_dbos_does = sorted((idle_harness.workflow(job) for job in (first, second, third)),
-                                     key=lambda status: (status.priority, status.created_at))
-        return [job_and_attempt(status.workflow_id)[0] for status in sorted_as_dbos_does]
-
-    assert order() == [first, second, third]
-    idle_harness.database.transact(lambda connection: change(connection, third, before["priority"] + 1))
-    assert order() == [third, first, second]
-    idle_harness.database.transact(lambda connection: change(connection, second, before["priority"] + 1))
-    assert order() == [second, third, first]
-    row = idle_harness.row(second)
-    assert (row["attempt"], row["revision"], row["state"]) == (1, before["revision"] + 1, jobs.QUEUED)
-    idle_harness.take(second, "one")
-    jobs.begin(idle_harness.database, Claim(second, 1, "one"))
-    assert idle_harness.database.transact(lambda connection: jobs.set_priority(connection, second, 1)) is None  # it runs
-
-
-def test_workflows_of_before_projects_took_turns_get_their_project(idle_harness):
-    """Workers take only workflows that name their project."""
-    job = idle_harness.relight(new_id(CAPTURE), new_id(ENVIRONMENT), 10, chunk_frames=5)
-    table = "workflow_status" if idle_harness.database.is_sqlite else "dbos.workflow_status"
-    idle_harness.database.transact(lambda connection: connection.execute(sa.text(f"UPDATE {table} SET queue_partition_key = NULL")))
-    prepare(idle_harness.settings, idle_harness.database)
-    row = idle_harness.database.row(sa.select(sa.text("queue_partition_key")).select_from(sa.text(table)))
-    assert row["queue_partition_key"] == PROJECT
-    assert idle_harness.in_queue(job)[0] == "ENQUEUED"
 
 
 def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):

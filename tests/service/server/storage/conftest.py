@@ -18,8 +18,8 @@ import httpx2
 import pytest
 
 from service.server.storage.bucket import Bucket
-from service.server.storage.folder import FolderStorage, Storage
-from service.server.storage.objects import ObjectStorage
+from service.server.storage.folder import FolderStorage
+from service.server.storage.objects import ObjectStorage, Storage
 from service.server.storage.scratch import Scratch
 
 LIMIT = 1 << 30

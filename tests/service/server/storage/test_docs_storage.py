@@ -10,7 +10,7 @@ from service.server.jobs.progress import JobProgress
 from service.server.jobs.steps import KEYS_FILE
 from service.server.settings import Settings
 from service.server.storage import layout, objects, scratch
-from service.server.storage.open import SCRATCH
+from service.server.storage.objects import SCRATCH
 from service.server.storage.part_files import part_files_folder
 
 TEXT = (Path(__file__).parents[4] / "docs" / "service_storage.md").read_text(encoding="utf-8")

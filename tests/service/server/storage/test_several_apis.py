@@ -20,7 +20,7 @@ from service.server.database import jobs, uploads
 from service.server.database.engine import connect
 from service.server.settings import Settings
 from service.server.storage import upload_parts
-from service.server.storage.open import open_storage
+from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from service.server.storage.bucket import PIECE_BYTES
-from service.server.storage.folder import FolderStorage, Storage
+from service.server.storage.folder import FolderStorage
+from service.server.storage.objects import Storage
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
@@ -39,10 +40,13 @@ def test_what_is_published_is_there(storage):
 def test_half_written_files_are_never_part_of_it(storage):
     folder = storage.workspace(RESULTS)
     write(folder, ".frame.0001.k3j.exr", b"half")
+    write(folder, "step/.frame.0003.x2f/rows.exr", b"rows")
     write(folder, "frame.0002.exr", b"whole")
+    storage.publish(RESULTS, alone=False)  # another worker may be writing the others
+    assert (folder / "step/.frame.0003.x2f/rows.exr").exists()
     storage.publish(RESULTS)
     assert names(storage, RESULTS) == ["frame.0002.exr"]
-    assert not (folder / ".frame.0001.k3j.exr").exists()
+    assert not (folder / ".frame.0001.k3j.exr").exists() and not list((folder / "step").iterdir())
     assert storage.open(RESULTS, ".frame.0001.k3j.exr") is None
 
 

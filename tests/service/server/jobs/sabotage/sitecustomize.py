@@ -36,13 +36,13 @@ class Slow:
         self._inner.advance(done)
 
 
-def slow(job, request, only, context, progress):
-    relight(job, request, only, context, Slow(progress))
+def slow(request, chunk, files):
+    relight(request, chunk, files._replace(progress=Slow(files.progress)))
 
 
-def slow_if_long(job, request, only, context, progress):
+def slow_if_long(request, chunk, files):
     is_long = len(frame_numbers(request.options.frames, 1)) > 400
-    relight(job, request, only, context, Slow(progress) if is_long else progress)
+    (slow if is_long else relight)(request, chunk, files)
 
 
 is_worker = "--multiprocessing-fork" in sys.orig_argv  # as Python calls a process that multiprocessing starts
