@@ -83,7 +83,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy", "small_gicp"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy", "small_gicp"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -186,7 +186,7 @@ def test_no_cycles():
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
-    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy", "rawpy",
+    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy", "rawpy",
              "small_gicp", "xatlas")
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
