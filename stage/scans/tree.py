@@ -4,6 +4,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stage.scans.pairs import Pair
 from stage.scans.rigid import inverse, step_between
@@ -16,20 +18,9 @@ CLOSED_PART = 0.03
 
 def joined_groups(count: int, pairs: Iterable[Pair]) -> list[set[int]]:
     """Return the groups of scans that pairs join, the largest first; of equal groups the one with the first scan."""
-    group = list(range(count))
-
-    def root(number: int) -> int:
-        while group[number] != number:
-            group[number] = group[group[number]]
-            number = group[number]
-        return number
-
-    for pair in pairs:
-        group[root(pair.a)] = root(pair.b)
-    found: dict[int, set[int]] = defaultdict(set)
-    for number in range(count):
-        found[root(number)].add(number)
-    return sorted(found.values(), key=lambda members: (-len(members), min(members)))
+    first, second = np.array([(pair.a, pair.b) for pair in pairs], dtype=np.int64).reshape(-1, 2).T
+    found, group = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(count, count)), directed=False)
+    return sorted((set(np.flatnonzero(group == number).tolist()) for number in range(found)), key=lambda members: (-len(members), min(members)))
 
 
 def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
