@@ -186,8 +186,8 @@ def test_no_cycles():
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
-    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy", "rawpy",
-             "small_gicp", "xatlas")
+    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy",
+             "rawpy", "small_gicp", "xatlas")
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
             "try: service.cli.main.main()\n"

@@ -20,7 +20,8 @@ def joined_groups(count: int, pairs: Iterable[Pair]) -> list[set[int]]:
     """Return the groups of scans that pairs join, the largest first; of equal groups the one with the first scan."""
     first, second = np.array([(pair.a, pair.b) for pair in pairs], dtype=np.int64).reshape(-1, 2).T
     found, group = connected_components(coo_array((np.ones(len(first)), (first, second)), shape=(count, count)), directed=False)
-    return sorted((set(np.flatnonzero(group == number).tolist()) for number in range(found)), key=lambda members: (-len(members), min(members)))
+    groups = [set(np.flatnonzero(group == number).tolist()) for number in range(found)]
+    return sorted(groups, key=lambda members: (-len(members), min(members)))
 
 
 def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
