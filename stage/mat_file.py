@@ -1,5 +1,7 @@
 """Reading of MATLAB's .mat files of version 5 (`save -v6` and `-v7`, and SciPy's `savemat`): numbers, texts, cells and structures.
 
+SciPy's `loadmat` ends the process with a segmentation fault on some files with one wrong byte, and these files come from strangers.
+
 Source: MathWorks, "MAT-File Format", level 5. Numbers are real and not sparse; a file of version 7.3 is HDF5 and is refused with the
 way out.
 """

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 
-from kernels.surface.components import label_runs
 from stage.board.comparison import Deviation
 from stage.board.grid import BoardGrid
 from stage.board.regions import RegionResult
@@ -114,17 +114,9 @@ def entries(defects: Sequence[Defect], regions: Sequence[RegionResult]) -> dict[
 
 def _connected(pixels: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
     """Yield the rows, the columns and the pixels within them of every connected area."""
-    runs = label_runs(pixels)
-    order = np.argsort(runs.label, kind="stable")
-    ends = np.cumsum(np.bincount(runs.label, minlength=runs.count))
-    for begin, end in zip([0, *ends[:-1]], ends, strict=True) if runs.count else ():
-        mine = order[begin:end]
-        row, first, last = runs.row[mine], runs.first_col[mine], runs.end_col[mine]
-        rows, cols = slice(int(row.min()), int(row.max()) + 1), slice(int(first.min()), int(last.max()))
-        part = np.zeros((rows.stop - rows.start, cols.stop - cols.start), dtype=bool)
-        for r, a, b in zip(row - rows.start, first - cols.start, last - cols.start, strict=True):
-            part[r, a:b] = True
-        yield rows, cols, part
+    labels, _ = label(pixels)
+    for number, (rows, cols) in enumerate(find_objects(labels), start=1):
+        yield rows, cols, labels[rows, cols] == number
 
 
 def _area(grid: BoardGrid, row: np.ndarray, col: np.ndarray, middle: tuple[float, float]) -> Area:

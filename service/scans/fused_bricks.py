@@ -18,13 +18,11 @@ from kernels.fusion.bricks import BRICK_VOXELS
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
-from service.scans.misplaced import Placing, Readings, place_scans, reach_of, readings_of
+from service.scans.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
-from service.scans.placing_words import placing_warnings
 from service.scans.prepared_scans import PreparedScans, ScanSummary
 from service.scans.range_images import WIDTHS, PreparedScan
-from service.scans.stored_bricks import packed_brick, unpacked_brick
-from service.scans.surface import BrickSurface, fuse_brick, origin_of, places_near
+from service.scans.surface import VERTEX, BrickSurface, fuse_brick, origin_of, places_near
 from service.solve.sharing import digest, kind_of_worker
 from stage.packed_arrays import packed, unpacked
 from stage.scans.records import read_scan_set
@@ -125,3 +123,35 @@ def _voxel(summaries: list[ScanSummary]) -> float:
     """Return half the median distance between neighbouring pixels on the surface, or the median noise where that is larger, metres."""
     pitch, noise = ([getattr(summary, name) for summary in summaries] for name in ("pitch", "noise"))
     return float(f"{max(np.median(pitch) / 2, np.median(noise)):.3g}")
+
+
+def placing_warnings(names: list[str], placings: list[Placing], choice: Misplaced) -> Iterator[str]:
+    """Yield which scans lie beside the others, and which have nothing in common with any.
+
+    Args:
+        names: of the scans.
+        placings: of each.
+        choice: what becomes of those that lie beside the others.
+    """
+    for name, placing in zip(names, placings, strict=True):
+        if placing.misplaced:
+            end = "it was left out" if choice is Misplaced.LEAVE_OUT else "it was fused all the same, and the surface is doubled there"
+            yield (f"scan {name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of the others, whose noise explains "
+                   f"{1e3 * placing.sigma_m:.2g} mm: its pose is wrong, and {end}")
+        elif placing.compared < LEAST_COMMON and len(names) > 1:
+            yield f"scan {name}: has next to no surface in common with the others, so that nothing tells whether its pose is right"
+
+
+def packed_brick(surface: BrickSurface) -> bytes:
+    """Return the surface of a brick as bytes."""
+    arrays = {name: getattr(surface, name) for name in (*VERTEX, "edge", "faces", "blocks")}
+    numbers = np.array(list(surface.tallies), dtype=np.int64)
+    return packed(arrays | {"scans": numbers, "tallies": np.array(list(surface.tallies.values()), dtype=np.float64)})
+
+
+def unpacked_brick(content: bytes) -> BrickSurface:
+    """Return the surface of `packed_brick`."""
+    found = unpacked(content)
+    tallies = dict(zip(map(int, found.pop("scans")), found.pop("tallies"), strict=True))
+    blocks = int(found.pop("blocks"))
+    return BrickSurface(**found, tallies=tallies, blocks=blocks)

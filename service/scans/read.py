@@ -14,7 +14,7 @@ from stage.ply import POINTS_FILE, read_ply
 from stage.result_metadata import result_file
 from stage.scans.planes import LocalPlanes, local_planes, robust_scatter
 from stage.scans.ply_points import PlyPoints, read_ply_points
-from stage.scans.records import UNITS_M, ScanEntry, ScanSet
+from stage.scans.records import MOST_M, UNITS_M, ScanEntry, ScanSet
 from stage.scans.rigid import nearest_rigid
 from stage.scans.scan import Scan, Target
 
@@ -149,6 +149,8 @@ def _point_set(path: Path, entry: ScanEntry, where: str, pose: np.ndarray | None
     if len(ply.points) == 0:
         beside = "" if entry.viewpoint_m is None else " that is not at viewpoint_m"
         raise ManifestError(f"{where}: has no point with a σ above 0{beside}")
+    if (farthest := float(np.abs(ply.points).max()) * unit) > MOST_M:
+        raise ManifestError(f"{where}: path: {path.name} has a coordinate of {farthest:.3g} m, {MOST_M:.0e} m are the most: check its unit")
     points = (ply.points * unit).astype(np.float32)
     planes = None
     if (ply.normals is None and estimate_normals) or (ply.sigma is None and entry.sigma_m is None):

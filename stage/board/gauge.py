@@ -7,6 +7,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import fdtrc
 
 POOL_PROBABILITY = 0.25
 """The interaction of parts and operators is pooled with the repeatability where chance alone makes it as large this often or more."""
@@ -76,7 +77,7 @@ def gauge_study(values: np.ndarray) -> GaugeStudy:
     crossed_freedom = (parts - 1) * (operators - 1)
     interaction: float | None = None
     repeat, base = error / freedom, crossed / crossed_freedom
-    if repeat == 0 or f_tail(base / repeat, crossed_freedom, freedom) < POOL_PROBABILITY:
+    if repeat == 0 or fdtrc(crossed_freedom, freedom, base / repeat) < POOL_PROBABILITY:
         interaction = max((base - repeat) / trials, 0.0)
     else:
         freedom += crossed_freedom
@@ -86,38 +87,8 @@ def gauge_study(values: np.ndarray) -> GaugeStudy:
     return _study(repeat, operator + (interaction or 0.0), interaction, part, freedom)
 
 
-def f_tail(ratio: float, above: int, below: int) -> float:
-    """Return the probability that an F-distributed number exceeds a ratio.
-
-    Args:
-        ratio: of two mean squares.
-        above, below: degrees of freedom of the numerator and the denominator.
-
-    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.6.2 and 26.5.8 (continued fraction of the incomplete beta).
-    """
-    if ratio <= 0:
-        return 1.0
-    return _incomplete_beta(below / (below + above * ratio), below / 2, above / 2)
-
-
 def _study(repeat: float, operator: float | None, interaction: float | None, part: float, freedom: int) -> GaugeStudy:
     gauge = repeat + (operator or 0.0)
     root = math.sqrt
     return GaugeStudy(root(repeat), None if operator is None else root(operator), None if interaction is None else root(interaction),
                       root(gauge), root(part), root(gauge + part), freedom)
-
-
-def _incomplete_beta(x: float, a: float, b: float) -> float:
-    """Return the regularised incomplete beta function, by its continued fraction, evaluated backwards."""
-    if x >= 1:
-        return 1.0
-    if x > (a + 1) / (a + b + 2):
-        return 1 - _incomplete_beta(1 - x, b, a)
-    front = math.exp(a * math.log(x) + b * math.log1p(-x) + math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)) / a if x > 0 else 0.0
-    fraction = 1.0
-    for m in range(200, 0, -1):  # converges within √max(a, b) terms
-        half, odd = divmod(m, 2)
-        step = (-(a + half) * (a + b + half) / ((a + 2 * half) * (a + 2 * half + 1)) if odd
-                else half * (b - half) / ((a + 2 * half - 1) * (a + 2 * half)))
-        fraction = 1 + step * x / fraction
-    return front / fraction

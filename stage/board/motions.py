@@ -94,18 +94,6 @@ def solve_motions(overlaps: Mapping[tuple[int, int], Overlap], middles: np.ndarr
     return Motions(values, relative @ inverse @ relative.T, contradicted, float(np.sqrt(np.mean(np.square(heights)))) if heights else 0.0)
 
 
-def connected(tiles: int, pairs: list[tuple[int, int]]) -> list[int]:
-    """Return the number of the group of every tile: tiles that pairs join, in any number of steps, have one number."""
-    group = list(range(tiles))
-    for _ in range(tiles):
-        before = list(group)
-        for i, j in pairs:
-            group[i] = group[j] = min(group[i], group[j])
-        if group == before:
-            break
-    return group
-
-
 def _weighted(information: np.ndarray, weight: float) -> np.ndarray:
     """Return an information matrix whose lateral unknowns count by a weight, and whose others keep what they say."""
     scale = np.ones(UNKNOWNS)

@@ -5,11 +5,13 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from stage.board.blending import Blender, TileErrors
 from stage.board.grid import BoardGrid, HeightMap, HeightPatch
 from stage.board.gridding import grid_points
-from stage.board.motions import Motions, connected, displace, solve_motions
+from stage.board.motions import Motions, displace, solve_motions
 from stage.board.overlap import UNKNOWNS, Evidence, Overlap, choose_candidate, measure_overlap
 from stage.errors import BoardError
 
@@ -202,8 +204,9 @@ def _check_agreement(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int]
                 raise BoardError(f"tiles {tiles[0].name} and {tiles[1].name}: one of them is mirrored: its mirror image fits the other, "
                                  "itself does not")
             raise BoardError(f"tile {tiles[turned].name}: is mirrored: its mirror image fits tile {tiles[others[0]].name}, itself does not")
-    group = connected(len(tiles), joined)
-    if len(set(group)) == 1:
+    first, second = np.array(joined, dtype=np.int64).reshape(-1, 2).T
+    count, group = connected_components(coo_array((np.ones(len(joined)), (first, second)), shape=(len(tiles),) * 2), directed=False)
+    if count == 1:
         return
     apart = next(number for number in range(len(tiles)) if group[number] != group[0])
     pair = next((pair for pair in differs if group[pair[0]] != group[pair[1]]), None)

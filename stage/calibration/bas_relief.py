@@ -8,7 +8,7 @@ narrow ranges of the angle. A surface without highlights is taken for one of few
 Sources: Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity", IJCV 35(1), 1999; Drbohlav and Šára, "Specularities reduce ambiguity
 of uncalibrated photometric stereo", ECCV 2002, and Tan, Mallick, Quan, Kriegman and Zickler, "Isotropy, reciprocity and the generalized
 bas-relief ambiguity", CVPR 2007, for what highlights and isotropy tell; Alldrin, Mallick and Kriegman, "Resolving the generalized
-bas-relief ambiguity by entropy minimization", CVPR 2007, for few albedos; Nelder and Mead, Computer Journal 7(4), 1965.
+bas-relief ambiguity by entropy minimization", CVPR 2007, for few albedos.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from stage.consistency.lambertian import SHADOW, bright_readings
 
@@ -67,14 +68,14 @@ def resolve_relief(readings: np.ndarray, usable: np.ndarray, lights: np.ndarray,
     pixels = _Pixels(readings - model, compared, lights, b)
     costs: dict[str, Callable[[_Pixels, np.ndarray], float]] = {"highlights": _untold_by_highlights, "albedo": _spread_of_albedo}
     if near is not None:
-        point, _ = _minimise(partial(costs[near.by], pixels.thinned(PIXELS)), _point(near.matrix @ np.linalg.inv(base)), STEPS)
+        point, _ = _minimise(partial(costs[near.by], pixels.thinned(PIXELS)), _point(near.matrix @ np.linalg.inv(base)))
         return Relief(_matrix(point) @ base, near.by, near.told)
     told = 0.0
     for by, cost in costs.items():
         search = partial(cost, pixels.thinned(SEARCH_PIXELS))
         grid = [np.array([mu, nu, np.log(stretch)]) for mu in SLOPES for nu in SLOPES for stretch in STRETCHES]
-        ends = [_minimise(search, start, STEPS) for start in sorted(grid, key=search)[:STARTS]]
-        point, least = _minimise(partial(cost, pixels.thinned(PIXELS)), min(ends, key=lambda end: end[1])[0], STEPS)
+        ends = [_minimise(search, start) for start in sorted(grid, key=search)[:STARTS]]
+        point, least = _minimise(partial(cost, pixels.thinned(PIXELS)), min(ends, key=lambda end: end[1])[0])
         if by == "highlights":
             told = 1 - least
             if told >= LEAST_TOLD:
@@ -146,25 +147,9 @@ def _spread_of_albedo(pixels: _Pixels, point: np.ndarray) -> float:
     return float(np.log1p(((logarithm - np.median(logarithm)) / ALBEDO_SCALE) ** 2).mean())
 
 
-def _minimise(cost: Callable[[np.ndarray], float], start: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
+def _minimise(cost: Callable[[np.ndarray], float], start: np.ndarray) -> tuple[np.ndarray, float]:
     """Return where Nelder and Mead's simplex ends, and the cost there."""
-    corners = [start, *(start + 0.15 * axis for axis in np.eye(len(start)))]
-    simplex = sorted(((cost(corner), corner) for corner in corners), key=lambda one: one[0])
-    for _ in range(steps):
-        middle = np.mean([corner for _, corner in simplex[:-1]], axis=0)
-        worst = simplex[-1][1]
-        tried = [(cost(point), point) for point in (2 * middle - worst,)]
-        if tried[0][0] < simplex[0][0]:
-            tried.append((cost(point := 3 * middle - 2 * worst), point))
-        elif tried[0][0] >= simplex[-2][0]:
-            tried.append((cost(point := 0.5 * (middle + worst)), point))
-        best = min(tried, key=lambda one: one[0])
-        if best[0] < simplex[-1][0]:
-            simplex[-1] = best
-        else:
-            first = simplex[0][1]
-            simplex[1:] = [(cost(point := 0.5 * (first + corner)), point) for _, corner in simplex[1:]]
-        simplex.sort(key=lambda one: one[0])
-        if max(np.abs(corner - simplex[0][1]).max() for _, corner in simplex[1:]) < 1e-4:
-            break
-    return simplex[0][1], simplex[0][0]
+    simplex = np.stack([start, *(start + 0.15 * np.eye(len(start)))])
+    found = minimize(cost, start, method="Nelder-Mead",
+                     options={"initial_simplex": simplex, "maxiter": STEPS, "xatol": 1e-4, "fatol": np.inf})
+    return found.x, float(found.fun)

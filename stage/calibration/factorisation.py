@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.consistency.lambertian import CAUCHY, SHADOW, bright_readings, fit_lambertian
+from stage.consistency.lambertian import CAUCHY, SHADOW, bright_readings, fit_lambertian, least_squares
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -74,8 +74,8 @@ def factorise(readings: np.ndarray, usable: np.ndarray, start: np.ndarray | None
         lights = start / strength
     weight = lit.astype(np.float64)
     for _ in range(ROUNDS):
-        surface = _least_squares(scaled, weight, lights)
-        lights = _least_squares(scaled.T, weight.T, surface.T).T
+        surface = least_squares(scaled, weight, lights)
+        lights = least_squares(scaled.T, weight.T, surface.T).T
         model = lights @ surface
         residual = np.where(lit, scaled - model, 0)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + LEAST_SPREAD
@@ -130,11 +130,3 @@ def integrable(b: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
         raise CalibrationError("the surface curves in one direction only: many lights explain its images alike")
     third /= np.linalg.norm(third)
     return np.stack([np.cross(first, third), np.cross(second, third), third])
-
-
-def _least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column."""
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
-    gram = (weight.T @ outer).reshape(-1, 3, 3)
-    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
-    return np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T

@@ -15,6 +15,7 @@ import numpy as np
 from stage.camera import Camera
 from stage.errors import CalibrationError
 from stage.frames import OPENCV_FROM_CAMERA
+from stage.spread import MAD_TO_SIGMA
 
 LARGEST_SIGMA_DEGREES = 1.0
 """The largest standard error of the tilt of a plane that is written: at a metre and 45 degrees it is a depth of 2 cm."""
@@ -108,7 +109,7 @@ def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
         values, vectors = np.linalg.eigh((points - middle).T @ ((points - middle) * weight[:, None]) / weight.sum())
         normal = vectors[:, 0]
         off = (points - middle) @ normal
-        spread = 1.4826 * float(np.median(np.abs(off))) + 1e-9
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(off))) + 1e-9
         weight = share / (1 + (off / (CAUCHY * spread)) ** 2)
     residual = math.sqrt(max(float(values[0]), 0.0))
     # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
@@ -127,4 +128,4 @@ def _scatter(points: np.ndarray) -> float:
     off = points - np.median(points, axis=0)
     across = off - np.outer(off @ along, along)
     widest = np.linalg.svd(across, full_matrices=False)[2][0]
-    return 1.4826 * float(np.median(np.abs(across @ widest)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(across @ widest)))

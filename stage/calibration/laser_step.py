@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from stage.calibration.step_stripe import Segment, StepStripe
 from stage.errors import CalibrationError
@@ -23,9 +24,8 @@ NUMBERS = 6
 """Unknowns of a pose: g, the direction of the riser in the base, ρ, and how far the riser leans."""
 LEAN = math.radians(0.25)
 """Standard deviation of the angle between riser and base about 90°, of machined or well cut blocks."""
-ROUNDS, SETTLED = 60, 1e-10
-STEP = 1e-6
-"""Part of the largest number of its vector by which a parameter is moved to find derivatives."""
+SETTLED = 1e-12
+"""Parts of the sum of squares, of the parameters and of the gradient by which the last step changes them."""
 LARGEST_SIGMA, LARGEST_SIGMA_DEGREES = 0.02, 1.0
 """The largest standard errors of a plane that is written: of depths on it as a part of them, and of its tilt."""
 
@@ -72,10 +72,11 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
             raise CalibrationError(f"frame {number + 1} of the laser: its stripe is not seen to cross base, block and base: put the block "
                                    "into the middle of the stripe")
     steps, planes = zip(*(_begin(number, pose, height_m) for number, pose in enumerate(poses)), strict=True)
-    lasers = np.array([np.mean([found[number] for found in planes if number in found], axis=0) for number in range(count)])
-    values = np.concatenate([np.concatenate(steps), lasers.ravel()])
+    middle = np.array([np.mean([shown[number] for shown in planes if number in shown], axis=0) for number in range(count)])
+    values = np.concatenate([np.concatenate(steps), middle.ravel()])
     data = _Data.of(poses, height_m)
-    values, residual, jacobian = _descend(data, values)
+    found = least_squares(data.residual, values, jac="3-point", method="lm", x_scale="jac", ftol=SETTLED, xtol=SETTLED, gtol=SETTLED)
+    values, residual, jacobian = found.x, found.fun, found.jac
     freedom = len(residual) - len(values)
     if freedom < 1:
         raise CalibrationError("the stripes do not determine the planes: photograph more places of the laser on the step")
@@ -85,14 +86,13 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
     whitened = normal_matrix / np.outer(scale, scale)
     covariance = np.linalg.pinv(whitened, rcond=1e-14, hermitian=True) / np.outer(scale, scale) * max(spread, 1.0) ** 2
     lost = np.linalg.eigvalsh(whitened)[0] < 1e-13
-    found = [_plane(data, values, residual, covariance, number, pixel) for number in range(count)]
-    worst = max(range(count), key=lambda number: found[number].sigma)
-    if lost or found[worst].sigma > LARGEST_SIGMA or max(plane.sigma_degrees for plane in found) > LARGEST_SIGMA_DEGREES:
-        known = f"to {100 * found[worst].sigma:.1f} % of the depth and {found[worst].sigma_degrees:.1f}° alone"
-        told = "hardly" if lost or found[worst].sigma > 1 else known
+    lasers = [_plane(data, values, residual, covariance, number, pixel) for number in range(count)]
+    worst = max(lasers, key=lambda plane: plane.sigma)
+    if lost or worst.sigma > LARGEST_SIGMA or max(plane.sigma_degrees for plane in lasers) > LARGEST_SIGMA_DEGREES:
+        told = "hardly" if lost or worst.sigma > 1 else f"to {100 * worst.sigma:.1f} % of the depth and {worst.sigma_degrees:.1f}° alone"
         raise CalibrationError(f"the step tells the planes {told}: look at it from 30 to 60 degrees above its base, let it fill more of "
                                "the image, take a higher one, or photograph it in several poses")
-    return StepFit(found, [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))], spread)
+    return StepFit(lasers, [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))], spread)
 
 
 class _Data(NamedTuple):
@@ -190,39 +190,6 @@ def _on(segment: Segment, normal: np.ndarray, offset: float) -> np.ndarray:
     """Return the ends of a line on the plane normal·X = offset, [2, 3]."""
     rays = np.hstack([segment.ends, -np.ones((2, 1))])
     return np.asarray(rays * (offset / (rays @ normal))[:, None])
-
-
-def _descend(data: _Data, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the values with the least squares by Levenberg and Marquardt's method, their residuals and derivatives."""
-    residual, damping = data.residual(values), 1e-3
-    for _ in range(ROUNDS):
-        jacobian = _derivatives(data, values)
-        gradient, matrix = jacobian.T @ residual, jacobian.T @ jacobian
-        moved = False
-        while damping < 1e8 and not moved:
-            change = np.linalg.lstsq(matrix + damping * np.diag(np.diag(matrix) + 1e-300), -gradient, rcond=None)[0]
-            tried = data.residual(values + change)
-            moved = bool(tried @ tried < residual @ residual)
-            damping = damping / 5 if moved else damping * 5
-        if not moved:
-            break
-        done = 1 - float(tried @ tried) / max(float(residual @ residual), 1e-300)
-        values, residual = values + change, tried
-        if done < SETTLED:
-            break
-    return values, residual, _derivatives(data, values)
-
-
-def _derivatives(data: _Data, values: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the residuals by central differences, [residuals, values]."""
-    found = []
-    for index, value in enumerate(values):
-        step = STEP * max(abs(float(value)), 1e-3)
-        up, down = values.copy(), values.copy()
-        up[index] += step
-        down[index] -= step
-        found.append((data.residual(up) - data.residual(down)) / (2 * step))
-    return np.stack(found, axis=1)
 
 
 def _plane(data: _Data, values: np.ndarray, residual: np.ndarray, covariance: np.ndarray, number: int, pixel: float) -> StepPlane:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from stage.calibration.ball import Ball, BallView
 from stage.errors import CalibrationError
@@ -30,8 +31,6 @@ MIN_CONTRAST = 2.0
 """The least ratio of the peak to that median."""
 RIVAL_SHARE = 0.5
 """The light of another spot, relative to the light of the found spot, above which the spot is flagged."""
-MAX_PARTS = 8
-"""The most connected bright regions that are compared."""
 SMALL_SPOT = 4
 """The count of pixels below which a spot is flagged, because its centroid is inaccurate."""
 
@@ -138,34 +137,7 @@ def _noise_ceiling(values: np.ndarray) -> float:
 
 def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the brightest connected region of `weight > 0` with a peak, and the light of the next region relative to its light."""
-    left = weight > 0
-    spots: list[tuple[float, np.ndarray]] = []
-    rivals = [0.0]
-    for _ in range(MAX_PARTS):
-        if not left.any():
-            break
-        part = _connected(left, int(np.argmax(np.where(left, weight, 0))))
-        total = float(weight[part].sum())
-        if peak[part].any():
-            spots.append((total, part))
-        else:
-            rivals.append(total)
-        left &= ~part
-    spots.sort(key=lambda spot: spot[0], reverse=True)
-    rivals += [total for total, _ in spots[1:]]
-    return spots[0][1], max(rivals) / spots[0][0]
-
-
-def _connected(allowed: np.ndarray, seed: int) -> np.ndarray:
-    """Return the region of `allowed` that is connected to the pixel of flat index `seed`, over sides and corners."""
-    rows, cols = allowed.shape
-    left = np.pad(allowed, 1).reshape(-1)  # a border, so that neighbours of the edge exist
-    front = np.array([(seed // cols + 1) * (cols + 2) + seed % cols + 1])
-    around = np.array([r * (cols + 2) + c for r in (-1, 0, 1) for c in (-1, 0, 1)])
-    part = np.zeros_like(left)
-    while len(front):
-        part[front] = True
-        left[front] = False
-        front = np.unique(front[:, None] + around)
-        front = front[left[front]]
-    return part.reshape(rows + 2, cols + 2)[1:-1, 1:-1]
+    parts, count = label(weight > 0, np.ones((3, 3)))
+    light = np.bincount(parts.ravel(), weight.ravel(), minlength=count + 1)
+    best = int(max(np.unique(parts[peak]), key=lambda part: light[part]))
+    return parts == best, float(np.delete(light, best).max()) / float(light[best])

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from stage.errors import CalibrationError
 
@@ -66,7 +67,7 @@ def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndar
     if (np.diff(curve) < -0.02).any():
         worst = int(np.argmin(np.diff(curve)))
         raise CalibrationError(f"the light falls from level {x[worst]:g} to {x[worst + 1]:g}: check the order of the images")
-    rising = _rising(curve)
+    rising = isotonic_regression(curve).x
     inner = (x > 0) & (x < 1) & (rising > 0)
     gamma = float(np.median(np.log(rising[inner]) / np.log(x[inner]))) if inner.any() else 1.0
     # between measured levels along the nearest power law, which bends as responses do, then corrected to pass through all of them
@@ -76,16 +77,3 @@ def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndar
     values = (values + LEAST_STEP * np.arange(EVEN_LEVELS)) - values[0]
     spread = float(np.median(np.abs(ratio - curve[:, None])))
     return Response(values / values[-1], gamma, spread)
-
-
-def _rising(values: np.ndarray) -> np.ndarray:
-    """Return the nearest sequence that does not fall, by pooling adjacent violators (Ayer et al. 1955)."""
-    blocks: list[list[float]] = []
-    for value in values:
-        blocks.append([float(value), 1.0])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            mean, weight = blocks.pop()
-            before = blocks[-1]
-            before[0] = (before[0] * before[1] + mean * weight) / (before[1] + weight)
-            before[1] += weight
-    return np.concatenate([np.full(int(weight), mean) for mean, weight in blocks])

@@ -14,7 +14,7 @@ from stage.calibration.semi_calibrated import TINY, fit_intensities
 from stage.colour import GREY_WEIGHTS
 from stage.colour_spaces import is_linear
 from stage.consistency.encodings import other_readings
-from stage.consistency.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, median_of
+from stage.consistency.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, least_squares, median_of
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -229,10 +229,10 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     best = np.argsort(-lit.sum(axis=0), kind="stable")[: max(PLENTY, lit.shape[1] // 4)]
     left, values, _ = np.linalg.svd(readings[:, best], full_matrices=False)
     lights, weight = left[:, :3] * values[:3], lit.astype(np.float64)
-    surface = _least_squares(readings, weight, lights)
+    surface = least_squares(readings, weight, lights)
     for _ in range(FREE_ROUNDS):
-        lights = _least_squares(readings.T, weight.T, surface.T).T
-        surface = _least_squares(readings, weight, lights)
+        lights = least_squares(readings.T, weight.T, surface.T).T
+        surface = least_squares(readings, weight, lights)
         residual = np.where(lit, readings - lights @ surface, 0)
         spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
         weight = lit / (1 + (residual / (3 * spread)) ** 2)
@@ -243,11 +243,3 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
         return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
-
-
-def _least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column."""
-    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
-    gram = (weight.T @ outer).reshape(-1, 3, 3)
-    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)
-    return np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T

@@ -62,15 +62,20 @@ def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndar
     """
     lit = usable & (readings > SHADOW * bright_readings(readings, usable)) & (readings > 0)
     weight = lit.astype(np.float64)
-    outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
     for _ in range(rounds):
-        gram = (weight.T @ outer).reshape(-1, 3, 3)
-        gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)  # pixels of no reading get 0
-        vector = np.linalg.solve(gram, ((weight * readings).T @ directions)[:, :, None])[:, :, 0].T
+        vector = least_squares(readings, weight, directions)
         residual = np.where(lit, readings - directions @ vector, 0) / np.maximum(np.linalg.norm(vector, axis=0), 1e-300)
         spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
     return Fit(vector, residual, lit)
+
+
+def least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight."""
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
+    gram = (weight.T @ outer).reshape(-1, 3, 3)
+    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
+    return np.asarray(np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T)
 
 
 def bright_readings(readings: np.ndarray, usable: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from stage.errors import ScanError
 from stage.scans.diagnosis import odd_scans
 from stage.scans.scan import Scan
 
@@ -14,9 +15,16 @@ SMALLER = 3.0
 
 
 def extent_of(scan: Scan) -> float:
-    """Return the diagonal of the box around nearly all points of a scan, metres."""
+    """Return the diagonal of the box around nearly all points of a scan, metres.
+
+    Raises:
+        ScanError: the points lie at one place.
+    """
     low, high = np.percentile(scan.points, (1, 99), axis=0)
-    return float(np.linalg.norm(high - low))
+    extent = float(np.linalg.norm(high - low))
+    if extent == 0:
+        raise ScanError(f"{scan.name}: nearly all of its {len(scan.points)} points lie at one place: check {scan.path}")
+    return extent
 
 
 def usual_extent(extents: Sequence[float]) -> float:

@@ -18,8 +18,9 @@ UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
 SYMMETRIC = 1e-6
 """The largest asymmetry of a covariance, and the largest negative eigenvalue, as a part of its largest number."""
 
-Coordinate = Annotated[float, Field(ge=-1e7, le=1e7)]
-"""Metres: beyond ten thousand kilometres single precision leaves nothing of a scan."""
+MOST_M = 1e7
+"""The largest coordinate, metres: beyond ten thousand kilometres single precision leaves nothing of a scan."""
+Coordinate = Annotated[float, Field(ge=-MOST_M, le=MOST_M)]
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 

@@ -21,13 +21,12 @@ from stage.scans.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
 from stage.scans.fine import Rows
 from stage.scans.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
 from stage.scans.pairs import Evidence, Pair, PairState, Prepared, prepare
-from stage.scans.pose_graph import REFUSED, Edge, Solved, solve
+from stage.scans.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
 from stage.scans.records import Turntable
 from stage.scans.rigid import inverse
 from stage.scans.scan import Scan, Target
 from stage.scans.symmetry import looks_alike_turned
 from stage.scans.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
-from stage.scans.tree import joined_groups, tree_poses
 from stage.scans.turntable import angle_of, freedom, turned_pose
 
 ROUNDS = 2

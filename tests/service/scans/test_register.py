@@ -1,6 +1,7 @@
 """relit register: scans of a simulated figure come together, how sure their poses are, and what is refused or flagged with a sentence."""
 
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -160,6 +161,18 @@ def test_a_scan_that_does_not_belong_is_named(relit, tmp_path, change, sentence)
     assert all(entry.scan_to_world is not None for entry in found.scans[:3])
     if "has no pose" in sentence:
         assert outcome.code == 1 and found.scans[3].scan_to_world is None
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (lambda points: np.ones((5000, 3)), "s1: nearly all of its 5000 points lie at one place"),
+    (lambda points: points * 1e37, r"scans\[1\] \(s1\): path: s1.ply has a coordinate of .*e\+3[78] m, 1e\+07 m are the most"),
+])
+@pytest.mark.parametrize("table", ["start", "fixed"])
+def test_points_that_are_no_scan_are_refused(relit, tmp_path, change, sentence, table):
+    seen = views(figure, 0.0, 30.0)
+    folder = write(tmp_path / "in", seen, s1={"points": change, "sigma_m": 0.001}, top=table_of(seen, 0.0, 30.0))
+    outcome = relit("register", folder, "--turntable", table, "--out", tmp_path / "out")
+    assert outcome.code == 2 and re.search(sentence, outcome.err) and not (tmp_path / "out").exists()
 
 
 def test_scans_without_overlap_are_refused(relit, tmp_path):
