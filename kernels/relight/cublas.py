@@ -3,7 +3,7 @@
 The stack is half, and cuBLAS multiplies matrices of one type with sums in float32. So the weights of a frame become two halves each,
 w = 2^e (h + 2^-11 r): h has the first 11 bits of a weight and r the next 11, so that weights are as exact as float32 down to a 2^-12th of
 the frame's largest, and off by a 2^-35th of the largest below. Two products add up in the same output, and the stack is read twice for up
-to GROUP frames; the kernel beside it (many_frames.py) reads it once for eight.
+to GROUP frames; the kernel beside it (combine.py) reads it once for eight.
 
 Every call makes GROUP frames, some of them zero: cuBLAS may sum in another order for another count, and a frame at the same position must
 be identical to the last bit whichever others are made. For the same reason this product is used for every count of frames, or not at all,

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.one_frame import combine
+from kernels.relight.combine import combine, combine_batch
 from service.requests.relight import CHUNK_FRAMES
 from stage.exr_rows import BLOCK_ROWS
 from stage.stack import PIXEL_PAD, Stack

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.environment import Weighting
-from kernels.relight.marching import grouped
 from kernels.relight.sample_energy import share_samples
-from kernels.relight.sources import Sources
+from kernels.relight.sources import Sources, grouped
 from service.light.far_light import FarSamples, captured_lights, hidden_as_captured
 
 FAR_MARCHES = 24

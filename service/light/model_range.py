@@ -13,13 +13,13 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import Band
+from kernels.relight.captured import Captured
+from kernels.relight.combine import combine_rows
 from kernels.relight.direction_grid import direction_grid
 from kernels.relight.gloss_ratio import ratio_of_sums
 from kernels.relight.horizon import Horizons, see_above
-from kernels.relight.many_frames import combine_rows
 from kernels.relight.responses import Responses, empty_responses, respond, shown_gloss
-from kernels.relight.shading import Surface, upload_sources
-from kernels.relight.small_lights import FrameSources, shade_frames, upload_frames
+from kernels.relight.shading import SourcesOnDevice, Surface, shade_frames, upload_sources
 from kernels.relight.sources import far, join, own_rows
 from service.light.far_light import FarSamples, captured_lights, hidden_as_captured
 from service.light.lit_model import LitBeyond, LitModel
@@ -72,7 +72,7 @@ class SmallLights(NamedTuple):
 
     frames: slice
     """The place of these frames in all that are made."""
-    sources: FrameSources
+    sources: SourcesOnDevice
     direction: np.ndarray  # [n, 3] of the samples of all these frames
 
 
@@ -91,7 +91,7 @@ class ChunkBeyond(NamedTuple):
 
     broad: FrameEnergy
     captured: FrameEnergy
-    small: FrameSources
+    small: SourcesOnDevice
 
 
 class Portion(NamedTuple):
@@ -137,7 +137,7 @@ class ModelRange:
         beyond = None
         if any(each.beyond is not None for each in lights):
             parts = [each.beyond or RangeBeyond(NO_SOURCES, np.zeros_like(each.broad), nothing) for each in lights]
-            small = upload_frames(join([each.small for each in parts]), [each.small.count for each in parts], self._model.device)
+            small = upload_sources(join([each.small for each in parts]), self._model.device, [each.small.count for each in parts])
             beyond = ChunkBeyond(FrameEnergy.of([each.broad for each in parts], places),
                                  FrameEnergy.of([each.captured for each in parts], places), small)
         has_added = any(each.added is not None for each in lights)
@@ -151,7 +151,7 @@ class ModelRange:
         for _, members in groupby(places, key=lambda place: place // HORIZON_FRAMES):
             frames = slice(done, done + len(list(members)))
             samples = own_rows(join([each.small for each in lights[frames]]))
-            sources = upload_frames(samples, [each.small.count for each in lights[frames]], self._model.device)
+            sources = upload_sources(samples, self._model.device, [each.small.count for each in lights[frames]])
             yield SmallLights(frames, sources, samples.place[:, :3])
             done = frames.stop
 
@@ -219,7 +219,8 @@ class ModelRange:
         captured = captured_room.room(len(self._captured.place), portion.surface.packs)
         respond(portion.surface, upload_sources(self._grid.taken(facing), self._model.device), portion.visible, grid)
         respond(portion.surface, self._captured, portion.visible, captured)
-        shown = shown_gloss(portion.band, portion.surface, captured, self._lights.direction, self._lights.irradiance, scale)
+        images = Captured.of(portion.band, portion.surface, portion.visible, self._lights.direction, self._lights.irradiance, scale)
+        shown = shown_gloss(images, captured)
         return _summed(portion, grid, facing, captured, shown, light)
 
 

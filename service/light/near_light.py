@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight import sources
-from kernels.relight.marching import grouped
-from kernels.relight.sources import Sources, far, join
+from kernels.relight.sources import Sources, far, grouped, join
 from service.requests.near_lights import PointLight, RectangleLight, SphereLight
 
 NEAR_MARCHES = 48

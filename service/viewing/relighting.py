@@ -1,7 +1,7 @@
 """What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
 
 The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
-captured images together do (kernels.relight.tile_basis has the method and its sources).
+captured images together do (kernels.relight.basis has the method and its sources).
 """
 
 import math
@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.relight.basis import gram
+from kernels.relight.basis import gram, light_factor, tile_bases
 from kernels.relight.beyond import reach
-from kernels.relight.tile_basis import light_factor, tile_bases
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
 from service.viewing.held_out import HeldOutLights

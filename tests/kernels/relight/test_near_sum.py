@@ -6,6 +6,7 @@ import pytest
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.relight import sources
+from kernels.relight.captured import Captured
 from kernels.relight.discs import integrate_discs
 from kernels.relight.environment import Weighting
 from kernels.relight.near_sum import sum_near
@@ -34,8 +35,8 @@ def summed(pixels, readings, given, lights, device, *, visible=None, irradiance=
     irradiance = 3 * colours(len(lights), seed=4) if irradiance is None else irradiance
     stack, scale, held = stored(readings, irradiance)
     visible = np.full((len(lights), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    got = sum_near(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), given, lights, irradiance,
-                   scale)
+    got = sum_near(Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), lights, irradiance,
+                               scale), given)
     return got.numpy()[:, : len(pixels.normal)], held
 
 
@@ -152,8 +153,9 @@ def test_of_lights_in_one_place_the_first_is_taken(device):
 def call(device, *, pixels=40, band_pixels=40, seen=(20, 40), lights=LIGHTS, stack_lights=20, channels=3, irradiance=None):
     stack = store(np.ones((channels, stack_lights, band_pixels)))
     irradiance = np.ones((len(lights), 3)) if irradiance is None else irradiance
-    return sum_near(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
-                    pack_bytes(np.full(seen, 255, np.uint8), device), NEAR["point"], lights, irradiance, np.ones(24, np.float32))
+    return sum_near(Captured.of(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
+                                pack_bytes(np.full(seen, 255, np.uint8), device), lights, irradiance, np.ones(24, np.float32)),
+                    NEAR["point"])
 
 
 @pytest.mark.parametrize("change, message", [
