@@ -16,27 +16,27 @@ from kernels.packs import as_packs, pack_type
 from kernels.relight.captured import Captured, images_type
 from kernels.relight.latlong import first_of_equals
 from kernels.relight.shading import lobes, modelled
-from kernels.relight.smooth import walk
+from kernels.relight.smooth import SphereTriangles, edge_planes, walk
 from kernels.relight.sources import Sources
-from kernels.relight.triangulation import edge_planes, triangulate_sphere
 
 LEAST_PART = 1e-3
 """Least share of an imaginary light's energy that a captured light receives. A light so far from the hole that its share is smaller
 receives nothing, and the other lights receive its share."""
 
 
-def sum_near(captured: Captured, sources: Sources) -> wp.array:
+def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -> wp.array:
     """Sum images, and the model's images, for near and far samples of light.
 
     Args:
-        captured: images and model; four lights or more not in one plane.
+        captured: images and model.
         sources: the wanted light, some tens of samples; what hides it is not looked at, the images show it.
+        triangles: of the captured lights, of several in one place the first.
 
     Returns:
         [6, pixels padded] float32 radiance on the device: of the images, and of the model.
 
     Raises:
-        ArrayError: a captured light without irradiance, fewer than four lights, or all in one plane.
+        ArrayError: a captured light without irradiance.
     """
     surface, direction, irradiance = captured.surface, captured.direction, captured.irradiance
     count, device = len(direction), surface.device
@@ -44,7 +44,6 @@ def sum_near(captured: Captured, sources: Sources) -> wp.array:
         light, channel = np.argwhere(~(irradiance > 0))[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
     kept = first_of_equals(direction)
-    triangles = triangulate_sphere(direction[kept])
     vertex, owner = np.nonzero(triangles.share > LEAST_PART)
     start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]

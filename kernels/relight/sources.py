@@ -23,6 +23,10 @@ SPHERE_SAMPLES = 512
 """Samples of a spherical light: half of them face away from any point, so that 256 light it."""
 RECTANGLE_SAMPLES = 256
 """Samples of a rectangular light, as many as of a spherical light reach a point."""
+DISC_PITCH_DEGREES = 1.0
+"""Largest distance between two samples of a disc, degrees: finer than captured lights are apart."""
+DISC_SAMPLES = 256
+"""Least number of samples of a disc, so that a disc passes from one light to the next in steps of 0.4 % of its energy."""
 FEW = 64
 """Samples of a light in model-guided sums. The images and the model are summed over the same samples and only the difference is used, so
 that the error of few samples cancels."""
@@ -76,6 +80,32 @@ def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None =
     """
     lobe = None if axis is None else np.append(axis, exponent)[None]
     return _sources(np.append(position, 1.0)[None], np.asarray(intensity)[None], lobe)
+
+
+def disc_samples(middle: np.ndarray, angle_degrees: float, count: int | None = None) -> np.ndarray:
+    """Return directions spread evenly over a disc on the sphere, each standing for the same solid angle.
+
+    Args:
+        middle: [3] unit vector.
+        angle_degrees: diameter, 0…180.
+        count: of samples; None: DISC_SAMPLES, and more where they would be farther apart than DISC_PITCH_DEGREES.
+
+    Returns:
+        [samples, 3] float64 unit vectors.
+
+    Source: Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44, 1979, with even steps of the cosine.
+    """
+    low = 2 * math.sin(math.radians(angle_degrees / 4)) ** 2  # 1 - cosine of the rim: without the rounding near 1
+    if count is None:
+        count = max(DISC_SAMPLES, math.ceil(2 * math.pi * low / math.radians(DISC_PITCH_DEGREES) ** 2))
+    place = np.arange(count) + 0.5
+    fall = place / count * low
+    across = np.sqrt(fall * (2 - fall))
+    turn = place * math.pi * (3 - math.sqrt(5))
+    z = np.asarray(middle, dtype=np.float64)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    return (across * np.cos(turn))[:, None] * x + (across * np.sin(turn))[:, None] * np.cross(z, x) + (1 - fall)[:, None] * z
 
 
 def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int = SPHERE_SAMPLES) -> Sources:

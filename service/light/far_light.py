@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.around import lights_around
-from kernels.relight.discs import disc_samples
-from kernels.relight.sources import Sources, far, own_rows
+from kernels.relight.sources import Sources, disc_samples, far, own_rows
 from service.light.environments import SHARP_RADIUS_DEGREES, EnvironmentMap, Environments
 from service.light.schedule import Disc, ScheduledFrame
+from service.light.triangulation import lights_around
 from stage.colour import rgb_matrix
 
 

@@ -18,7 +18,6 @@ import warp as wp
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.around import left_out
 from kernels.relight.beyond import compare_beyond, followed, inward_pairs, share_beyond
 from kernels.relight.captured import Captured
 from kernels.relight.gloss_ratio import sum_shown
@@ -35,6 +34,7 @@ from service.light.model_range import ModelRange
 from service.light.near_light import NearLights
 from service.light.range_light import RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
+from service.light.triangulation import left_out, triangles_between
 from service.reporting.progress import Timings
 from stage.errors import ResultError
 from stage.maps import SurfaceMaps
@@ -260,7 +260,8 @@ class Guide:
         """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
         count = len(batch.pixels)
         wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
-        summed = sum_near(self._captured(batch, self.stack, self._upload(batch, self.stack), visible), coarse)
+        captured = self._captured(batch, self.stack, self._upload(batch, self.stack), visible)
+        summed = sum_near(captured, coarse, triangles_between(self._lights.direction))
         pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
         return wanted, pictures, told
 

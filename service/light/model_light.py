@@ -4,10 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.environment import Weighting
-from kernels.relight.sample_energy import share_samples
 from kernels.relight.sources import Sources, grouped
 from service.light.far_light import FarSamples, captured_lights, hidden_as_captured
+from service.light.weighting import Weighting, share_samples
 
 FAR_MARCHES = 24
 """Most directions in which shadows are marched for one frame: for a sun of 3°, its penumbra has steps of 4 %."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.relight.environment import Weighting
 from kernels.relight.shading import shade as shade_surface
 from kernels.relight.sources import join
 from service.errors import RequestError
@@ -28,6 +27,7 @@ from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.surface_model import SurfaceModel
 from service.light.time_steps import capture_files
+from service.light.weighting import Weighting
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata

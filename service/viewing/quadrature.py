@@ -1,8 +1,8 @@
 """What a page needs to share light out over the captured lights exactly as `relit relight --weights kernel` does.
 
 Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with them
-gives the energies of the lights, none below 0 (kernels.relight.kernel_quadrature). Light from beyond the captured lights is shared by a
-table over the grid of directions, since its parts add up (kernels.relight.smooth).
+gives the energies of the lights, none below 0 (service.light.quadrature). Light from beyond the captured lights is shared by a
+table over the grid of directions, since its parts add up (service.light.triangulation).
 """
 
 from typing import Any
@@ -11,9 +11,9 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.relight.beyond import share_beyond
-from kernels.relight.kernel_quadrature import quadrature_of
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.smooth import share_smooth
+from service.light.quadrature import quadrature_of
+from service.light.triangulation import share_smooth
 from service.viewing.block_file import BlockFile
 from service.viewing.transfer import grid_directions
 from stage.light_basis import numbers

@@ -5,10 +5,10 @@ import pytest
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.around import left_out
 from kernels.relight.captured import Captured
 from kernels.relight.guide import LEAST_ALPHA, POOL, compare_model, fit_trust, seen_lobes
 from kernels.relight.shading import SecondLobe, upload_surface
+from service.light.triangulation import left_out
 from tests.kernels.relight.lights import AXES, icosahedron
 from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store

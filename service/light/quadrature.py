@@ -25,7 +25,7 @@ from kernels.errors import ArrayError
 from kernels.relight.beyond import share_beyond
 from kernels.relight.environment_sources import sample_environment
 from kernels.relight.latlong import check, first_of_equals
-from kernels.relight.smooth import share_smooth
+from service.light.triangulation import share_smooth
 
 NEIGHBOURS = 6
 """Number of lights around one, as a triangular lattice has them."""
