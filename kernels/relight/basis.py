@@ -47,17 +47,11 @@ class Basis(NamedTuple):
 
 
 def gram(band: Band, keep: np.ndarray) -> np.ndarray:
-    """Return the inner products of the stored images of a band over some of its pixels.
+    """Return [3, lights, lights] float64 inner products of the stored images of a band, padding included; waits for the device on CUDA.
 
     Args:
         band: the stack on the device.
         keep: [pixels of the band] bool, the pixels that count.
-
-    Returns:
-        [3, lights, lights] float64, padding included; waits for the device on CUDA.
-
-    Raises:
-        ArrayError: the mask is of another length.
     """
     band.require_channels(3)
     if keep.shape != (band.pixel_count,):
@@ -77,17 +71,13 @@ def gram(band: Band, keep: np.ndarray) -> np.ndarray:
 
 
 def principal(products: np.ndarray, count: int) -> Basis:
-    """Return the best basis of `count` images for each channel.
+    """Return the best basis of `count` images, 1 to the number of lights, for each channel.
+
+    Of each image's two signs, the one in which its largest coefficient is positive.
 
     Args:
         products: [3, lights, lights] Gram matrices, summed over all bands, of radiance and without padding.
-        count: coefficient images, 1 to the number of lights.
-
-    Returns:
-        The basis. Of each image's two signs, the one in which its largest coefficient is positive.
-
-    Raises:
-        ArrayError: the count is out of range, or the products are not finite.
+        count: coefficient images.
     """
     _check_count(count, products.shape[-1])
     _check_finite(products)
@@ -116,14 +106,11 @@ def _eigenvectors(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndar
 
 
 def projection(basis: Basis, scale: np.ndarray) -> np.ndarray:
-    """Return the weights with which batch.combine_batch turns stored images into coefficient images.
+    """Return [K, 3, lights padded] float32 weights with which combine_batch turns stored images into coefficient images.
 
     Args:
         basis: of principal.
         scale: [lights padded] radiance of a stored 1.0.
-
-    Returns:
-        [K, 3, lights padded] float32.
     """
     channels, count, lights = basis.matrix.shape
     weights = np.zeros((count, channels, len(scale)), dtype=np.float32)
@@ -133,7 +120,9 @@ def projection(basis: Basis, scale: np.ndarray) -> np.ndarray:
 
 def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, functions: np.ndarray, *,
                      low: float = -np.inf, high: float = np.inf) -> wp.array:
-    """Return Σ over the lights of (image − rebuilt image)² at each pixel.
+    """Return [3, pixels padded] float32 Σ over the lights of (image − rebuilt image)²; not synchronised on CUDA.
+
+    Differences are taken in float: below 1e-6 of the image they are rounding.
 
     Args:
         band: the stack on the device.
@@ -141,13 +130,6 @@ def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, fu
         coefficients: [terms, 3, pixels padded] float32.
         functions: [3, lights padded, terms]; rebuilt image = Σ function · coefficient. 0 for lights that do not count.
         low, high: what a rebuilt value is limited to, as a display does; 0 must lie between.
-
-    Returns:
-        [3, pixels padded] float32 on the device; not synchronised on CUDA. Differences are taken in float: below 1e-6 of the
-        image they are rounding.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     band.require_channels(3)
     pack, device = devices.pack_width(band.device), band.device
@@ -186,9 +168,6 @@ def light_factor(products: np.ndarray, weights: np.ndarray, share: np.ndarray) -
 
     Returns:
         [3, lights, lights] float64, upper triangular; the identity where all images are black.
-
-    Raises:
-        ArrayError: the Gram matrices hold values that are not finite.
     """
     _check_finite(products)
     lights = products.shape[-1]
@@ -203,18 +182,12 @@ def light_factor(products: np.ndarray, weights: np.ndarray, share: np.ndarray) -
 
 
 def tile_bases(images: np.ndarray, factor: np.ndarray, count: int) -> TileBases:
-    """Return the bases of tiles that lose least.
+    """Return the bases of tiles that lose least; of each term's two signs, the one in which its largest coefficient of a light is positive.
 
     Args:
         images: [tiles, 3, lights, pixels] float32, finite.
         factor: [3, lights, lights] of light_factor, invertible.
         count: terms, 1 to the number of lights.
-
-    Returns:
-        The bases; of each term's two signs, the one in which its largest coefficient of a light is positive.
-
-    Raises:
-        ArrayError: the count is out of range.
     """
     _check_count(count, images.shape[2])
     weighted = np.matmul(factor.astype(np.float32), images)

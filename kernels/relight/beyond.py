@@ -27,13 +27,10 @@ be in the dark under all of them."""
 
 
 def spacing(direction: np.ndarray) -> float:
-    """Return the angle between a captured light and its nearest neighbour, the median over the lights, in radians.
+    """Return the angle between a captured light and its nearest neighbour, the median over the lights, in radians; π for a single light.
 
     Args:
         direction: [lights, 3] unit vectors; several in one place count as one.
-
-    Returns:
-        π for a single light.
     """
     kept = direction[first_of_equals(direction)]
     cosine = kept @ kept.T - 2 * np.eye(len(kept))

@@ -47,9 +47,6 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
 
     Returns:
         [3, pixels padded] float32 radiance on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: weights do not match the band, or are not finite.
     """
     band.require_channels(3)
     _check_weights(weights, (3, band.frame_count))
@@ -75,9 +72,6 @@ def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) 
 
     Returns:
         [frames, 3, pixels padded] float32 radiance on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: weights do not match the band, or are not finite.
     """
     band.require_channels(3)
     _check_weights(weights, (len(weights), 3, band.frame_count))
@@ -110,9 +104,6 @@ def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
 
     Returns:
         [frames, channels, pixels padded] float32 on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: weights do not match the rows, or are not finite.
     """
     count, channels, terms = weights.shape
     _check_weights(weights, (count, channels, rows.shape[0] // channels))

@@ -94,16 +94,7 @@ def describe(device: str) -> str:
 
 
 def combine_by(gemm: Gemm, band: Band, weights: np.ndarray) -> wp.array:
-    """Relight many frames by products.
-
-    Args:
-        gemm: does a product, in the order of the device's stream.
-        band: the stack on the device.
-        weights: [frames, 3, lights] float32, finite.
-
-    Returns:
-        [frames, 3, pixels padded] float32 radiance on the device; not synchronised.
-    """
+    """Relight many frames by products that are done in the order of the device's stream; as combine.combine_batch."""
     lights = band.frame_count
     pixels = band.packs * band.values.dtype._length_
     groups = -(-len(weights) // GROUP)

@@ -55,15 +55,7 @@ def ratio_of_sums(shown: np.ndarray, gloss: np.ndarray) -> np.ndarray:
 
 
 def sum_shown(captured: Captured, energy: np.ndarray) -> ShownModel:
-    """Sum the model under the captured lights for one frame; waits for the device.
-
-    Args:
-        captured: images and model.
-        energy: [lights, 3] that the frame gives each light; may be negative.
-
-    Raises:
-        ArrayError: shapes that do not fit.
-    """
+    """Sum the model under the captured lights for one frame, which gives them energy [lights, 3], also negative; waits for the device."""
     surface, count = captured.surface, len(captured.direction)
     if np.shape(energy) != (count, 3):
         raise ArrayError(f"energy is {np.shape(energy)}: give {(count, 3)}")

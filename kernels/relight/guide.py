@@ -31,18 +31,10 @@ and between two lights the half vector moves by half of the angle between them (
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Widen lobes that are narrower than the captured lights can resolve.
+    """Widen lobes that are narrower than the captured lights can resolve, and return their F0 […, 3] and roughness […], float32.
 
-    The captured lights see only the tail of a lobe that is much narrower than their spacing, and its strength is F0 · α². The wider and
-    fainter lobe that is returned has the same tail.
-
-    Args:
-        specular: […, 3] F0.
-        roughness: […].
-        direction: [lights, 3] unit vectors to the captured lights.
-
-    Returns:
-        F0 and roughness, float32.
+    The captured lights, unit vectors [lights, 3], see only the tail of a lobe that is much narrower than their spacing, and its strength is
+    F0 · α². The wider and fainter lobe that is returned has the same tail.
     """
     alpha = np.asarray(roughness, dtype=np.float32) ** 2
     wider = np.maximum(alpha, np.float32(LEAST_ALPHA * spacing(direction)))
@@ -54,13 +46,10 @@ def compare_model(captured: Captured, neighbours: np.ndarray, shares: np.ndarray
 
     Args:
         captured: images and model; where one of the four readings of a comparison is clipped, the comparison does not count.
-        neighbours, shares: [lights, 3] of around.left_out.
+        neighbours, shares: [lights, 3] of triangulation.left_out.
 
     Returns:
         [2, pixels padded] float32 on the device: Σ over lights and channels of missing · told, and of told².
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     count, device = len(captured.direction), captured.surface.device
     if np.shape(neighbours) != (count, 3) or np.shape(shares) != (count, 3):
@@ -70,13 +59,7 @@ def compare_model(captured: Captured, neighbours: np.ndarray, shares: np.ndarray
 
 
 def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given.
-
-    Args:
-        plane: [n] of the pixels.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-    """
+    """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given, row-major."""
     rows, cols = np.divmod(pixels, shape[1])
     table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
     table[rows + POOL, cols + POOL] = plane
@@ -85,17 +68,10 @@ def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.
 
 
 def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return β from the sums of each pixel and of its neighbours.
+    """Return β, [n] float32, 0…1, from the sums [2, n] of each pixel and of its neighbours; 0 where the model says nothing.
 
-    A pixel's own lights are few, and a model that is wrong at a pixel is wrong around it too.
-
-    Args:
-        sums: [2, n] of compare_model.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-
-    Returns:
-        [n] float32, 0…1; 0 where the model says nothing.
+    A pixel's own lights are few, and a model that is wrong at a pixel is wrong around it too. Pixels are row-major positions in an image of
+    this shape.
     """
     top, bottom = (pooled(plane, pixels, shape) for plane in sums)
     return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)

@@ -52,15 +52,9 @@ def profile_moments(captured: Captured) -> wp.array:
 
 
 def fit_profile(moments: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the profile of each pixel from the moments of it and of its neighbours.
+    """Return the profile of each pixel, [n, 3] float32 coefficients, from the moments [MOMENTS, n] of it and of its neighbours.
 
-    Args:
-        moments: [MOMENTS, n] of profile_moments.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-
-    Returns:
-        [n, 3] float32 coefficients.
+    Pixels are row-major positions in an image of this shape.
     """
     first = len(PRODUCTS)
     alone = moments.astype(np.float64)

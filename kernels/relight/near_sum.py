@@ -25,15 +25,12 @@ receives nothing, and the other lights receive its share."""
 
 
 def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -> wp.array:
-    """Sum images, and the model's images, for near and far samples of light.
+    """Sum images, and the model's images, for near and far samples of light: [6, pixels padded] float32 radiance on the device.
 
     Args:
         captured: images and model.
         sources: the wanted light, some tens of samples; what hides it is not looked at, the images show it.
         triangles: of the captured lights, of several in one place the first.
-
-    Returns:
-        [6, pixels padded] float32 radiance on the device: of the images, and of the model.
 
     Raises:
         ArrayError: a captured light without irradiance.

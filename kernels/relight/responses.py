@@ -39,13 +39,12 @@ def empty_responses(count: int, packs: int, device: str) -> Responses:
 
 
 def respond(surface: Surface, sources: SourcesOnDevice, visible: wp.array, responses: Responses) -> None:
-    """Compute the responses of a surface to samples of light, each of energy one.
+    """Compute the responses of a surface to far samples of light, as of energy one, into memory of as many packs as the surface has.
 
     Args:
-        surface: the pixels.
-        sources: far samples; their energy is not used.
+        surface, sources: the pixels, and the samples.
         visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; it has the rows of all samples.
-        responses: where they are written, of as many packs as the surface has.
+        responses: where they are written.
     """
     devices.launch(_respond_kernel(devices.pack_width(surface.device)), responses.matt.size,
                    [surface.values, sources.place, sources.occluder, sources.share, visible], list(responses), device=surface.device)

@@ -43,16 +43,7 @@ class Luminance(NamedTuple):
 
 
 def biquadratic(directions: np.ndarray) -> np.ndarray:
-    """Return the six terms of a polynomial texture map.
-
-    Args:
-        directions: [lights, 3] unit vectors to the lights.
-
-    Returns:
-        [lights, 6] float64: u², v², u·v, u, v, 1 with u = x, v = y.
-
-    Source: Malzbender, Gelb and Wolters, "Polynomial Texture Maps", SIGGRAPH 2001.
-    """
+    """Return the six terms [lights, 6] float64 of a polynomial texture map: u², v², u·v, u, v, 1 with u = x, v = y of unit vectors."""
     u, v, _ = np.asarray(directions, dtype=np.float64).T
     return np.stack([u * u, v * v, u * v, u, v, np.ones_like(u)], axis=1)
 
@@ -104,16 +95,10 @@ def hemispherical_harmonics(directions: np.ndarray, terms: int) -> np.ndarray:
 
 
 def fit_weights(functions: np.ndarray) -> np.ndarray:
-    """Return the weight of each image with which their sum is a coefficient of the least-squares fit.
-
-    Args:
-        functions: [lights, terms].
-
-    Returns:
-        [terms, lights] float64.
+    """Return [terms, lights] float64 weights of the images with which their sums are the coefficients of the least-squares fit.
 
     Raises:
-        ArrayError: the lights do not determine the coefficients.
+        ArrayError: the lights of functions [lights, terms] do not determine the coefficients.
     """
     lights, terms = functions.shape
     strength = np.linalg.svd(functions, compute_uv=False)
@@ -125,13 +110,12 @@ def fit_weights(functions: np.ndarray) -> np.ndarray:
 def separate(coefficients: np.ndarray, functions: np.ndarray) -> Luminance:
     """Return the product of a colour and a luminance function that is closest to three fitted channels.
 
+    The colour is the one that the brightest of the lights shows, at most white, so that each pixel's luminance reaches 255; 0 where it is
+    black.
+
     Args:
         coefficients: [terms, 3, pixels] float32, of channels whose white is 255.
         functions: [lights, terms] over which closeness is meant.
-
-    Returns:
-        The colour that the brightest of the lights shows, at most white, so that each pixel's luminance reaches 255; 0 where it
-        is black.
     """
     moments = functions.T @ functions
     spread = np.einsum("tcp,ts,sdp->pcd", coefficients, moments.astype(np.float32), coefficients, optimize=True)
@@ -155,18 +139,12 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Band:
-    """Encode every stored image for a display.
+    """Encode every stored image of a band for a display: 0…1, half (off by at most 1/16 of an 8-bit step); not synchronised on CUDA.
 
     Args:
         band: the stack on the device.
         gains: [3, lights] exposed scene-linear radiance of a stored 1.0; 0 for padding and for lights to leave out.
         display_from_stack: [3, 3] linear RGB of the display from that of the stack; white is 1.
-
-    Returns:
-        A band of the same shape: 0…1, half (off by at most 1/16 of an 8-bit step); not synchronised on CUDA.
-
-    Raises:
-        ArrayError: gains or matrix of another shape, or not finite.
     """
     band.require_channels(3)
     for name, array, shape in (("gains", gains, (3, band.frame_count)), ("display_from_stack", display_from_stack, (3, 3))):

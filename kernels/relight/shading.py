@@ -72,9 +72,6 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
         second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
         profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF. A pixel without a lobe has no second one.
         device: where.
-
-    Raises:
-        ArrayError: no pixels, or shapes that do not fit.
     """
     count = len(normal)
     nothing = SecondLobe(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
@@ -110,8 +107,7 @@ def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -
     """Return the radiance of a surface under samples of light.
 
     Args:
-        surface: the pixels.
-        sources: the samples.
+        surface, sources: the pixels, and the samples.
         visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; None: nothing is hidden.
 
     Returns:

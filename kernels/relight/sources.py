@@ -60,12 +60,7 @@ class Sources(NamedTuple):
 
 
 def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
-    """Return far lights as samples.
-
-    Args:
-        direction: [n, 3] unit vectors to them.
-        irradiance: [n, 3] on a surface that faces each.
-    """
+    """Return far lights as samples: [n, 3] unit vectors to them, and [n, 3] irradiance on a surface that faces each."""
     return _sources(np.concatenate([direction, np.zeros((len(direction), 1))], axis=1), irradiance)
 
 
@@ -83,15 +78,12 @@ def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None =
 
 
 def disc_samples(middle: np.ndarray, angle_degrees: float, count: int | None = None) -> np.ndarray:
-    """Return directions spread evenly over a disc on the sphere, each standing for the same solid angle.
+    """Return [samples, 3] float64 unit vectors spread evenly over a disc on the sphere, each standing for the same solid angle.
 
     Args:
         middle: [3] unit vector.
         angle_degrees: diameter, 0…180.
         count: of samples; None: DISC_SAMPLES, and more where they would be farther apart than DISC_PITCH_DEGREES.
-
-    Returns:
-        [samples, 3] float64 unit vectors.
 
     Source: Vogel, "A better way to construct the sunflower head", Mathematical Biosciences 44, 1979, with even steps of the cosine.
     """
@@ -109,17 +101,7 @@ def disc_samples(middle: np.ndarray, angle_degrees: float, count: int | None = N
 
 
 def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int = SPHERE_SAMPLES) -> Sources:
-    """Return samples of a sphere of even radiance.
-
-    Args:
-        centre: [3], camera frame.
-        radius: in the same unit, above 0.
-        radiance: [3].
-        count: of samples.
-
-    Raises:
-        ArrayError: no radius.
-    """
+    """Return samples of a sphere of even radiance [3] around a centre [3] of the camera frame; the radius is in the same unit."""
     if not radius > 0:
         raise ArrayError(f"radius of a sphere light is {radius}: it must be above 0")
     height = 1 - 2 * (np.arange(count) + 0.5) / count
@@ -132,18 +114,13 @@ def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int =
 
 def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radiance: np.ndarray,
               count: int = RECTANGLE_SAMPLES) -> Sources:
-    """Return samples of a rectangle of even radiance that shines to one side.
-
-    It shines against edge_u × edge_v, as a UsdLux RectLight of width u and height v does.
+    """Return samples of a rectangle of even radiance that shines to one side: against edge_u × edge_v, as a UsdLux RectLight does.
 
     Args:
         centre: [3], camera frame.
         edge_u, edge_v: [3] its whole edges, at a right angle.
         radiance: [3].
         count: of samples, about.
-
-    Raises:
-        ArrayError: an edge of no length, or edges that are not at a right angle.
     """
     edge_u, edge_v = np.asarray(edge_u, dtype=np.float64), np.asarray(edge_v, dtype=np.float64)
     lengths = np.linalg.norm(edge_u), np.linalg.norm(edge_v)
@@ -181,9 +158,8 @@ def grouped(sources: Sources, wanted: np.ndarray, first_row: int, *, most: int, 
         reach: how far a sample may be from the middle of its group, in the unit of places (of directions: radians).
 
     Returns:
-        The samples, those near enough to a group with its row as their only occluder, the others as they were; and [groups, 4]
-        the places of the groups. Middles are samples, chosen one after the other: the one whose energy times squared distance from
-        all middles so far is largest.
+        The samples, those near enough to a group with its row as their only occluder; and [groups, 4] the places of the groups. Middles
+        are samples, chosen one after the other: the one whose energy times squared distance from all middles so far is largest.
     """
     chosen = np.flatnonzero(wanted)
     if not len(chosen):

@@ -57,7 +57,7 @@ def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
 
 def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str,
                   pixels: slice | None = None) -> np.ndarray:
-    """Return the frames of one chunk.
+    """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
 
     Args:
         stack: the images.
@@ -67,9 +67,6 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
             faster product is used.
         device: where.
         pixels: of a block of rows; None: all.
-
-    Returns:
-        [frames, 3, pixels] float32 radiance in the stack's scene-linear space, unclipped.
     """
     channels, _, count = stack.shape
     begin, end, _ = (pixels or slice(None)).indices(count)

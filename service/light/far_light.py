@@ -44,12 +44,7 @@ NO_SAMPLES = FarSamples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bo
 
 
 def far_light(frame: ScheduledFrame, environments: Environments | None, space: str) -> FarLight:
-    """Return the environment and the discs of a frame in a working space.
-
-    Args:
-        frame: of a schedule.
-        environments: where its environment map is read from.
-        space: scene-linear.
+    """Return the environment and the discs of a frame in a scene-linear working space.
 
     Raises:
         ImageError: the map has impossible values (counted), or a colour space that is not known.

@@ -28,10 +28,8 @@ from kernels.relight.shading import shade
 from kernels.relight.sources import Sources
 from service.light.clipping import Clipping, clipped_channels
 from service.light.far_light import captured_lights
-from service.light.lit_model import LitBeyond, LitModel, correction
-from service.light.model_light import ModelLight
-from service.light.model_range import ModelRange
-from service.light.near_light import NearLights
+from service.light.model_light import ModelLight, NearLights
+from service.light.model_range import LitBeyond, LitModel, ModelRange, correction
 from service.light.range_light import RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
 from service.light.triangulation import left_out, triangles_between
@@ -58,8 +56,7 @@ class Guide:
         Args:
             maps: of the capture, in its working space.
             where: their file, for messages.
-            stack: the captured images.
-            lights: the captured lights.
+            stack, lights: the captured images and lights.
             clipping: of the captured images.
             space: the scene-linear space of the stack.
             device: where.
@@ -151,10 +148,7 @@ class Guide:
         Args:
             frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
             lights: the light of each frame.
-            specular: whether the specular part is wanted too.
-
-        Returns:
-            [frames, 3, pixels] float32 of that part, between 0 and the frame, or None.
+            specular: whether [frames, 3, pixels] float32 of that part, between 0 and the frame, is returned.
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         done = 0
@@ -172,13 +166,8 @@ class Guide:
         """Add to the plain frames of a chunk what the model says they miss; what they have in common is computed once.
 
         Args:
-            frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
-            lights: the light of each frame.
+            frames, lights, specular: as for `correct`.
             places: position of each frame in the full chunk, also when only some of its frames are made.
-            specular: whether the specular part is wanted too.
-
-        Returns:
-            [frames, 3, pixels] float32 of that part, between 0 and the frame, or None.
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         chunk = self._range.chunk(lights, places)

@@ -57,8 +57,7 @@ class CaptureLighting:
         """Keep what the frames of the capture have in common.
 
         Args:
-            lights: the captured lights.
-            stack: the captured images.
+            lights, stack: the captured lights and images.
             environments: where the environment maps of frames are read from.
             space: the scene-linear space of the stack.
             weighting: how light from between the captured lights is shared out over them.

@@ -21,8 +21,7 @@ from service.light.findings import FrameFindings
 from service.light.guide import Guide
 from service.light.layers import check_layers, frame_matte, hard_matte, read_maps, still_layers
 from service.light.lighting import CaptureLighting, ModelUse
-from service.light.model_light import light_samples
-from service.light.near_light import NearLight, near_lights
+from service.light.model_light import NearLight, light_samples, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.surface_model import SurfaceModel

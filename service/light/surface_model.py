@@ -48,9 +48,6 @@ class SurfaceModel:
             device: where.
             chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
             by_normal: True to make pixels of like normals neighbours within each batch; else pixels ascend.
-
-        Raises:
-            ResultError: a layer is not there, or none of the pixels is solved.
         """
         for name in ("normal", "diffuse_albedo", "height"):
             if getattr(maps, name) is None:

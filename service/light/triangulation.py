@@ -95,15 +95,7 @@ def _remembered(directions_bytes: bytes, count: int) -> SphereTriangles:
 
 
 def find_faces(triangles: SphereTriangles, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangle that each of a few directions lies in, on the host.
-
-    Args:
-        triangles: that cover the sphere.
-        directions: [n, 3] unit vectors.
-
-    Returns:
-        [n] faces, and [n, 3] float64 shares of their corners; they sum to one.
-    """
+    """Return the triangles that a few directions [n, 3] lie in, on the host: [n] faces, and [n, 3] float64 shares of their corners."""
     inward, length = edge_planes(triangles)
     face = np.concatenate([np.einsum("sx,fkx->fks", part, inward).min(axis=1).argmax(axis=0)
                            for part in np.array_split(directions, max(1, len(directions) // CHUNK))])
@@ -121,9 +113,6 @@ def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
 
     Returns:
         [lights, channels] float64; its sum is that of the samples.
-
-    Raises:
-        ArrayError: fewer than four lights, or all of them in one plane.
     """
     triangles = triangulate_sphere(directions)
     face, part = find_faces(triangles, samples)
@@ -141,9 +130,6 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
 
     Returns:
         [n, 3] int32 lights and [n, 3] float32 shares that sum to one; where lights are missing the nearest stand for the corners.
-
-    Raises:
-        ArrayError: fewer than four lights, or all in one plane.
     """
     kept, triangles = first_of_equals(directions), triangles_between(directions)
     nearest = kept[np.argmax(triangles.vertex @ directions[kept].T, axis=1)]
@@ -153,17 +139,11 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
 
 
 def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lights that each light would be predicted from if it were missing, and their shares.
-
-    Args:
-        directions: [lights, 3] unit vectors, four or more not in one plane.
+    """Return the lights that each light [lights, 3] would be predicted from if it were missing, and their shares.
 
     Returns:
         [lights, 3] int32 and [lights, 3] float32. Taken from the neighbours of the light: of the triangles between them that hold it,
         the one whose farthest corner is nearest. Where none holds it, at the rim of a dome, all shares are 0.
-
-    Raises:
-        ArrayError: fewer than four lights, or all in one plane.
     """
     kept, triangles = first_of_equals(directions), triangles_between(directions)
     real = len(kept)

@@ -49,8 +49,7 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
         [frames, lights, 3] float64 energy of each light; it sums to that of the whole map.
 
     Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, radiance that is negative or not finite (counted);
-            for smooth weighting also fewer than four lights in different places, or all of them in one plane.
+        ArrayError: as latlong.check; for smooth weighting also as triangulate_sphere.
     """
     if weighting is Weighting.KERNEL:
         return integrate_kernel(environment, directions, rotations)
@@ -59,21 +58,11 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
 
 
 def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, device: str) -> LightEnergy:
-    """Share a lat-long map out over the lights, each direction to the three around it, for several rotations of the map.
-
-    Args:
-        environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
-        directions: [lights, 3] unit vectors from the object to the lights (without padding).
-        rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
-        device: where the triangles are found; sums are taken on the host in float64.
+    """Share a lat-long map out over the lights, each direction to the three around it; arguments are those of `integrate`.
 
     Returns:
         Energy of each light, and the integral of its share over the sphere; both sum to those of the whole map. Of lights in one
         place the first gets all. Where lights are missing, energy goes to those around the hole (service.light.triangulation).
-
-    Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, radiance that is negative or not finite (counted),
-            fewer than four lights in different places, or all of them in one plane.
     """
     directions, rotations = check(environment, directions, rotations)
     kept, triangles = first_of_equals(directions), triangles_between(directions)
@@ -92,7 +81,7 @@ def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations:
 
 
 def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
-    """Share the energy of samples out over the captured lights.
+    """Share the energy of samples out over the captured lights, as whole environments are.
 
     Args:
         samples: [n, 3] unit vectors to the samples.
@@ -102,9 +91,6 @@ def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarra
 
     Returns:
         [lights, channels] float64; its sum is that of the samples.
-
-    Raises:
-        ArrayError: for smooth weighting, fewer than four lights in different places, or all of them in one plane.
     """
     if weighting is Weighting.KERNEL:
         return share_kernel(samples, energy, directions)
@@ -129,14 +115,11 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
         weighting: how, as for a map.
 
     Returns:
-        [discs, lights] float64: ∫ w L dω, for discs that give a surface facing them an irradiance of 1.
+        [discs, lights] float64: ∫ w L dω, for discs that give a surface facing them an irradiance of 1: ∫ L cosθ dω = 1, so that the
+        sum over the lights, ∫ L dω, is 2 / (1 + cos(angle / 2)): 1 for a small disc, 2 for half the sphere.
 
     Raises:
-        ArrayError: shapes that do not fit; for smooth weighting also as integrate_smooth.
-
-    Convention:
-        A facing surface gets ∫ L cosθ dω = 1, so that the sum over the lights, ∫ L dω, is 2 / (1 + cos(angle / 2)): 1 for a small
-        disc, 2 for half the sphere.
+        ArrayError: shapes that do not fit; for smooth weighting also as triangulate_sphere.
     """
     middles, directions = np.asarray(middles, dtype=np.float64), np.asarray(directions, dtype=np.float64)
     if directions.ndim != 2 or directions.shape[1] != 3 or len(directions) == 0:
@@ -152,15 +135,12 @@ def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions:
 
 
 def light_weights(energy: np.ndarray, irradiance: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the weight of each stored image with which their sum is lit by the environment.
+    """Return [frames, 3, lights padded] float32 weights of the stored images with which their sum is lit by the environment.
 
     Args:
-        energy: [frames, lights, 3] of each light, of integrate.
+        energy: [frames, lights, 3] of each light, of `integrate`.
         irradiance: [lights, 3] of each captured light, without padding.
         scale: [lights padded] radiance of a stored 1.0.
-
-    Returns:
-        [frames, 3, lights padded] float32.
 
     Raises:
         ArrayError: a light gives nothing in a channel, so that its part of the energy there could not be placed.

@@ -40,11 +40,7 @@ class MapsJoiner:
     _others: dict[str, Track] = field(default_factory=dict)
 
     def join(self, alone: SurfaceMaps) -> tuple[SurfaceMaps, dict[str, Any]]:
-        """Return the maps of a step joined with those before, and what the report says.
-
-        Args:
-            alone: of the step alone.
-        """
+        """Return the maps of a step, of which `alone` was found, joined with those before, and what the report says."""
         assert alone.normal is not None and alone.sigma is not None
         sigma = np.radians(alone.sigma.astype(np.float32))
         if self._before is None or self._normal is None:

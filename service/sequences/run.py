@@ -88,14 +88,10 @@ def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> S
 
 
 def depth_sequence(request: DepthRequest, progress: Progress | None = None) -> SequenceResult:
-    """Measure the depth of every capture of a sequence, and join what agrees from step to step.
-
-    Args:
-        request: as for solve_sequence.
-        progress: told of every stage of every step.
+    """Measure the depth of every capture of a sequence, and join what agrees from step to step; as solve_sequence.
 
     Raises:
-        as solve_sequence; ResultError: a step is decoded and cannot be triangulated.
+        ResultError: a step is decoded and cannot be triangulated.
     """
     sequence, _ = _open(request)
     joiner = DepthJoiner()
