@@ -90,15 +90,15 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
 
 
 def upload_sources(sources: Sources, device: str, counts: Sequence[int] | None = None) -> SourcesOnDevice:
-    """Put samples on the device: of one frame, or for several frames, one after the other, as many samples as `counts` says.
+    """Put samples on the device: of one frame, or far ones for several frames, one after the other, as many samples as `counts` says.
 
     Raises:
-        ArrayError: counts of other samples.
+        ArrayError: counts of other samples, or a near one among those of frames.
     """
-    counts = [sources.count] if counts is None else counts
-    if sum(counts) != sources.count:
-        raise ArrayError(f"samples are {sources.count} for frames of {sum(counts)}: give the samples of all frames")
-    first = np.concatenate([[0], np.cumsum(counts)])
+    if counts is not None and (sum(counts) != sources.count or sources.place[:, 3].any()):
+        raise ArrayError(f"samples are {sources.count}, {int(sources.place[:, 3].sum())} of them near, for frames of {sum(counts)}: "
+                         "give the far samples of all frames")
+    first = np.concatenate([[0], np.cumsum([sources.count] if counts is None else counts)])
     return SourcesOnDevice(*(wp.array(values, dtype=dtype, device=device) for values, dtype in
                              zip((*sources, first), (wp.vec4, wp.vec3, wp.vec4, wp.vec3i, wp.vec3, wp.int32), strict=True)))
 
@@ -123,14 +123,18 @@ def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -
         raise ArrayError(f"sources ask for row {sources.occluder.max()} of visibility, there are {visible.shape[0]}")
     if visible.shape[1] != surface.packs:
         raise ArrayError(f"visibility has {visible.shape[1]} packs, the surface {surface.packs}: give the same pixels")
-    return shade_frames(surface, upload_sources(sources, surface.device), visible)[0]
+    return _shade(surface, upload_sources(sources, surface.device), visible, far=False)[0]
 
 
 def shade_frames(surface: Surface, sources: SourcesOnDevice, visible: wp.array) -> wp.array:
-    """Return [frames, 6, pixels padded] float32, as `shade` does for each frame; `visible` must have the rows of all samples."""
+    """Return [frames, 6, pixels padded] float32, as `shade` does for far samples of each frame; `visible` must have the rows of all."""
+    return _shade(surface, sources, visible, far=True)
+
+
+def _shade(surface: Surface, sources: SourcesOnDevice, visible: wp.array, *, far: bool) -> wp.array:
     pack, count = devices.pack_width(surface.device), len(sources.first) - 1
     out = wp.empty((count, 6, surface.packs * pack), dtype=wp.float32, device=surface.device)
-    devices.launch(_shade_kernel(pack), count * surface.packs, [surface.values, *sources, visible], [as_packs(out, surface.device)],
+    devices.launch(_shade_kernel(pack, far), count * surface.packs, [surface.values, *sources, visible], [as_packs(out, surface.device)],
                    device=surface.device)
     return out
 
@@ -277,7 +281,7 @@ def visibility(pack: int) -> Any:
 
 
 @cache
-def _shade_kernel(pack: int) -> Any:
+def _shade_kernel(pack: int, far: bool) -> Any:
     lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
     evaluate, seen = lobes(pack), visibility(pack)
 
@@ -299,9 +303,11 @@ def _shade_kernel(pack: int) -> Any:
         p = thread % packs
         matt, glossy = channels(), channels()
         for n in range(begin[f], begin[f + 1]):
-            facing, gloss, lit, _ = evaluate(values, p, place[n], axis[n])
+            facing, gloss, lit, _ = evaluate(values, p, place[n], wp.where(wp.static(far), wp.vec4(), axis[n]))
             rows = occluder[n]
-            if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
+            if wp.static(far):
+                lit = seen(visible, p, rows, share[n])
+            elif rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
                 whole = seen(visible, p, rows, share[n])
                 for k in range(pack):
                     lit[k] = lit[k] * whole[k]

@@ -140,10 +140,10 @@ def join(parts: Sequence[Sources]) -> Sources:
     return Sources(*(np.concatenate(planes) for planes in zip(*parts, strict=True)))
 
 
-def own_rows(sources: Sources, first: int = 0) -> Sources:
-    """Return samples of which each is hidden as the row of visibility of its own says, from row `first` on."""
+def own_rows(sources: Sources) -> Sources:
+    """Return samples of which each is hidden as the row of visibility of its own says."""
     rows = np.full((sources.count, 3), NEVER, np.int32)
-    rows[:, 0] = first + np.arange(sources.count)
+    rows[:, 0] = np.arange(sources.count)
     return sources._replace(occluder=rows, share=np.tile(np.float32([1, 0, 0]), (sources.count, 1)))
 
 

@@ -16,7 +16,6 @@ CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
 
-
 BLOCK_BYTES = 1280 << 20
 """Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
 and 64 lights, a block of 64 frames has 128 rows; every block of every frame costs some milliseconds beyond its pixels."""

@@ -39,7 +39,6 @@ class FarSamples(NamedTuple):
         """Return all samples of one part or more, in order."""
         return FarSamples(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
-
 NO_SAMPLES = FarSamples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bool))
 
 

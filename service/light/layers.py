@@ -28,7 +28,6 @@ class Content(NamedTuple):
     dtype: type[np.floating[Any]] = np.float16
     is_colour: bool = False
 
-
 STILL = {
     Layer.MASK: Content("mask", "Y", "mask"),
     Layer.NORMAL: Content("normal", "XYZ", "normal"),

@@ -23,7 +23,6 @@ from stage.maps import LOBES, SurfaceMaps
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
 
-
 NORMAL_CELLS = 32
 """Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
 

@@ -38,7 +38,6 @@ LARGEST_FACE_DEGREES = 80.0
 """Largest radius of a face's circle, degrees. At 90 degrees the centre would lie in the face; the faces of a regular tetrahedron have 70.5
 degrees."""
 
-
 REMEMBERED = 4
 """Number of sets of lights whose triangles are kept in memory."""
 CHUNK = 4096

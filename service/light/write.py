@@ -27,7 +27,6 @@ from stage.matte import Matte
 COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ: exr.Compression.PIZ,
                 FrameCompression.DWAA: exr.Compression.DWAA}
 
-
 BEAUTY_PART = "rgba"
 """The name of the part that holds the picture, as Nuke calls it."""
 ALPHA = "A"

@@ -28,7 +28,6 @@ FIGURES = re.compile(r"\d[\d.]*")
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
 """What the report says of a sequence without a file."""
 
-
 OF_LIGHTS = ("found", "suspect_lights")
 """What the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
 
