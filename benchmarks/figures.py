@@ -26,7 +26,6 @@ from benchmarks.materials import material_table
 from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
-from benchmarks.short_runs import RUNS, short_runs_table
 from benchmarks.spin import spin_table
 from benchmarks.structured import structured_rows
 from benchmarks.tof import rows as tof_rows
@@ -176,11 +175,6 @@ def _measure(*arguments: str) -> tuple[float, float]:
     return time.perf_counter() - before, peak / 2**20
 
 
-def short(given: argparse.Namespace) -> list[str]:
-    """Time commands on captures that are solved in about a second."""
-    return short_runs_table(given.runs)
-
-
 def memory(given: argparse.Namespace) -> list[str] | None:
     """Measure the stages and the peak memory of a large capture."""
     return None if given.large is None else large_table(given.large, given.megapixels, given.lights, given.frames)
@@ -201,7 +195,6 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "gpu": ("On a GPU", gpu),
     "tof": ("Depth from time of flight", tof),
     "depth_speed": ("Speed of depth", depth_speed),
-    "short": ("Short runs", short),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
 }
@@ -227,7 +220,6 @@ def main() -> None:
     parser.add_argument("--megapixels", type=float, default=MEGAPIXELS, help="of --large")
     parser.add_argument("--lights", type=int, default=LIGHTS, help="of --large")
     parser.add_argument("--frames", type=int, default=FRAMES, help="of --large")
-    parser.add_argument("--runs", type=int, default=RUNS, help="of each of the short runs")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections to measure (default: all)")
     given = parser.parse_args()
     before = TARGET.read_text(encoding="utf-8") if TARGET.exists() else ""

@@ -33,8 +33,7 @@ from kernels.photometric.robust import solve_robust
 from kernels.photometric.samples import gather
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.relight import cublas
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.one_frame import combine
+from kernels.relight.combine import combine, combine_batch
 from kernels.structured.frames import NoiseModel, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly

@@ -19,7 +19,8 @@ import rendering
 from check_conventions import lambert_ggx_brdf
 from make_relight_checks import OBJECTS
 
-from kernels.relight.environment import integrate_cells, light_weights
+from kernels.relight.cells import integrate_cells
+from service.light.weighting import light_weights
 from stage import exr
 from stage.capture import Capture
 

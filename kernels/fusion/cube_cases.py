@@ -25,7 +25,6 @@ CORNERS = np.array([(i & 1, i >> 1 & 1, i >> 2 & 1) for i in range(8)])
 def _edge_start(axis: int) -> list[int]:
     return [i for i in range(8) if CORNERS[i, axis] == 0]
 
-
 EDGE_CORNER = np.array([start for axis in range(3) for start in _edge_start(axis)])
 """[12] the corner from which each edge leads along its axis, edge // 4."""
 

@@ -99,21 +99,17 @@ def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype
 
 def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: Any, sigma: Any, *, vectors: int, slack: float,
            device: str) -> Gathered:
-    """Blend what views show at points.
+    """Blend what views show at points; returns before the device is done. Means of vectors are not of unit length.
 
     Args:
         views: the range images, which decide what hides what.
         layers: wp.array [P, C] float, values of all pixels of the views, one view after another.
         feather: wp.array [P, 1] float, 0…1, how much each pixel counts.
-        points: wp.array [n] of vec3, metres, in the coordinates of the views.
-        normals: wp.array [n] of vec3, unit, world frame.
+        points, normals: wp.array [n] of vec3, metres in the coordinates of the views, and unit vectors of the world frame.
         sigma: wp.array [n] metres, standard deviation of the place of each point.
         vectors: count of the first channels that are vectors of the camera frame, three by three; they are turned to the world frame.
         slack: distance in metres by which a point may lie off its surface beside that, as on a simplified mesh.
         device: where the arrays are.
-
-    Convention:
-        Returns before the device is done. Means of vectors are not of unit length.
     """
     count, channels = len(points), layers.shape[1]
     values = wp.empty((count, channels), dtype=float, device=device)

@@ -162,15 +162,7 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
 
 
 def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
-    """Compute the signed distance of every voxel of the blocks of a brick.
-
-    Args:
-        blocks: of find_blocks, with these views.
-        views: the range images.
-
-    Convention:
-        Returns before the device is done.
-    """
+    """Compute the signed distance of every voxel of blocks, found with these views by find_blocks; returns before the device is done."""
     count, device = blocks.count * VOXELS, blocks.device
     value, variance = (wp.zeros(count, dtype=float, device=device) for _ in range(2))
     state = wp.zeros(count, dtype=wp.uint8, device=device)

@@ -40,7 +40,7 @@ def _rasterise_kernel(first: int, texture: wp.array(dtype=wp.vec2), faces: wp.ar
 
 
 def rasterise(texture: np.ndarray, faces: np.ndarray, rows: int, cols: int, *, device: str) -> tuple[np.ndarray, np.ndarray]:
-    """Find the triangle of each texel whose centre one covers.
+    """Find the triangle of each texel whose centre one covers; waits for the device.
 
     Args:
         texture: [V, 2] u and v of the vertices in texels, from the top-left corner of the image.
@@ -51,9 +51,6 @@ def rasterise(texture: np.ndarray, faces: np.ndarray, rows: int, cols: int, *, d
     Returns:
         [rows, cols] int32, the face with the largest number that covers the centre, −1 where none does; and [n, 3] float64, the barycentric
         coordinates of the covered texels in row-major order.
-
-    Convention:
-        Waits for the device.
     """
     covered: Any = wp.full((rows, cols), -1, dtype=int, device=device)
     devices.launch(_rasterise_kernel, len(faces), [wp.array(texture.astype(np.float32), dtype=wp.vec2, device=device),

@@ -167,18 +167,14 @@ def _resample_kernel(first: int, rows: int, cols: int, focal: float, start: wp.a
 
 
 def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: tuple[int, int], focal: float, *, device: str) -> Resampled:
-    """Return the range image of points that a perspective camera without distortion saw.
+    """Return the range image of points that a perspective camera without distortion saw; waits for the device.
 
     Args:
         places: [n, 2] u and v of the points in pixels, from the top-left corner of the image; those outside of it do not count.
-        depths: [n] metres, above 0.
-        sigmas: [n] metres, standard deviations of the depths, above 0; the errors of points are independent.
+        depths, sigmas: [n] metres, above 0; the errors of points are independent.
         shape: rows and columns of the image.
         focal: of the camera, pixels.
         device: where to compute.
-
-    Convention:
-        Waits for the device.
     """
     rows, cols = shape
     col, row = np.floor(places).astype(np.int64).T

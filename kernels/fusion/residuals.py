@@ -1,4 +1,5 @@
-"""How far each pixel of a view lies from the fused surface, as the voxels of a brick tell."""
+"""How far each pixel of a view lies from the fused surface, as the voxels of a brick tell, and how far the surfaces of two views lie apart
+where both measured the same place."""
 
 from typing import Any
 
@@ -8,12 +9,14 @@ import warp as wp
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, Blocks
 from kernels.fusion.integrate import EMPTY, SURFACE, Volume, voxel_number
-from kernels.fusion.projection import View, line_of_sight, sight_start
-from kernels.fusion.views import Cell, ViewArrays
+from kernels.fusion.projection import View, image_point, in_front, line_of_sight, sight_start, to_camera, turned_back
+from kernels.fusion.views import Cell, ViewArrays, read_view
 
 ELSEWHERE, FUSED, LOST, REFUSED = 0, 1, 2, 3
 """What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
 around it; or other views saw its place to be empty."""
+SAME_SIDE = 0.5
+"""Least cosine between two normals at which two views may show the same surface: 60°."""
 
 
 @wp.kernel(enable_backward=False)
@@ -58,14 +61,11 @@ def _residual_kernel(first: int, voxel: float, corner: wp.vec3i, index: wp.array
 
 
 def residuals(volume: Volume, views: ViewArrays) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the pixels of all views lie from the fused surface in a brick.
+    """Return how far the pixels of all views lie from the fused surface in a brick; waits for the device.
 
     Returns:
         [C] float32 metres, positive outside, one for the upper left pixel of each cell; and [C] uint8, ELSEWHERE, FUSED, LOST or REFUSED:
         distances count where it is FUSED.
-
-    Convention:
-        Waits for the device.
     """
     blocks: Blocks = volume.blocks
     count = len(views.cells)
@@ -74,3 +74,46 @@ def residuals(volume: Volume, views: ViewArrays) -> tuple[np.ndarray, np.ndarray
     devices.launch(_residual_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), blocks.index, volume.value, volume.state, views.views,
                                              views.cells], [distance, fate], device=blocks.device)
     return distance.numpy(), fate.numpy()
+
+
+@wp.kernel(enable_backward=False)
+def _compare_kernel(first: int, skipped: int, count: int, reach: float, views: wp.array(dtype=View), cell: wp.array(dtype=int),
+                    cells: wp.array(dtype=Cell), points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3),
+                    variance: wp.array(dtype=float),
+                    # outputs
+                    distance: wp.array2d(dtype=float), expected: wp.array2d(dtype=float)):
+    i = first + wp.tid()
+    for number in range(count):
+        if number != skipped:
+            view = views[number]
+            there = to_camera(view, points[i])
+            if in_front(view, there):
+                reading = read_view(view, there, image_point(view, there), cell, cells)
+                if (reading.known and wp.dot(turned_back(view, reading.normal), normals[i]) > SAME_SIDE
+                        and wp.abs(reading.distance) < reach):
+                    distance[i, number] = reading.distance
+                    expected[i, number] = wp.sqrt(reading.variance + variance[i])
+
+
+def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, variance: np.ndarray, *, skipped: int, reach: float,
+                  device: str) -> tuple[np.ndarray, np.ndarray]:
+    """Compare points that one view measured with the surfaces that others measured there; waits for the device.
+
+    Args:
+        views: the range images.
+        points, normals: [n, 3] metres in the coordinates of the views, and unit vectors of the world frame.
+        variance: [n] square metres, of each point along its normal.
+        skipped: number of the view that measured the points, which are not compared with it; −1 where it is not among the views.
+        reach: metres; surfaces farther off are other surfaces.
+        device: where the arrays are.
+
+    Returns:
+        [n, V] float32: the distance of each point from the surface of each view along its normal, metres, and what standard deviation the
+        difference of the two has; 0 where they cannot be compared.
+    """
+    distance, expected = (wp.zeros((len(points), views.count), dtype=float, device=device) for _ in range(2))
+    devices.launch(_compare_kernel, len(points), [
+        skipped, views.count, reach, views.views, views.cell, views.cells,
+        *(wp.array(values.astype(np.float32), dtype=kind, device=device) for values, kind in (
+            (points, wp.vec3), (normals, wp.vec3), (variance, float)))], [distance, expected], device=device, uneven=True)
+    return distance.numpy(), expected.numpy()

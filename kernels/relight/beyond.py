@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
-from kernels.packs import Band, as_packs, bit_of, pack_type
+from kernels.packs import bit_of, pack_type
+from kernels.relight.captured import Captured, images_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes, modelled, require_same, upload_captured
+from kernels.relight.shading import lobes, modelled
 
 LONGEST_REACH = math.pi / 4
 """Largest reach, radians. With it, light that is 90 degrees from every captured light is wholly beyond them: a surface that faces it may
@@ -27,13 +27,10 @@ be in the dark under all of them."""
 
 
 def spacing(direction: np.ndarray) -> float:
-    """Return the angle between a captured light and its nearest neighbour, the median over the lights, in radians.
+    """Return the angle between a captured light and its nearest neighbour, the median over the lights, in radians; π for a single light.
 
     Args:
         direction: [lights, 3] unit vectors; several in one place count as one.
-
-    Returns:
-        π for a single light.
     """
     kept = direction[first_of_equals(direction)]
     cosine = kept @ kept.T - 2 * np.eye(len(kept))
@@ -91,36 +88,18 @@ def followed(change: np.ndarray, picture: np.ndarray, modelled_picture: np.ndarr
     return np.where(change < 0, change * np.maximum(share, 0), change)
 
 
-def compare_beyond(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
-                   pairs: np.ndarray) -> wp.array:
+def compare_beyond(captured: Captured, pairs: np.ndarray) -> wp.array:
     """Compare the model's changes from light to light with those of the captured images.
 
     Args:
-        band: captured images of the same pixels as the surface; pairs with a clipped reading do not count.
-        surface: solved maps.
-        visible: [lights, P] uint8 packs of occlusion.see_lights.
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights padded] radiance of a stored 1.0.
+        captured: images and model; pairs with a clipped reading do not count.
         pairs: [pairs, 2] of inward_pairs.
 
     Returns:
         [2, pixels padded] float32 on the device: Σ over pairs and channels of missing · told, and of told², where the image of the
         first light of a pair misses `missing` from that of the second, and `told` is what `followed` makes of the model's change.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
-    count, device = len(direction), surface.device
-    require_same(band, surface, visible, count)
-    pack = devices.pack_width(device)
-    places, factors = upload_captured(direction, irradiance, scale, device)
-    sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
-    devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors,
-                    wp.array(pairs, dtype=wp.vec2i, device=device)],
-                   [as_packs(sums, device)], device=device)
-    return sums
+    return captured.sums(_compare_kernel, 2, wp.array(pairs, dtype=wp.vec2i, device=captured.surface.device))
 
 
 @wp.func
@@ -134,18 +113,11 @@ def _told(before: float, after: float, reading: float) -> float:
 
 @cache
 def _compare_kernel(pack: int) -> Any:
-    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    evaluate = lobes(pack)
+    lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def compare_kernel(first: int,
-                       captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                       clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
-                       padded: int,  # lights
-                       values: wp.array2d(dtype=lane_type),  # [24, P]
-                       visible: wp.array2d(dtype=byte_pack),  # [lights, P]
-                       places: wp.array(dtype=wp.vec4),  # [lights]
-                       factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                       images: images_struct,
                        pairs: wp.array(dtype=wp.vec2i),  # [pairs] predicted light, light that it is predicted from
                        # outputs
                        sums: wp.array2d(dtype=lane_type)):  # [2, P]
@@ -153,17 +125,17 @@ def _compare_kernel(pack: int) -> Any:
         top, bottom = lane_type(), lane_type()
         for n in range(pairs.shape[0]):
             j, i = pairs[n][0], pairs[n][1]
-            facing_j, gloss_j, _, _ = evaluate(values, p, places[j], wp.vec4())
-            facing_i, gloss_i, _, _ = evaluate(values, p, places[i], wp.vec4())
-            lit_j = visible[j, p]
-            lit_i = visible[i, p]
-            bits_j = clipped[j / 8, p]
-            bits_i = clipped[i / 8, p]
+            facing_j, gloss_j, _, _ = evaluate(images.surface, p, images.places[j], wp.vec4())
+            facing_i, gloss_i, _, _ = evaluate(images.surface, p, images.places[i], wp.vec4())
+            lit_j = images.visible[j, p]
+            lit_i = images.visible[i, p]
+            bits_j = images.clipped[j / 8, p]
+            bits_i = images.clipped[i / 8, p]
             for c in range(3):
-                albedo = values[3 + c, p]
-                image_j = captured[c * padded + j, p]
-                image_i = captured[c * padded + i, p]
-                factor_j, factor_i = factors[j][c], factors[i][c]
+                albedo = images.surface[3 + c, p]
+                image_j = images.stored[c * images.padded + j, p]
+                image_i = images.stored[c * images.padded + i, p]
+                factor_j, factor_i = images.factors[j][c], images.factors[i][c]
                 for k in range(pack):
                     after = modelled(float(lit_j[k]) * wp.static(1.0 / 255.0), albedo[k], facing_j[k], gloss_j[c, k])
                     before = modelled(float(lit_i[k]) * wp.static(1.0 / 255.0), albedo[k], facing_i[k], gloss_i[c, k])

@@ -44,8 +44,7 @@ def integrate_cells(environment: np.ndarray, directions: np.ndarray, rotations: 
         Energy and solid angle of each cell; both sum to those of the whole map. Of lights in one place the first has the cell.
 
     Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite
-            (counted).
+        ArrayError: as latlong.check.
     """
     directions, rotations = check(environment, directions, rotations)
     kept = first_of_equals(directions)

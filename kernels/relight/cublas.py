@@ -3,7 +3,7 @@
 The stack is half, and cuBLAS multiplies matrices of one type with sums in float32. So the weights of a frame become two halves each,
 w = 2^e (h + 2^-11 r): h has the first 11 bits of a weight and r the next 11, so that weights are as exact as float32 down to a 2^-12th of
 the frame's largest, and off by a 2^-35th of the largest below. Two products add up in the same output, and the stack is read twice for up
-to GROUP frames; the kernel beside it (many_frames.py) reads it once for eight.
+to GROUP frames; the kernel beside it (combine.py) reads it once for eight.
 
 Every call makes GROUP frames, some of them zero: cuBLAS may sum in another order for another count, and a frame at the same position must
 be identical to the last bit whichever others are made. For the same reason this product is used for every count of frames, or not at all,
@@ -94,16 +94,7 @@ def describe(device: str) -> str:
 
 
 def combine_by(gemm: Gemm, band: Band, weights: np.ndarray) -> wp.array:
-    """Relight many frames by products.
-
-    Args:
-        gemm: does a product, in the order of the device's stream.
-        band: the stack on the device.
-        weights: [frames, 3, lights] float32, finite.
-
-    Returns:
-        [frames, 3, pixels padded] float32 radiance on the device; not synchronised.
-    """
+    """Relight many frames by products that are done in the order of the device's stream; as combine.combine_batch."""
     lights = band.frame_count
     pixels = band.packs * band.values.dtype._length_
     groups = -(-len(weights) // GROUP)

@@ -108,11 +108,7 @@ def sample_environment(environment: np.ndarray, count: int = SAMPLES) -> Environ
 
 
 def split_environment(environment: np.ndarray, radius: float) -> EnvironmentParts:
-    """Divide a lat-long map into small bright places and the rest.
-
-    Args:
-        environment: [rows, cols, 3] scene-linear radiance, finite, 0 or above.
-        radius: largest angular radius of a small place, radians.
+    """Divide a lat-long map [rows, cols, 3], finite, 0 or above, into small bright places, of this angular radius at most, and the rest.
 
     Returns:
         The samples of sample_environment that are small, at most MOST_SMALL with most energy, and BROAD_SAMPLES samples of what they leave.

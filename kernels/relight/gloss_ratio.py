@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, as_packs, channels_type, pack_type
-from kernels.relight.shading import Surface, lobes, require_same, upload_captured
+from kernels.packs import channels_type, pack_type
+from kernels.relight.captured import Captured, images_type
+from kernels.relight.shading import lobes
 
 MOST_RATIO = 1.25
 """Largest ratio of image to model that the gloss is scaled by; what is brighter stays a difference. On the flank of a lobe that is
@@ -54,51 +54,25 @@ def ratio_of_sums(shown: np.ndarray, gloss: np.ndarray) -> np.ndarray:
     return np.divide(shown, gloss, out=np.ones_like(shown), where=gloss > LEAST_GLOSS)
 
 
-def sum_shown(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
-              energy: np.ndarray) -> ShownModel:
-    """Sum the model under the captured lights for one frame; waits for the device.
-
-    Args:
-        band: captured images of the same pixels as the surface.
-        surface: solved maps.
-        visible: [lights or more, P] uint8 packs of occlusion.see_lights.
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights padded] radiance of a stored 1.0.
-        energy: [lights, 3] that the frame gives each light; may be negative.
-
-    Raises:
-        ArrayError: shapes that do not fit.
-    """
-    count, device = len(direction), surface.device
-    require_same(band, surface, visible, count)
+def sum_shown(captured: Captured, energy: np.ndarray) -> ShownModel:
+    """Sum the model under the captured lights for one frame, which gives them energy [lights, 3], also negative; waits for the device."""
+    surface, count = captured.surface, len(captured.direction)
     if np.shape(energy) != (count, 3):
         raise ArrayError(f"energy is {np.shape(energy)}: give {(count, 3)}")
-    pack = devices.pack_width(device)
-    places, factors = upload_captured(direction, irradiance, scale, device)
     used = np.flatnonzero(np.abs(energy).max(axis=1, initial=0) > 0).astype(np.int32)
-    sums = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
-    devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible, places, factors,
-                    wp.array(energy, dtype=wp.vec3, device=device), wp.array(used, dtype=wp.int32, device=device)],
-                   [as_packs(sums, device)], device=device)
+    sums = captured.sums(_sum_kernel, 6, wp.array(energy, dtype=wp.vec3, device=surface.device),
+                         wp.array(used, dtype=wp.int32, device=surface.device))
     whole, ratio = sums.numpy()[:, : surface.pixel_count].reshape(2, 3, -1)
     return ShownModel(whole, ratio)
 
 
 @cache
 def _sum_kernel(pack: int) -> Any:
-    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    channels, evaluate = channels_type(pack), lobes(pack)
+    lane_type, images_struct, channels, evaluate = pack_type(pack, wp.float32), images_type(pack), channels_type(pack), lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def sum_kernel(first: int,
-                   captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                   padded: int,  # lights
-                   values: wp.array2d(dtype=lane_type),  # [24, P]
-                   visible: wp.array2d(dtype=byte_pack),  # [rows, P]
-                   places: wp.array(dtype=wp.vec4),  # [lights]
-                   factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                   images: images_struct,
                    energy: wp.array(dtype=wp.vec3),  # [lights]
                    used: wp.array(dtype=wp.int32),  # lights with energy
                    # outputs
@@ -107,12 +81,12 @@ def _sum_kernel(pack: int) -> Any:
         whole, shown, shone = channels(), channels(), channels()
         for n in range(used.shape[0]):
             light = used[n]
-            facing, gloss, _, _ = evaluate(values, p, places[light], wp.vec4())
-            lit = visible[light, p]
+            facing, gloss, _, _ = evaluate(images.surface, p, images.places[light], wp.vec4())
+            lit = images.visible[light, p]
             for c in range(3):
-                albedo = values[3 + c, p]
-                reading = captured[c * padded + light, p]
-                given, factor = energy[light][c], factors[light][c]
+                albedo = images.surface[3 + c, p]
+                reading = images.stored[c * images.padded + light, p]
+                given, factor = energy[light][c], images.factors[light][c]
                 for k in range(pack):
                     seen = float(lit[k]) * wp.static(1.0 / 255.0)
                     matt = seen * albedo[k] * INVERSE_PI * facing[k]

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, as_packs, bit_of, channels_type, pack_type
+from kernels.packs import bit_of, channels_type, pack_type
 from kernels.relight.beyond import spacing
+from kernels.relight.captured import Captured, images_type
 from kernels.relight.gloss_ratio import gloss_ratio, mean_ratio
-from kernels.relight.shading import Surface, lobes, require_same, upload_captured
+from kernels.relight.shading import lobes
 
 POOL = 2
 """Half-width, in pixels, of the window over which the sums of β are pooled."""
@@ -31,66 +31,35 @@ and between two lights the half vector moves by half of the angle between them (
 
 
 def seen_lobes(specular: np.ndarray, roughness: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Widen lobes that are narrower than the captured lights can resolve.
+    """Widen lobes that are narrower than the captured lights can resolve, and return their F0 […, 3] and roughness […], float32.
 
-    The captured lights see only the tail of a lobe that is much narrower than their spacing, and its strength is F0 · α². The wider and
-    fainter lobe that is returned has the same tail.
-
-    Args:
-        specular: […, 3] F0.
-        roughness: […].
-        direction: [lights, 3] unit vectors to the captured lights.
-
-    Returns:
-        F0 and roughness, float32.
+    The captured lights, unit vectors [lights, 3], see only the tail of a lobe that is much narrower than their spacing, and its strength is
+    F0 · α². The wider and fainter lobe that is returned has the same tail.
     """
     alpha = np.asarray(roughness, dtype=np.float32) ** 2
     wider = np.maximum(alpha, np.float32(LEAST_ALPHA * spacing(direction)))
     return specular * ((alpha / wider) ** 2)[..., None], np.where(alpha > 0, np.sqrt(wider), 0)
 
 
-def compare_model(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray,
-                neighbours: np.ndarray, shares: np.ndarray) -> wp.array:
+def compare_model(captured: Captured, neighbours: np.ndarray, shares: np.ndarray) -> wp.array:
     """Compare the model with the captured images, each left out and predicted from its neighbours.
 
     Args:
-        band: captured images of the same pixels as the surface; where one of the four readings of a comparison is clipped, the comparison
-            does not count.
-        surface: solved maps.
-        visible: [lights, P] uint8 packs of occlusion.see_lights.
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights padded] radiance of a stored 1.0.
-        neighbours, shares: [lights, 3] of around.left_out.
+        captured: images and model; where one of the four readings of a comparison is clipped, the comparison does not count.
+        neighbours, shares: [lights, 3] of triangulation.left_out.
 
     Returns:
         [2, pixels padded] float32 on the device: Σ over lights and channels of missing · told, and of told².
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
-    count, device = len(direction), surface.device
-    require_same(band, surface, visible, count)
+    count, device = len(captured.direction), captured.surface.device
     if np.shape(neighbours) != (count, 3) or np.shape(shares) != (count, 3):
         raise ArrayError(f"neighbours are {np.shape(neighbours)}, shares {np.shape(shares)}: give {(count, 3)} of both")
-    pack = devices.pack_width(device)
-    places, factors = upload_captured(direction, irradiance, scale, device)
-    sums = wp.empty((2, surface.packs * pack), dtype=wp.float32, device=device)
-    devices.launch(_compare_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors,
-                    wp.array(neighbours, dtype=wp.vec3i, device=device), wp.array(shares, dtype=wp.vec3, device=device)],
-                   [as_packs(sums, device)], device=device)
-    return sums
+    return captured.sums(_compare_kernel, 2, wp.array(neighbours, dtype=wp.vec3i, device=device),
+                         wp.array(shares, dtype=wp.vec3, device=device))
 
 
 def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given.
-
-    Args:
-        plane: [n] of the pixels.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-    """
+    """Return the sum of a value [n] over the window of POOL pixels around each of the pixels, over those that are given, row-major."""
     rows, cols = np.divmod(pixels, shape[1])
     table = np.zeros((shape[0] + 2 * POOL, shape[1] + 2 * POOL))
     table[rows + POOL, cols + POOL] = plane
@@ -99,17 +68,10 @@ def pooled(plane: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.
 
 
 def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return β from the sums of each pixel and of its neighbours.
+    """Return β, [n] float32, 0…1, from the sums [2, n] of each pixel and of its neighbours; 0 where the model says nothing.
 
-    A pixel's own lights are few, and a model that is wrong at a pixel is wrong around it too.
-
-    Args:
-        sums: [2, n] of compare_model.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-
-    Returns:
-        [n] float32, 0…1; 0 where the model says nothing.
+    A pixel's own lights are few, and a model that is wrong at a pixel is wrong around it too. Pixels are row-major positions in an image of
+    this shape.
     """
     top, bottom = (pooled(plane, pixels, shape) for plane in sums)
     return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)
@@ -117,25 +79,18 @@ def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> n
 
 @cache
 def _compare_kernel(pack: int) -> Any:
-    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    channels, evaluate = channels_type(pack), lobes(pack)
+    lane_type, images_struct, channels, evaluate = pack_type(pack, wp.float32), images_type(pack), channels_type(pack), lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def compare_kernel(first: int,
-                     captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                     clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
-                     padded: int,  # lights
-                     values: wp.array2d(dtype=lane_type),  # [24, P]
-                     visible: wp.array2d(dtype=byte_pack),  # [lights, P]
-                     places: wp.array(dtype=wp.vec4),  # [lights]
-                     factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                     images: images_struct,
                      neighbours: wp.array(dtype=wp.vec3i),  # [lights]
                      shares: wp.array(dtype=wp.vec3),  # [lights]
                      # outputs
                      sums: wp.array2d(dtype=lane_type)):  # [2, P]
         p = first + wp.tid()
         top, bottom = lane_type(), lane_type()
-        for light in range(places.shape[0]):
+        for light in range(images.places.shape[0]):
             parts = shares[light]
             if parts[0] + parts[1] + parts[2] > 0.0:
                 near = neighbours[light]
@@ -144,13 +99,13 @@ def _compare_kernel(pack: int) -> Any:
                 for corner in range(4):  # the light itself last, because its gloss is scaled as that of the others is
                     at = wp.where(corner == 0, near[0], wp.where(corner == 1, near[1], wp.where(corner == 2, near[2], light)))
                     part = wp.where(corner == 0, parts[0], wp.where(corner == 1, parts[1], wp.where(corner == 2, parts[2], -1.0)))
-                    facing, gloss, _, _ = evaluate(values, p, places[at], wp.vec4())
-                    lit = visible[at, p]
-                    bits = clipped[at / 8, p]
+                    facing, gloss, _, _ = evaluate(images.surface, p, images.places[at], wp.vec4())
+                    lit = images.visible[at, p]
+                    bits = images.clipped[at / 8, p]
                     for k in range(pack):
                         counts[k] = wp.where(bit_of(bits[k], at) == 1, 0.0, counts[k])
                     for c in range(3):
-                        albedo, stored, factor = values[3 + c, p], captured[c * padded + at, p], factors[at][c]
+                        albedo, stored, factor = images.surface[3 + c, p], images.stored[c * images.padded + at, p], images.factors[at][c]
                         for k in range(pack):
                             seen = float(lit[k]) * wp.static(1.0 / 255.0)
                             reading = factor * float(stored[k])

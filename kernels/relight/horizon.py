@@ -168,14 +168,7 @@ def see_above(direction: np.ndarray, surface: Surface, horizons: Horizons) -> wp
 
     Args:
         direction: [n, 3] unit vectors, between directions in the picture whose horizons are there.
-        surface: the pixels.
-        horizons: of the same pixels.
-
-    Returns:
-        [n, P] uint8 packs: 255 where the light is seen, 0 where the surface hides it.
-
-    Raises:
-        ArrayError: horizons of other pixels.
+        surface, horizons: the pixels, and their horizons.
     """
     if horizons.tangent.shape[1] != surface.packs:
         raise ArrayError(f"horizons have {horizons.tangent.shape[1]} packs, the surface {surface.packs}: give the same pixels")

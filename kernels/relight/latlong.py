@@ -21,7 +21,6 @@ EQUAL_RADIANS = 1e-4
 BAND_SAMPLES = 1 << 19
 """Number of samples that are summed at one time: it bounds the memory of a large map, and the samples stay in the cache."""
 
-
 EQUAL_COLUMNS = 1e-6
 """Rotations whose difference is a whole number of columns to within this part of one column, less than a thousandth of a second of arc,
 share one split of the samples."""

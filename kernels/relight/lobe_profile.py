@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from kernels import device as devices
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, as_packs, bit_of, pack_type
+from kernels.packs import bit_of, pack_type
+from kernels.relight.captured import Captured, images_type
 from kernels.relight.guide import pooled
-from kernels.relight.shading import Surface, lobes, require_same, upload_captured
+from kernels.relight.shading import lobes
 
 TERMS = 4
 """Number of terms whose moments are taken: three of the profile, and the diffuse part."""
@@ -43,45 +43,18 @@ MOMENTS = len(PRODUCTS) + TERMS + 2
 """Number of sums of a pixel: products of terms, terms times residual, residual squared, and number of lights."""
 
 
-def profile_moments(band: Band, surface: Surface, visible: wp.array, direction: np.ndarray, irradiance: np.ndarray,
-                    scale: np.ndarray) -> wp.array:
-    """Sum what the captured images, as grey, have beyond the model, against the terms of a profile.
+def profile_moments(captured: Captured) -> wp.array:
+    """Sum what the captured images, as grey, have beyond the model, against the terms of a profile: [MOMENTS, pixels padded] float32.
 
-    Args:
-        band: captured images of the same pixels as the surface; clipped readings count where they are brighter than the model all the same.
-        surface: solved maps, with the plain profile.
-        visible: [lights, P] uint8 packs of occlusion.see_lights.
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights padded] radiance of a stored 1.0.
-
-    Returns:
-        [MOMENTS, pixels padded] float32 on the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
+    The surface has the plain profile. Clipped readings count where they are brighter than the model all the same.
     """
-    count, device = len(direction), surface.device
-    require_same(band, surface, visible, count)
-    pack = devices.pack_width(device)
-    places, factors = upload_captured(direction, irradiance, scale, device)
-    moments = wp.empty((MOMENTS, surface.packs * pack), dtype=wp.float32, device=device)
-    devices.launch(_moments_kernel(pack), surface.packs,
-                   [band.values, band.saturated, band.frame_count, surface.values, visible, places, factors],
-                   [as_packs(moments, device)], device=device)
-    return moments
+    return captured.sums(_moments_kernel, MOMENTS)
 
 
 def fit_profile(moments: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the profile of each pixel from the moments of it and of its neighbours.
+    """Return the profile of each pixel, [n, 3] float32 coefficients, from the moments [MOMENTS, n] of it and of its neighbours.
 
-    Args:
-        moments: [MOMENTS, n] of profile_moments.
-        pixels: [n] row-major positions in the image.
-        shape: (rows, cols) of the image.
-
-    Returns:
-        [n, 3] float32 coefficients.
+    Pixels are row-major positions in an image of this shape.
     """
     first = len(PRODUCTS)
     alone = moments.astype(np.float64)
@@ -113,34 +86,27 @@ def fit_profile(moments: np.ndarray, pixels: np.ndarray, shape: tuple[int, int])
 
 @cache
 def _moments_kernel(pack: int) -> Any:
-    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    evaluate = lobes(pack)
+    lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
     sums_type = wp.types.matrix(shape=(MOMENTS, pack), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def moments_kernel(first: int,
-                       captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                       clipped: wp.array2d(dtype=byte_pack),  # [lights padded / 8, P] bits
-                       padded: int,  # lights
-                       values: wp.array2d(dtype=lane_type),  # [24, P]
-                       visible: wp.array2d(dtype=byte_pack),  # [lights, P]
-                       places: wp.array(dtype=wp.vec4),  # [lights]
-                       factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                       images: images_struct,
                        # outputs
                        moments: wp.array2d(dtype=lane_type)):  # [MOMENTS, P]
         p = first + wp.tid()
-        albedo_r = values[3, p]
-        albedo_g = values[4, p]
-        albedo_b = values[5, p]
+        albedo_r = images.surface[3, p]
+        albedo_g = images.surface[4, p]
+        albedo_b = images.surface[5, p]
         sums = sums_type()
-        for light in range(places.shape[0]):
-            facing, gloss, _, peak = evaluate(values, p, places[light], wp.vec4())
-            factor = factors[light]
-            red = captured[light, p]
-            green = captured[padded + light, p]
-            blue = captured[2 * padded + light, p]
-            bits = clipped[light / 8, p]
-            lit = visible[light, p]
+        for light in range(images.places.shape[0]):
+            facing, gloss, _, peak = evaluate(images.surface, p, images.places[light], wp.vec4())
+            factor = images.factors[light]
+            red = images.stored[light, p]
+            green = images.stored[images.padded + light, p]
+            blue = images.stored[2 * images.padded + light, p]
+            bits = images.clipped[light / 8, p]
+            lit = images.visible[light, p]
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / (3.0 * 255.0))
                 shine = seen * (gloss[0, k] + gloss[1, k] + gloss[2, k])

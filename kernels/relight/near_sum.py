@@ -12,65 +12,52 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.packs import Band, as_packs, pack_type
+from kernels.packs import as_packs, pack_type
+from kernels.relight.captured import Captured, images_type
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.shading import Surface, lobes, modelled, require_same, upload_captured
-from kernels.relight.smooth import walk
+from kernels.relight.shading import lobes, modelled
+from kernels.relight.smooth import SphereTriangles, edge_planes, walk
 from kernels.relight.sources import Sources
-from kernels.relight.triangulation import edge_planes, triangulate_sphere
 
 LEAST_PART = 1e-3
 """Least share of an imaginary light's energy that a captured light receives. A light so far from the hole that its share is smaller
 receives nothing, and the other lights receive its share."""
 
 
-def sum_near(band: Band, surface: Surface, visible: wp.array, sources: Sources, direction: np.ndarray, irradiance: np.ndarray,
-             scale: np.ndarray) -> wp.array:
-    """Sum images, and the model's images, for near and far samples of light.
+def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -> wp.array:
+    """Sum images, and the model's images, for near and far samples of light: [6, pixels padded] float32 radiance on the device.
 
     Args:
-        band: captured images of the same pixels as the surface.
-        surface: solved maps.
-        visible: [lights, P] uint8 packs of occlusion.see_lights for the captured lights.
+        captured: images and model.
         sources: the wanted light, some tens of samples; what hides it is not looked at, the images show it.
-        direction, irradiance: [lights, 3] of the captured lights, four or more not in one plane.
-        scale: [lights padded] radiance of a stored 1.0.
-
-    Returns:
-        [6, pixels padded] float32 radiance on the device: of the images, and of the model.
+        triangles: of the captured lights, of several in one place the first.
 
     Raises:
-        ArrayError: shapes that do not fit, a captured light without irradiance, fewer than four lights, or all in one plane.
+        ArrayError: a captured light without irradiance.
     """
+    surface, direction, irradiance = captured.surface, captured.direction, captured.irradiance
     count, device = len(direction), surface.device
-    require_same(band, surface, visible, count)
     if not (irradiance > 0).all():
         light, channel = np.argwhere(~(irradiance > 0))[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
     kept = first_of_equals(direction)
-    triangles = triangulate_sphere(direction[kept])
     vertex, owner = np.nonzero(triangles.share > LEAST_PART)
     start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
     part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
     inward, length = edge_planes(triangles)
-    pack = devices.pack_width(device)
-    places, factors = upload_captured(direction, irradiance, scale, device)
-    weights = wp.zeros((3 * count, surface.packs * pack), dtype=wp.float32, device=device)
-    out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=device)
+    pixels = surface.packs * devices.pack_width(device)
+    weights = wp.zeros((3 * count, pixels), dtype=wp.float32, device=device)
 
     def upload(values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(values, dtype=dtype, device=device)
 
     position = wp.array(surface.values.numpy()[12:15].reshape(3, -1), dtype=wp.float32, device=device)
-    devices.launch(_weights_kernel, surface.packs * pack,
+    devices.launch(_weights_kernel, pixels,
                    [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
                     upload(inward.reshape(-1, 3), wp.vec3), upload(length.reshape(-1), wp.float32),
                     upload(triangles.neighbour.reshape(-1), wp.int32), upload(triangles.corner.reshape(-1), wp.int32),
                     upload(start, wp.int32), upload(kept[owner], wp.int32), upload(part, wp.float32), count], [weights], device=device)
-    devices.launch(_sum_kernel(pack), surface.packs,
-                   [band.values, band.frame_count, surface.values, visible, places, factors, as_packs(weights, device)],
-                   [as_packs(out, device)], device=device)
-    return out
+    return captured.sums(_sum_kernel, 6, as_packs(weights, device))
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -119,34 +106,28 @@ def _weights_kernel(first: int,
 
 @cache
 def _sum_kernel(pack: int) -> Any:
-    lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
-    evaluate = lobes(pack)
+    lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def sum_kernel(first: int,
-                   captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                   padded: int,  # lights
-                   values: wp.array2d(dtype=lane_type),  # [24, P]
-                   visible: wp.array2d(dtype=byte_pack),  # [lights, P]
-                   lights: wp.array(dtype=wp.vec4),  # [lights]
-                   factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
+                   images: images_struct,
                    weights: wp.array2d(dtype=lane_type),  # [3 · lights, P]
                    # outputs
                    out: wp.array2d(dtype=lane_type)):  # [6, P]
         p = first + wp.tid()
-        count = lights.shape[0]
-        albedo_r = values[3, p]
-        albedo_g = values[4, p]
-        albedo_b = values[5, p]
+        count = images.places.shape[0]
+        albedo_r = images.surface[3, p]
+        albedo_g = images.surface[4, p]
+        albedo_b = images.surface[5, p]
         image_r, image_g, image_b = lane_type(), lane_type(), lane_type()
         model_r, model_g, model_b = lane_type(), lane_type(), lane_type()
         for light in range(count):
-            facing, gloss, _, _ = evaluate(values, p, lights[light], wp.vec4())
-            lit = visible[light, p]
-            factor = factors[light]
-            red = captured[light, p]
-            green = captured[padded + light, p]
-            blue = captured[2 * padded + light, p]
+            facing, gloss, _, _ = evaluate(images.surface, p, images.places[light], wp.vec4())
+            lit = images.visible[light, p]
+            factor = images.factors[light]
+            red = images.stored[light, p]
+            green = images.stored[images.padded + light, p]
+            blue = images.stored[2 * images.padded + light, p]
             wr = weights[light, p]
             wg = weights[count + light, p]
             wb = weights[2 * count + light, p]

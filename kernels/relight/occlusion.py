@@ -28,9 +28,6 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     Returns:
         [n, P] uint8 packs: 255 where the light is seen, 0 where the surface hides it. The last pack is filled up with the last
         pixel. Attached shadow is not looked at.
-
-    Raises:
-        ArrayError: positions outside the image, or none.
     """
     if not len(pixels) or pixels.min() < 0 or pixels.max() >= mask.shape[0] * mask.shape[1]:
         raise ArrayError(f"pixels must be positions from 0 to {mask.shape[0] * mask.shape[1] - 1}, one or more")

@@ -1,7 +1,7 @@
 """The response of a surface to light of energy one from each of many directions: frames are weighted sums of it.
 
 A frame's own samples are shaded by kernels.relight.shading. Where many frames light the same surface, what depends on the surface is
-computed once here, and what depends on the frame is a matrix product (kernels.relight.many_frames).
+computed once here, and what depends on the frame is a matrix product (kernels.relight.combine).
 
 Source: precomputed light transport, Ng, Ramamoorthi and Hanrahan, "All-frequency shadows using non-linear wavelet lighting
 approximation", SIGGRAPH 2003, here without wavelets.
@@ -10,14 +10,14 @@ approximation", SIGGRAPH 2003, here without wavelets.
 from functools import cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, pack_type
+from kernels.packs import pack_type
+from kernels.relight.captured import Captured, images_type
 from kernels.relight.gloss_ratio import gloss_ratio
-from kernels.relight.shading import SourcesOnDevice, Surface, lobes, require_same, upload_captured, visibility
+from kernels.relight.shading import SourcesOnDevice, Surface, lobes, visibility
 
 
 class Responses(NamedTuple):
@@ -39,42 +39,29 @@ def empty_responses(count: int, packs: int, device: str) -> Responses:
 
 
 def respond(surface: Surface, sources: SourcesOnDevice, visible: wp.array, responses: Responses) -> None:
-    """Compute the responses of a surface to samples of light, each of energy one.
+    """Compute the responses of a surface to far samples of light, as of energy one, into memory of as many packs as the surface has.
 
     Args:
-        surface: the pixels.
-        sources: far samples; their energy is not used.
+        surface, sources: the pixels, and the samples.
         visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; it has the rows of all samples.
-        responses: where they are written, of as many packs as the surface has.
+        responses: where they are written.
     """
     devices.launch(_respond_kernel(devices.pack_width(surface.device)), responses.matt.size,
                    [surface.values, sources.place, sources.occluder, sources.share, visible], list(responses), device=surface.device)
 
 
-def shown_gloss(band: Band, surface: Surface, responses: Responses, direction: np.ndarray, irradiance: np.ndarray,
-                scale: np.ndarray) -> wp.array:
-    """Return the specular part under each captured light, as bright as the images show it (kernels.relight.gloss_ratio).
+def shown_gloss(captured: Captured, responses: Responses) -> wp.array:
+    """Return [3 lights, P] float32 packs of the specular part under each captured light of irradiance one, as bright as the images show it
+    (kernels.relight.gloss_ratio); on CUDA not synchronised.
 
     Args:
-        band: captured images of the same pixels as the surface.
-        surface: solved maps.
+        captured: images and model.
         responses: of the surface to the captured lights.
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights padded] radiance of a stored 1.0.
-
-    Returns:
-        [3 lights, P] float32 packs for lights of irradiance one; on CUDA not synchronised.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
-    count, device = len(direction), surface.device
-    require_same(band, surface, responses.matt, count)
-    _, factors = upload_captured(direction, irradiance, scale, device)
+    device = captured.surface.device
     shown = wp.empty(responses.gloss.shape, dtype=responses.gloss.dtype, device=device)
-    devices.launch(_shown_kernel(devices.pack_width(device)), count * surface.packs,
-                   [band.values, band.frame_count, surface.values, responses.matt, responses.gloss, factors], [shown], device=device)
+    devices.launch(_shown_kernel(devices.pack_width(device)), responses.matt.size,
+                   [captured.images, responses.matt, responses.gloss], [shown], device=device)
     return shown
 
 
@@ -113,28 +100,25 @@ def _respond_kernel(pack: int) -> Any:
 
 @cache
 def _shown_kernel(pack: int) -> Any:
-    lane_type, half_pack = pack_type(pack, wp.float32), pack_type(pack, wp.float16)
+    lane_type, images_struct = pack_type(pack, wp.float32), images_type(pack)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def shown_kernel(first: int,
-                     captured: wp.array2d(dtype=half_pack),  # [3 · lights padded, P]
-                     padded: int,  # lights
-                     values: wp.array2d(dtype=lane_type),  # [24, P]
+                     images: images_struct,
                      matt: wp.array2d(dtype=lane_type),  # [lights, P]
                      gloss: wp.array2d(dtype=lane_type),  # [3 lights, P]
-                     factors: wp.array(dtype=wp.vec3),  # [lights] stored → radiance / irradiance
                      # outputs
                      shown: wp.array2d(dtype=lane_type)):  # [3 lights, P]
         thread = first + wp.tid()
-        packs = values.shape[1]
+        packs = matt.shape[1]
         light = thread / packs
         p = thread % packs
         diffuse = matt[light, p]
         for c in range(3):
-            reading = captured[c * padded + light, p]
-            albedo = values[3 + c, p]
+            reading = images.stored[c * images.padded + light, p]
+            albedo = images.surface[3 + c, p]
             shine = gloss[c * matt.shape[0] + light, p]
-            factor = factors[light][c]
+            factor = images.factors[light][c]
             for k in range(pack):
                 shine[k] = shine[k] * gloss_ratio(factor * float(reading[k]), albedo[k] * diffuse[k], shine[k])
             shown[c * matt.shape[0] + light, p] = shine

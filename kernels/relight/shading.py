@@ -5,6 +5,7 @@ intensity · cos^μ / distance² of a near one, V the visibility that the caller
 The specular part can have a profile of each pixel (kernels.relight.lobe_profile): a factor that depends on the angle of the half vector.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
-from kernels.packs import Band, as_packs, channels_type, pack_type
+from kernels.packs import as_packs, channels_type, pack_type
 from kernels.relight.sources import Sources
 
 LEAST_ROUGHNESS = 0.05
@@ -50,13 +51,14 @@ class SecondLobe(NamedTuple):
 
 
 class SourcesOnDevice(NamedTuple):
-    """Samples of light, uploaded."""
+    """Samples of light of one frame or of several, uploaded."""
 
     place: wp.array
     energy: wp.array
     axis: wp.array
     occluder: wp.array
     share: wp.array
+    first: wp.array  # [frames + 1] int32: where the samples of each frame begin
 
 
 def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.ndarray, roughness: np.ndarray, view: np.ndarray,
@@ -70,9 +72,6 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
         second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
         profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF. A pixel without a lobe has no second one.
         device: where.
-
-    Raises:
-        ArrayError: no pixels, or shapes that do not fit.
     """
     count = len(normal)
     nothing = SecondLobe(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
@@ -90,18 +89,25 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
     return Surface(wp.array(packed, dtype=pack_type(pack, wp.float32), device=device), count, device)
 
 
-def upload_sources(sources: Sources, device: str) -> SourcesOnDevice:
-    """Put samples on the device."""
+def upload_sources(sources: Sources, device: str, counts: Sequence[int] | None = None) -> SourcesOnDevice:
+    """Put samples on the device: of one frame, or far ones for several frames, one after the other, as many samples as `counts` says.
+
+    Raises:
+        ArrayError: counts of other samples, or a near one among those of frames.
+    """
+    if counts is not None and (sum(counts) != sources.count or sources.place[:, 3].any()):
+        raise ArrayError(f"samples are {sources.count}, {int(sources.place[:, 3].sum())} of them near, for frames of {sum(counts)}: "
+                         "give the far samples of all frames")
+    first = np.concatenate([[0], np.cumsum([sources.count] if counts is None else counts)])
     return SourcesOnDevice(*(wp.array(values, dtype=dtype, device=device) for values, dtype in
-                             zip(sources, (wp.vec4, wp.vec3, wp.vec4, wp.vec3i, wp.vec3), strict=True)))
+                             zip((*sources, first), (wp.vec4, wp.vec3, wp.vec4, wp.vec3i, wp.vec3, wp.int32), strict=True)))
 
 
 def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -> wp.array:
     """Return the radiance of a surface under samples of light.
 
     Args:
-        surface: the pixels.
-        sources: the samples.
+        surface, sources: the pixels, and the samples.
         visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; None: nothing is hidden.
 
     Returns:
@@ -110,57 +116,27 @@ def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -
     Raises:
         ArrayError: samples that ask for rows of visibility that are not there, or visibility of other pixels.
     """
-    pack = devices.pack_width(surface.device)
     if visible is None:
-        visible = wp.empty((0, surface.packs), dtype=pack_type(pack, wp.uint8), device=surface.device)
-    require_rows(surface, sources, visible)
-    out = wp.empty((6, surface.packs * pack), dtype=wp.float32, device=surface.device)
-    devices.launch(_shade_kernel(pack), surface.packs, [surface.values, *upload_sources(sources, surface.device), visible],
-                   [as_packs(out, surface.device)], device=surface.device)
-    return out
-
-
-def require_rows(surface: Surface, sources: Sources, visible: wp.array) -> None:
-    """Refuse visibility of other pixels than a surface has, or without rows that samples of light ask for.
-
-    Raises:
-        ArrayError: naming what was got.
-    """
+        kind = pack_type(devices.pack_width(surface.device), wp.uint8)
+        visible = wp.empty((0, surface.packs), dtype=kind, device=surface.device)
     if sources.count and sources.occluder.max() >= visible.shape[0]:
         raise ArrayError(f"sources ask for row {sources.occluder.max()} of visibility, there are {visible.shape[0]}")
     if visible.shape[1] != surface.packs:
         raise ArrayError(f"visibility has {visible.shape[1]} packs, the surface {surface.packs}: give the same pixels")
+    return _shade(surface, upload_sources(sources, surface.device), visible, far=False)[0]
 
 
-def require_same(band: Band, surface: Surface, visible: wp.array, count: int) -> None:
-    """Refuse captured images and visibility of other pixels or fewer lights than a surface and its lights have.
-
-    Raises:
-        ArrayError: naming what was got.
-    """
-    band.require_channels(3)
-    if band.packs != surface.packs or visible.shape[1] != surface.packs or min(visible.shape[0], band.frame_count) < count:
-        raise ArrayError(f"band has {band.packs} packs of {band.frame_count} lights, the surface {surface.packs}, visibility is "
-                         f"{visible.shape}, directions are {count}: give the same pixels and lights")
+def shade_frames(surface: Surface, sources: SourcesOnDevice, visible: wp.array) -> wp.array:
+    """Return [frames, 6, pixels padded] float32, as `shade` does for far samples of each frame; `visible` must have the rows of all."""
+    return _shade(surface, sources, visible, far=True)
 
 
-def upload_captured(direction: np.ndarray, irradiance: np.ndarray, scale: np.ndarray, device: str) -> tuple[wp.array, wp.array]:
-    """Return what kernels need to compare captured images with a model under the same lights.
-
-    Args:
-        direction: [lights, 3] unit vectors to the captured lights.
-        irradiance: [lights, 3] of each.
-        scale: [lights or more] radiance of a stored 1.0.
-        device: where.
-
-    Returns:
-        On the device, [lights] vec4 places of far samples and [lights] vec3 factors from stored values to radiance / irradiance; 0 in
-        channels without irradiance.
-    """
-    count = len(direction)
-    place = np.concatenate([direction, np.zeros((count, 1))], axis=1)
-    factor = np.divide(scale[:count, None], irradiance, out=np.zeros((count, 3)), where=irradiance > 0)
-    return wp.array(place, dtype=wp.vec4, device=device), wp.array(factor, dtype=wp.vec3, device=device)
+def _shade(surface: Surface, sources: SourcesOnDevice, visible: wp.array, *, far: bool) -> wp.array:
+    pack, count = devices.pack_width(surface.device), len(sources.first) - 1
+    out = wp.empty((count, 6, surface.packs * pack), dtype=wp.float32, device=surface.device)
+    devices.launch(_shade_kernel(pack, far), count * surface.packs, [surface.values, *sources, visible], [as_packs(out, surface.device)],
+                   device=surface.device)
+    return out
 
 
 @cache
@@ -305,7 +281,7 @@ def visibility(pack: int) -> Any:
 
 
 @cache
-def _shade_kernel(pack: int) -> Any:
+def _shade_kernel(pack: int, far: bool) -> Any:
     lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
     evaluate, seen = lobes(pack), visibility(pack)
 
@@ -317,15 +293,21 @@ def _shade_kernel(pack: int) -> Any:
                      axis: wp.array(dtype=wp.vec4),  # [N]
                      occluder: wp.array(dtype=wp.vec3i),  # [N]
                      share: wp.array(dtype=wp.vec3),  # [N]
+                     begin: wp.array(dtype=wp.int32),  # [frames + 1]
                      visible: wp.array2d(dtype=byte_pack),  # [rows, P]
                      # outputs
-                     out: wp.array2d(dtype=lane_type)):  # [6, P]
-        p = first + wp.tid()
+                     out: wp.array3d(dtype=lane_type)):  # [frames, 6, P]
+        thread = first + wp.tid()
+        packs = values.shape[1]
+        f = thread / packs
+        p = thread % packs
         matt, glossy = channels(), channels()
-        for n in range(place.shape[0]):
-            facing, gloss, lit, _ = evaluate(values, p, place[n], axis[n])
+        for n in range(begin[f], begin[f + 1]):
+            facing, gloss, lit, _ = evaluate(values, p, place[n], wp.where(wp.static(far), wp.vec4(), axis[n]))
             rows = occluder[n]
-            if rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
+            if wp.static(far):
+                lit = seen(visible, p, rows, share[n])
+            elif rows[0] >= 0 or rows[1] >= 0 or rows[2] >= 0:
                 whole = seen(visible, p, rows, share[n])
                 for k in range(pack):
                     lit[k] = lit[k] * whole[k]
@@ -338,7 +320,7 @@ def _shade_kernel(pack: int) -> Any:
             albedo = values[3 + c, p]
             for k in range(pack):
                 matt[c, k] = albedo[k] * INVERSE_PI * matt[c, k]
-            out[c, p] = matt[c]
-            out[3 + c, p] = glossy[c]
+            out[f, c, p] = matt[c]
+            out[f, 3 + c, p] = glossy[c]
 
     return shade_kernel

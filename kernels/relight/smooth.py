@@ -1,29 +1,34 @@
-"""Smooth weighting: each sample of a lat-long map is shared by the three lights around it.
+"""Samples of a lat-long map are located among the triangles of the lights, for smooth weighting: each is shared by the three around it.
 
-The triangles are the spherical Delaunay triangles of the lights. A ray from the centre meets its triangle's plane in a point, and the
-shares are that point's barycentric coordinates: never negative, one in sum, the whole at a light, and the same from both sides of an
-edge. A sun that moves fades from light to light and never jumps, where cell weighting keeps it whole on one.
+A ray from the centre meets its triangle's plane in a point, and the shares are that point's barycentric coordinates: never negative, one in
+sum, the whole at a light, and the same from both sides of an edge. A sun that moves fades from light to light and never jumps, where cell
+weighting keeps it whole on one.
 
 Source: barycentric weights of a direction as in vector base amplitude panning, Pulkki, JAES 1997, here with sum one.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.relight.borders import Shares
-from kernels.relight.latlong import SampleGrid, check, first_of_equals
-from kernels.relight.triangulation import SphereTriangles, edge_planes, find_faces, triangulate_sphere
-from kernels.relight.turned_sums import LightEnergy, gather
+from kernels.relight.latlong import SampleGrid
 
 RUN = 64
 """Number of neighbouring samples that one thread locates: it seeks the triangle of the first over the whole sphere, and that of each other
 from the sample before."""
 BESIDE_RADIANS = 1e-6
 """A direction this many radians beyond an edge counts as on it, because float32 resolves no less; the search can then not go in circles."""
+
+
+class SphereTriangles(NamedTuple):
+    """Triangles that cover the sphere."""
+
+    vertex: np.ndarray  # [vertices, 3] the lights; middles of polygons, in their planes; unit vectors to the middles of holes
+    corner: np.ndarray  # [faces, 3] index of a vertex, counterclockwise seen from outside
+    neighbour: np.ndarray  # [faces, 3] the face beyond the edge that lies opposite to the corner
+    share: np.ndarray  # [vertices, lights] part of a vertex's energy that a light gets; rows sum to one
 
 
 class Located(NamedTuple):
@@ -33,59 +38,17 @@ class Located(NamedTuple):
     share: np.ndarray  # [samples, 3] float64 of each of its corners; sums to one
 
 
-def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, device: str) -> LightEnergy:
-    """Share a lat-long map out over the lights, each direction to the three around it, for several rotations of the map.
-
-    Args:
-        environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
-        directions: [lights, 3] unit vectors from the object to the lights (without padding).
-        rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
-        device: where the triangles are found; sums are taken on the host in float64.
+def edge_planes(triangles: SphereTriangles) -> tuple[np.ndarray, np.ndarray]:
+    """Return the planes through the centre and the edge opposite to each corner.
 
     Returns:
-        Energy of each light, and the integral of its share over the sphere; both sum to those of the whole map. Of lights in one
-        place the first gets all. Where lights are missing, energy goes to those around the hole (kernels.relight.triangulation).
-
-    Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, radiance that is negative or not finite (counted),
-            fewer than four lights in different places, or all of them in one plane.
+        inward: [faces, 3, 3] unit normals: a direction's sine of the angle from each edge is its product with them.
+        length: [faces, 3] what that sine is multiplied by to be the corner's coordinate, but for a common factor.
     """
-    directions, rotations = check(environment, directions, rotations)
-    kept = first_of_equals(directions)
-    triangles = triangulate_sphere(directions[kept])
-
-    def split(rotation: np.ndarray, band: SampleGrid) -> Iterator[Shares]:
-        face, share = locate(band, triangles, rotation, device=device)
-        for k in range(3):
-            yield Shares(slice(None), triangles.corner[face, k], share[:, k])
-
-    sums = gather(environment, rotations, len(triangles.vertex), split)
-    energy = np.zeros((len(rotations), len(directions), 3))
-    solid_angle = np.zeros((len(rotations), len(directions)))
-    energy[:, kept] = np.einsum("fvc,vl->flc", sums.energy, triangles.share)
-    solid_angle[:, kept] = sums.solid_angle @ triangles.share
-    return LightEnergy(energy, solid_angle)
-
-
-def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share the energy of a few samples out over the lights, each to the three around it; in NumPy, because they are too few for a launch.
-
-    Args:
-        samples: [n, 3] unit vectors to the samples.
-        energy: [n, channels] of each.
-        directions: [lights, 3] unit vectors to the lights, all in different places.
-
-    Returns:
-        [lights, channels] float64; its sum is that of the samples.
-
-    Raises:
-        ArrayError: fewer than four lights, or all of them in one plane.
-    """
-    triangles = triangulate_sphere(directions)
-    face, part = find_faces(triangles, samples)
-    corner = triangles.corner[face].reshape(-1)
-    return np.stack([np.bincount(corner, weights=(part * amount[:, None]).reshape(-1), minlength=len(triangles.vertex)) @ triangles.share
-                     for amount in energy.T], axis=1)
+    corners = triangles.vertex[triangles.corner]
+    plane = np.cross(np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1))
+    length = np.linalg.norm(plane, axis=2)
+    return plane / length[..., None], length
 
 
 def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *, device: str) -> Located:

@@ -44,9 +44,6 @@ def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
         rotations: [frames, 3, 3] of the map.
         lights: how many there are.
         split: (rotation, band) → which parts of the band's samples go where; the shares of a sample add up to one.
-
-    Returns:
-        Energy and solid angle of each light; both sum to those of the whole map.
     """
     energy, areas = np.zeros((len(rotations), lights, 3)), np.zeros((len(rotations), lights))
     for band in cut(*environment.shape[:2]).bands():

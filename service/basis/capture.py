@@ -114,11 +114,10 @@ def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings
     """Yield the bands of the stack on the device, without those that have no pixel inside the mask.
 
     Args:
-        source: the capture.
-        device: where.
+        source, device: the capture, and where.
         bytes_per_pixel: what the caller allocates beside the stack for each pixel.
-        timings: told of the bands as one stage of the work.
-        stage: the name of that stage.
+        timings: told of the bands as one `stage` of the work.
+        stage: its name.
     """
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))

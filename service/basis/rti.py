@@ -3,7 +3,7 @@
 Coefficients are fitted twice, once for their ranges and once to be stored, so that only bytes are kept of the whole image.
 
 Source: Malzbender, Gelb and Wolters, "Polynomial texture maps", SIGGRAPH 2001, section 3; Gautron et al., "A novel hemispherical basis for
-accurate and efficient rendering", Eurographics Symposium on Rendering 2004 (kernels.relight.hemisphere has the equations).
+accurate and efficient rendering", Eurographics Symposium on Rendering 2004 (kernels.relight.rti has the equations).
 """
 
 from pathlib import Path
@@ -13,11 +13,9 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.packs import Band
-from kernels.relight.display import encode
-from kernels.relight.hemisphere import HSH_TERMS, PTM_TERMS, biquadratic, fit_weights, hemispherical_harmonics
-from kernels.relight.luminance import WHITE, separate
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.residual import squared_residual
+from kernels.relight.basis import squared_residual
+from kernels.relight.combine import combine_batch
+from kernels.relight.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, encode, fit_weights, hemispherical_harmonics, separate
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings

@@ -7,9 +7,8 @@ matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis).
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.relight.basis import Basis, gram, principal, projection
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.residual import squared_residual
+from kernels.relight.basis import Basis, gram, principal, projection, squared_residual
+from kernels.relight.combine import combine_batch
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings

@@ -45,7 +45,7 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
 
         from kernels import device, packs
         from kernels.relight import cublas
-        from kernels.relight.one_frame import combine
+        from kernels.relight.combine import combine
 
         for name in [device.resolve(only)] if only else device.names():
             band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
@@ -72,7 +72,7 @@ def _wrong_products(device: str) -> list[str]:
 
     from kernels import packs
     from kernels.relight import cublas
-    from kernels.relight.many_frames import combine_batch
+    from kernels.relight.combine import combine_batch
 
     if cublas.product_of(device) is None:
         return []

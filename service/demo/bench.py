@@ -12,8 +12,7 @@ from kernels.photometric.albedo import fit_albedo
 from kernels.photometric.lambert import solve_lambert
 from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
 from kernels.photometric.robust import solve_robust
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.one_frame import combine
+from kernels.relight.combine import combine, combine_batch
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import BenchRequest
 from stage.colour import GREY_WEIGHTS
@@ -93,16 +92,16 @@ def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
 
 def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable[[], object]:
     """Return a launch of the combine kernel on a stack of one channel."""
-    from kernels.relight import one_frame as module
+    from kernels.relight import combine as module
 
     pack = devices.pack_width(device)
     out = packs.zeros(band.pixel_count, wp.float32, device, rows=1)
     on_device = wp.array(weights, dtype=wp.float32, device=device)
     if device == "cpu":
-        chunks = -(-band.packs // module.CHUNK)
-        return lambda: devices.launch(module.chunk_kernel(pack), chunks, [band.values, on_device, chunks],
+        chunks = -(-band.packs // module.FRAME_CHUNK)
+        return lambda: devices.launch(module.frame_chunk_kernel(pack), chunks, [band.values, on_device, chunks],
                                       [packs.as_packs(out, device)], device=device)
-    return lambda: devices.launch(module.register_kernel(pack), band.packs, [band.values, on_device],
+    return lambda: devices.launch(module.frame_register_kernel(pack), band.packs, [band.values, on_device],
                                   [packs.as_packs(out, device)], device=device)
 
 

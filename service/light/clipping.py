@@ -50,30 +50,20 @@ class Clipping(NamedTuple):
         return cls(level, sums, whole, any_clipped / max(int(inside.sum()), 1))
 
     def share(self, weights: np.ndarray) -> np.ndarray:
-        """Return the share of the light of frames that comes from clipped readings.
-
-        Args:
-            weights: [frames, 3, lights padded] of the stored images.
-
-        Returns:
-            [frames, 3], 0…1.
-        """
+        """Return [frames, 3] shares, 0…1, of the light of frames that come from clipped readings, by weights [frames, 3, lights padded]."""
         clipped = (np.abs(weights) * np.maximum(self.clipped, 0)).sum(axis=2)
         whole = (np.abs(weights) * np.maximum(self.whole, 0)).sum(axis=2)
         return np.divide(clipped, whole, out=np.zeros_like(clipped), where=whole > 0)
 
 
 def clipped_channels(values: np.ndarray, bits: np.ndarray, scale: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Return which channels of readings are clipped; the bits of a stack tell only that one of the three is.
+    """Return [3, lights padded, n] bool: which channels of readings are clipped; the bits of a stack tell only that one of the three is.
 
     Args:
         values: [3, lights padded, n] stored values.
         bits: [lights padded / 8, n] of the stack.
         scale: [lights padded] radiance of a stored 1.0.
         level: [lights padded] of Clipping.
-
-    Returns:
-        [3, lights padded, n] bool.
     """
     return _unpacked(bits) & (values.astype(np.float32) * scale[:, None] >= LEVEL_MARGIN * level[:, None])
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.one_frame import combine
+from kernels.relight.combine import combine, combine_batch
 from service.requests.relight import CHUNK_FRAMES
 from stage.exr_rows import BLOCK_ROWS
 from stage.stack import PIXEL_PAD, Stack
@@ -16,7 +15,6 @@ from stage.stack import PIXEL_PAD, Stack
 CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
-
 
 BLOCK_BYTES = 1280 << 20
 """Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
@@ -58,7 +56,7 @@ def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
 
 def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str,
                   pixels: slice | None = None) -> np.ndarray:
-    """Return the frames of one chunk.
+    """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
 
     Args:
         stack: the images.
@@ -68,9 +66,6 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
             faster product is used.
         device: where.
         pixels: of a block of rows; None: all.
-
-    Returns:
-        [frames, 3, pixels] float32 radiance in the stack's scene-linear space, unclipped.
     """
     channels, _, count = stack.shape
     begin, end, _ = (pixels or slice(None)).indices(count)

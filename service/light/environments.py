@@ -41,11 +41,9 @@ class Environments:
     """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
 
     def __init__(self, pattern: Path, *, clip_negative: bool = False) -> None:
-        """Keep the path of the maps.
+        """Keep the path of the maps, as it was given.
 
-        Args:
-            pattern: the path, as it was given.
-            clip_negative: True to set values to 0 that are negative beyond the noise of their map, which is refused otherwise.
+        With `clip_negative`, values that are negative beyond the noise of their map are set to 0; else such maps are refused.
 
         Raises:
             RequestError: several runs of #, or one in the folder.

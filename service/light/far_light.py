@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.around import lights_around
-from kernels.relight.discs import disc_samples
-from kernels.relight.sources import Sources, far, own_rows
+from kernels.relight.sources import Sources, disc_samples, far, own_rows
 from service.light.environments import SHARP_RADIUS_DEGREES, EnvironmentMap, Environments
 from service.light.schedule import Disc, ScheduledFrame
+from service.light.triangulation import lights_around
 from stage.colour import rgb_matrix
 
 
@@ -40,17 +39,11 @@ class FarSamples(NamedTuple):
         """Return all samples of one part or more, in order."""
         return FarSamples(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
-
 NO_SAMPLES = FarSamples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bool))
 
 
 def far_light(frame: ScheduledFrame, environments: Environments | None, space: str) -> FarLight:
-    """Return the environment and the discs of a frame in a working space.
-
-    Args:
-        frame: of a schedule.
-        environments: where its environment map is read from.
-        space: scene-linear.
+    """Return the environment and the discs of a frame in a scene-linear working space.
 
     Raises:
         ImageError: the map has impossible values (counted), or a colour space that is not known.

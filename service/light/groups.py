@@ -20,10 +20,6 @@ PREFIX = "light_"
 def group_names(has_environment: bool, keys: LightKeys | None) -> tuple[str, ...]:
     """Return the name of the layer of each light: letters, digits and underscores, each name once.
 
-    Args:
-        has_environment: whether an environment map lights the frames.
-        keys: the light keys, or None.
-
     Raises:
         RequestError: there are more than MOST_GROUPS.
     """
@@ -53,14 +49,10 @@ def in_groups(frame: ScheduledFrame, keys: LightKeys | None) -> tuple[ScheduledF
 
 
 def add_up(groups: Sequence[np.ndarray], whole: np.ndarray) -> None:
-    """Scale the pictures of lights, each alone, so that they add up to the picture of all at every pixel.
+    """Scale the pictures of lights, each alone [frames, 3, pixels] and changed in place, so that they add up to the whole at every pixel.
 
     A model of maps that corrects pictures does so less for their sum than for each of them; where they add up to nothing, the first takes
     what the whole holds.
-
-    Args:
-        groups: [frames, 3, pixels] float32 each, changed in place.
-        whole: [frames, 3, pixels] float32.
     """
     total = np.sum(groups, axis=0)
     scale = np.divide(whole, total, out=np.zeros_like(whole), where=np.abs(total) > np.finfo(np.float32).tiny)

@@ -18,8 +18,8 @@ import warp as wp
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.around import left_out
 from kernels.relight.beyond import compare_beyond, followed, inward_pairs, share_beyond
+from kernels.relight.captured import Captured
 from kernels.relight.gloss_ratio import sum_shown
 from kernels.relight.guide import compare_model, fit_trust, seen_lobes
 from kernels.relight.lobe_profile import MOMENTS, fit_profile, profile_moments
@@ -28,12 +28,11 @@ from kernels.relight.shading import shade
 from kernels.relight.sources import Sources
 from service.light.clipping import Clipping, clipped_channels
 from service.light.far_light import captured_lights
-from service.light.lit_model import LitBeyond, LitModel, correction
-from service.light.model_light import ModelLight
-from service.light.model_range import ModelRange
-from service.light.near_light import NearLights
+from service.light.model_light import ModelLight, NearLights
+from service.light.model_range import LitBeyond, LitModel, ModelRange, correction
 from service.light.range_light import RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
+from service.light.triangulation import left_out, triangles_between
 from service.reporting.progress import Timings
 from service.reporting.provenance import other_inputs
 from stage.errors import ResultError
@@ -58,8 +57,7 @@ class Guide:
         Args:
             maps: of the capture, in its working space.
             where: their file, for messages.
-            stack: the captured images.
-            lights: the captured lights.
+            stack, lights: the captured images and lights.
             clipping: of the captured images.
             space: the scene-linear space of the stack.
             device: where.
@@ -85,11 +83,9 @@ class Guide:
         self._seen: dict[int, wp.array] = {}
         if progress is not None:
             progress.stage("guide", len(self._model.pixels))
-        given = lights.direction, lights.irradiance, stack.scale
-        moments = self._sums(MOMENTS, lambda band, batch: profile_moments(band, batch.surface, self._visible(batch), *given), None)
+        moments = self._sums(MOMENTS, profile_moments, None)
         self._model.profile = fit_profile(moments, self._model.pixels, maps.mask.shape)
-        self.trust = self._fit(lambda band, batch: compare_model(band, batch.surface, self._visible(batch), *given, neighbours, shares),
-                               progress)
+        self.trust = self._fit(partial(compare_model, neighbours=neighbours, shares=shares), progress)
         """[n] β of the model's pixels between the captured lights, 0…1."""
         self.stack = self._unclipped(clipping.level)
         """The captured images, with clipped readings as bright as the model has them."""
@@ -97,25 +93,30 @@ class Guide:
     @cached_property
     def trust_beyond(self) -> np.ndarray:
         """Return [n] β of the model's pixels for light from beyond the captured lights, 0…1."""
-        lights, stack = self._lights, self._stack
-        pairs = inward_pairs(lights.direction)
-        return self._fit(lambda band, batch: compare_beyond(band, batch.surface, self._visible(batch), lights.direction, lights.irradiance,
-                                                            stack.scale, pairs), None)
+        return self._fit(partial(compare_beyond, pairs=inward_pairs(self._lights.direction)), None)
 
-    def _fit(self, compare: Callable[[packs.Band, ModelBatch], wp.array], progress: Timings | None) -> np.ndarray:
+    def _fit(self, compare: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
         """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
         return fit_trust(self._sums(2, compare, progress), self._model.pixels, self._model.maps.mask.shape)
 
-    def _sums(self, rows: int, take: Callable[[packs.Band, ModelBatch], wp.array], progress: Timings | None) -> np.ndarray:
+    def _sums(self, rows: int, take: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
         """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch."""
         sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
-            taken = take(packs.upload(*self._stack.pick(batch.pixels), device=self._model.device), batch)
+            taken = take(self._captured(batch, self._stack, self._upload(batch, self._stack), self._visible(batch)))
             sums[:, done : done + len(batch.pixels)] = taken.numpy()[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
         return sums
+
+    def _captured(self, batch: ModelBatch, stack: Stack, band: packs.Band, visible: wp.array) -> Captured:
+        """Return the captured images of a batch, from a stack, beside the model."""
+        return Captured.of(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, stack.scale)
+
+    def _upload(self, batch: ModelBatch, stack: Stack) -> packs.Band:
+        """Return the images of a batch on the device."""
+        return packs.upload(*stack.pick(batch.pixels), device=self._model.device)
 
     def _unclipped(self, level: np.ndarray) -> Stack:
         """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
@@ -148,17 +149,14 @@ class Guide:
         Args:
             frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
             lights: the light of each frame.
-            specular: whether the specular part is wanted too.
-
-        Returns:
-            [frames, 3, pixels] float32 of that part, between 0 and the frame, or None.
+            specular: whether [frames, 3, pixels] float32 of that part, between 0 and the frame, is returned.
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         done = 0
         for batch in self._model.batches():
             part = slice(done, done + len(batch.pixels))
             done = part.stop
-            band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
+            band = self._upload(batch, self.stack)
             for index, light in enumerate(lights):
                 frame, mirror = frames[index : index + 1], None if mirrored is None else mirrored[index : index + 1]
                 self._add(frame, mirror, batch.pixels, part, self._lit(batch, band, light))
@@ -169,13 +167,8 @@ class Guide:
         """Add to the plain frames of a chunk what the model says they miss; what they have in common is computed once.
 
         Args:
-            frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
-            lights: the light of each frame.
+            frames, lights, specular: as for `correct`.
             places: position of each frame in the full chunk, also when only some of its frames are made.
-            specular: whether the specular part is wanted too.
-
-        Returns:
-            [frames, 3, pixels] float32 of that part, between 0 and the frame, or None.
         """
         mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
         chunk = self._range.chunk(lights, places)
@@ -183,7 +176,7 @@ class Guide:
             _ = self.trust_beyond  # before several threads ask for it
         done = 0
         for batch in self._model.batches():
-            band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
+            band = self._upload(batch, self.stack)
 
             def use(at: slice, lit: LitModel, batch: ModelBatch = batch, done: int = done) -> None:
                 self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
@@ -209,7 +202,7 @@ class Guide:
             return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
 
         wanted = lit(light.wanted)
-        given = sum_shown(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, self.stack.scale, light.captured)
+        given = sum_shown(self._captured(batch, self.stack, band, visible), light.captured)
         beyond = None
         if light.beyond is not None:
             outside = lit(light.beyond.wanted)
@@ -257,8 +250,8 @@ class Guide:
         """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
         count = len(batch.pixels)
         wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
-        band = packs.upload(*self.stack.pick(batch.pixels), device=self._model.device)
-        summed = sum_near(band, batch.surface, visible, coarse, self._lights.direction, self._lights.irradiance, self.stack.scale)
+        captured = self._captured(batch, self.stack, self._upload(batch, self.stack), visible)
+        summed = sum_near(captured, coarse, triangles_between(self._lights.direction))
         pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
         return wanted, pictures, told
 

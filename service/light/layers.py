@@ -28,7 +28,6 @@ class Content(NamedTuple):
     dtype: type[np.floating[Any]] = np.float16
     is_colour: bool = False
 
-
 STILL = {
     Layer.MASK: Content("mask", "Y", "mask"),
     Layer.NORMAL: Content("normal", "XYZ", "normal"),
@@ -118,17 +117,13 @@ def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
 
 def still_layers(layers: Collection[Layer], capture: Capture | None, maps: SurfaceMaps | None, where: Path | None,
                  space: str) -> tuple[StillLayer, ...]:
-    """Return the layers that every frame of a capture shares.
+    """Return the layers that every frame of a capture shares, in the order of STILL; pixels that are not solved are 0.
 
     Args:
         layers: the wanted layers; those that depend on the light are passed over.
         capture: gives the mask where there are no maps.
-        maps: solved maps, or None.
-        where: the file of the maps, for messages.
+        maps, where: solved maps and their file, or None.
         space: the scene-linear colour space of the frames.
-
-    Returns:
-        The layers in the order of STILL; pixels that are not solved are 0.
 
     Raises:
         ResultError: the maps lack a layer.

@@ -1,7 +1,7 @@
 """What lights a frame, computed once from its schedule: weights of the captured images, and the same light for a model of the surface.
 
 `far_light` reads the environment, turns it and takes discs into the working space. From its result come the weights of the captured
-images (kernels.relight.environment, after Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.3)
+images (service.light.weighting, after Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.3)
 and the light that a model of the surface is shaded with: samples for one frame, and energy over a fixed grid of directions for a range.
 """
 
@@ -13,13 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.beyond import reach, share_beyond
-from kernels.relight.discs import integrate_discs
-from kernels.relight.environment import Weighting, integrate, light_weights
 from service.light.environments import Environments
 from service.light.far_light import FarLight, far_light, far_samples
 from service.light.model_light import CapturedEnergy, ModelLight, model_light
 from service.light.range_light import RangeLight, RangeLighting
 from service.light.schedule import ScheduledFrame
+from service.light.weighting import Weighting, integrate, integrate_discs, light_weights
 from stage.point_lights import DistantLights
 from stage.stack import Stack
 
@@ -58,8 +57,7 @@ class CaptureLighting:
         """Keep what the frames of the capture have in common.
 
         Args:
-            lights: the captured lights.
-            stack: the captured images.
+            lights, stack: the captured lights and images.
             environments: where the environment maps of frames are read from.
             space: the scene-linear space of the stack.
             weighting: how light from between the captured lights is shared out over them.

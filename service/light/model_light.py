@@ -1,19 +1,26 @@
-"""The light of one frame as samples, for a model of the surface that is shaded with each of them."""
+"""The light of one frame, and near lights, as samples for a model of the surface that is shaded with each of them."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.environment import Weighting
-from kernels.relight.marching import grouped
-from kernels.relight.sample_energy import share_samples
-from kernels.relight.sources import Sources
+from kernels.relight import sources
+from kernels.relight.sources import Sources, far, grouped, join
 from service.light.far_light import FarSamples, captured_lights, hidden_as_captured
+from service.light.weighting import Weighting, share_samples
+from service.requests.shade import PointLight, RectangleLight, SphereLight
 
 FAR_MARCHES = 24
 """Most directions in which shadows are marched for one frame: for a sun of 3°, its penumbra has steps of 4 %."""
 FAR_REACH_DEGREES = 2.0
 """Largest angle between a sample and the direction that is marched for it."""
+NEAR_MARCHES = 48
+"""Number of places on an area light to which shadows are marched: its penumbra has steps of 2 %."""
+ANYWHERE = 1e30
+"""Reach beyond every scene: each sample of an area light takes the nearest marched place."""
+
+NearLight = PointLight | SphereLight | RectangleLight
 
 
 class CapturedEnergy(NamedTuple):
@@ -82,9 +89,40 @@ def light_samples(samples: FarSamples, directions: np.ndarray) -> tuple[Sources,
 
     Returns:
         The samples, and [groups, 4] directions of the rows of visibility that follow.
-
-    Raises:
-        ArrayError: fewer than four directions, or all in one plane.
     """
     return grouped(hidden_as_captured(samples, directions), samples.sharp, len(directions), most=FAR_MARCHES,
                    reach=np.radians(FAR_REACH_DEGREES))
+
+
+class NearLights(NamedTuple):
+    """Near lights as samples."""
+
+    fine: Sources
+    """Samples for a model of the surface, with rows of visibility."""
+    coarse: Sources
+    """Fewer samples, for sums of captured images."""
+    marched: np.ndarray  # [rows, 4] places of the rows of visibility
+
+
+def near_lights(lights: Sequence[NearLight], first_row: int) -> NearLights:
+    """Return near lights of the camera frame as samples, whose rows of visibility begin at `first_row`."""
+    nothing = far(np.zeros((0, 3)), np.zeros((0, 3)))
+    fine, coarse, marched = [nothing], [nothing], [np.zeros((0, 4), np.float32)]
+    for light in lights:
+        all_samples = _near_samples(light)
+        samples, places = grouped(all_samples, np.ones(all_samples.count, dtype=bool), first_row, most=NEAR_MARCHES, reach=ANYWHERE)
+        first_row += len(places)
+        fine.append(samples)
+        coarse.append(_near_samples(light, sources.FEW))
+        marched.append(places)
+    return NearLights(join(fine), join(coarse), np.concatenate(marched))
+
+
+def _near_samples(light: NearLight, count: int | None = None) -> Sources:
+    if isinstance(light, SphereLight):
+        return sources.sphere(np.array(light.center_m), light.radius_m, np.array(light.radiance), count or sources.SPHERE_SAMPLES)
+    if isinstance(light, RectangleLight):
+        return sources.rectangle(np.array(light.center_m), np.array(light.edge_u_m), np.array(light.edge_v_m), np.array(light.radiance),
+                                 count or sources.RECTANGLE_SAMPLES)
+    axis = None if light.axis is None else np.array(light.axis) / np.linalg.norm(light.axis)
+    return sources.point(np.array(light.position_m), np.array(light.intensity), axis, light.anisotropy)

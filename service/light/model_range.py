@@ -13,16 +13,16 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import Band
+from kernels.relight.beyond import followed
+from kernels.relight.captured import Captured
+from kernels.relight.combine import combine_rows
 from kernels.relight.direction_grid import direction_grid
 from kernels.relight.gloss_ratio import ratio_of_sums
 from kernels.relight.horizon import Horizons, see_above
-from kernels.relight.many_frames import combine_rows
 from kernels.relight.responses import Responses, empty_responses, respond, shown_gloss
-from kernels.relight.shading import Surface, upload_sources
-from kernels.relight.small_lights import FrameSources, shade_frames, upload_frames
+from kernels.relight.shading import SourcesOnDevice, Surface, shade_frames, upload_sources
 from kernels.relight.sources import far, join, own_rows
 from service.light.far_light import FarSamples, captured_lights, hidden_as_captured
-from service.light.lit_model import LitBeyond, LitModel
 from service.light.range_light import RangeBeyond, RangeLight
 from service.light.surface_model import ModelBatch, SurfaceModel
 from stage.point_lights import DistantLights
@@ -35,6 +35,26 @@ ROUNDING = 1e-4
 """A direction whose cosine to every normal of a portion is below minus this lights none of its pixels, in float32 neither."""
 
 NO_SOURCES = far(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+class LitModel(NamedTuple):
+    """The model of some pixels under the light of one frame or of several ([frames, 3, n] in place of [3, n])."""
+
+    matt: np.ndarray  # [3, n] diffuse part under the light between the captured lights
+    gloss: np.ndarray  # [3, n] specular part under it
+    whole: np.ndarray  # [3, n] what the weighted sum of images contains for it, with gloss as bright as the images show it
+    ratio: np.ndarray  # [3, n] of image to model that the gloss has there (kernels.relight.gloss_ratio)
+    added: "np.ndarray | None"  # [2, 3, n] diffuse and specular part of the captured images that the frame adds
+    beyond: "LitBeyond | None"
+    """Under the light from beyond the captured lights; None: there is none."""
+
+
+class LitBeyond(NamedTuple):
+    """The model under the light from beyond the captured lights."""
+
+    whole: np.ndarray  # [3, n]
+    gloss: np.ndarray  # [3, n] the specular part of it
+    captured: np.ndarray  # [3, n] under what stands in for it in the weighted sum of images
 
 
 class FrameEnergy(NamedTuple):
@@ -72,7 +92,7 @@ class SmallLights(NamedTuple):
 
     frames: slice
     """The place of these frames in all that are made."""
-    sources: FrameSources
+    sources: SourcesOnDevice
     direction: np.ndarray  # [n, 3] of the samples of all these frames
 
 
@@ -91,7 +111,7 @@ class ChunkBeyond(NamedTuple):
 
     broad: FrameEnergy
     captured: FrameEnergy
-    small: FrameSources
+    small: SourcesOnDevice
 
 
 class Portion(NamedTuple):
@@ -126,18 +146,13 @@ class ModelRange:
         self._captured = upload_sources(captured_lights(lights.direction, lights.irradiance), model.device)
 
     def chunk(self, lights: Sequence[RangeLight], places: Sequence[int]) -> ChunkLight:
-        """Put the light of frames on the device.
-
-        Args:
-            lights: of each frame.
-            places: position of each frame in the full chunk.
-        """
+        """Put the light of frames on the device; `places` are the positions of the frames in the full chunk."""
         nothing = np.zeros_like(lights[0].captured)
         added = [nothing if each.added is None else each.added for each in lights]
         beyond = None
         if any(each.beyond is not None for each in lights):
             parts = [each.beyond or RangeBeyond(NO_SOURCES, np.zeros_like(each.broad), nothing) for each in lights]
-            small = upload_frames(join([each.small for each in parts]), [each.small.count for each in parts], self._model.device)
+            small = upload_sources(join([each.small for each in parts]), self._model.device, [each.small.count for each in parts])
             beyond = ChunkBeyond(FrameEnergy.of([each.broad for each in parts], places),
                                  FrameEnergy.of([each.captured for each in parts], places), small)
         has_added = any(each.added is not None for each in lights)
@@ -151,7 +166,7 @@ class ModelRange:
         for _, members in groupby(places, key=lambda place: place // HORIZON_FRAMES):
             frames = slice(done, done + len(list(members)))
             samples = own_rows(join([each.small for each in lights[frames]]))
-            sources = upload_frames(samples, [each.small.count for each in lights[frames]], self._model.device)
+            sources = upload_sources(samples, self._model.device, [each.small.count for each in lights[frames]])
             yield SmallLights(frames, sources, samples.place[:, :3])
             done = frames.stop
 
@@ -160,8 +175,7 @@ class ModelRange:
         """Light the model for frames, portion by portion of a batch; on the CPU every thread lights portions of its own.
 
         Args:
-            batch: pixels.
-            band: captured images of the same pixels.
+            batch, band: pixels, and their captured images.
             scale: [lights padded] radiance of a stored 1.0.
             visible: [lights, P] of the captured lights.
             light: of the frames.
@@ -206,21 +220,37 @@ class ModelRange:
                           self._model.normals(batch.pixels[pixels]), self._model.albedo(batch.pixels[pixels]))
 
     def _lit(self, portion: Portion, grid_room: Responses, captured_room: Responses, scale: np.ndarray, light: ChunkLight) -> LitModel:
-        """Return the model of a portion under the light of frames.
-
-        Args:
-            portion: the pixels.
-            grid_room, captured_room: memory for the responses to the directions of the grid and of the captured lights.
-            scale: [lights padded] radiance of a stored 1.0.
-            light: of the frames.
-        """
+        """Return the model of a portion under the light of frames, with memory for its responses to the grid and to the captured lights."""
         facing = np.flatnonzero((self._towards @ portion.normal.T).max(axis=1) > -ROUNDING)  # the responses to all others are 0
         grid = grid_room.room(len(facing), portion.surface.packs)
         captured = captured_room.room(len(self._captured.place), portion.surface.packs)
         respond(portion.surface, upload_sources(self._grid.taken(facing), self._model.device), portion.visible, grid)
         respond(portion.surface, self._captured, portion.visible, captured)
-        shown = shown_gloss(portion.band, portion.surface, captured, self._lights.direction, self._lights.irradiance, scale)
+        images = Captured.of(portion.band, portion.surface, portion.visible, self._lights.direction, self._lights.irradiance, scale)
+        shown = shown_gloss(images, captured)
         return _summed(portion, grid, facing, captured, shown, light)
+
+
+def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is added to frames, and the model's specular part of their light.
+
+    Args:
+        model: under their light.
+        plain: [3, n] or [frames, 3, n] sums of captured images.
+        trust: [n] β between the captured lights.
+        trust_beyond: [n] β beyond them; not None where the model has such light.
+    """
+    mirror = model.gloss * model.ratio
+    change = trust * (model.matt + mirror - model.whole)
+    added = None if model.added is None else model.added.sum(axis=-3)
+    if model.beyond is not None and trust_beyond is not None:
+        beyond = model.beyond
+        whole = beyond.captured + np.maximum(model.whole, 0)
+        change = change + trust_beyond * followed(beyond.whole - beyond.captured, plain, whole if added is None else whole + added)
+        mirror = mirror + beyond.gloss
+    if model.added is not None:
+        mirror = mirror + model.added[..., 1, :, :]
+    return change, mirror
 
 
 def _summed(portion: Portion, grid: Responses, facing: np.ndarray, captured: Responses, shown: wp.array, light: ChunkLight) -> LitModel:

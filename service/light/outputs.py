@@ -59,10 +59,6 @@ def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -
     Args:
         outputs: (option as it was given, file) of every file that will be written.
         inputs: every file that will be read.
-
-    Raises:
-        RequestError: names the first input or result that would be replaced.
-        StorageError: names the first file whose folder cannot be written to; nothing is made.
     """
     written: dict[Path, tuple[str, Path]] = {}
     for option, path in outputs:
@@ -94,9 +90,6 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
         frames: what lights each.
         environments: the maps that the frames name.
         rate: frames per second.
-
-    Raises:
-        StorageError: a map cannot be read.
     """
     mask = opened.capture.manifest.mask
     scene = _hash(

@@ -11,12 +11,10 @@ import numpy as np
 
 from kernels.relight.beyond import share_beyond
 from kernels.relight.direction_grid import direction_grid, spread
-from kernels.relight.discs import disc_samples
-from kernels.relight.environment import Weighting
-from kernels.relight.sample_energy import share_samples
-from kernels.relight.sources import Sources, far
+from kernels.relight.sources import Sources, disc_samples, far
 from service.light.far_light import NO_SAMPLES, FarLight, FarSamples, disc_light, hidden_as_captured
 from service.light.model_light import CapturedEnergy, weighting_beyond
+from service.light.weighting import Weighting, share_samples
 
 SMALL_DISC_DEGREES = 20.0
 """Largest diameter of a disc that casts shadows of its own; the visibility of larger ones is interpolated from the captured lights."""

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.relight.environment import Weighting
 from service.light.attributes import time_attributes
 from service.light.clipping import Clipping
 from service.light.combine import chunk_frames, linear_frames, row_blocks
@@ -25,6 +24,7 @@ from service.light.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.light.plan import Plan, PlannedFrame, make_plan
 from service.light.sequence import OpenedCapture, open_capture
 from service.light.sheet import contact_sheet
+from service.light.weighting import Weighting
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report

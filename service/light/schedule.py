@@ -62,13 +62,7 @@ class ScheduledFrame(NamedTuple):
 
 def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | None,
              environments: Environments | None) -> list[ScheduledFrame]:
-    """Return what lights each frame of a range.
-
-    Args:
-        request: with spin and exposure.
-        numbers: of the frames.
-        keys: the content of `request.keys`.
-        environments: the environment maps of `request.environment`.
+    """Return what lights each of the numbered frames of a range, by the content of `request.keys` and the maps of `request.environment`.
 
     Raises:
         RequestError: nothing lights the frames, or two options turn the environment, or keys turn one that is not there.

@@ -33,13 +33,9 @@ class OpenedCapture(NamedTuple):
 
 
 def open_capture(folder: Path, request: RelightRequest, captures: int, frames: Sequence[ScheduledFrame]) -> OpenedCapture:
-    """Open the capture of a time step; no image is read.
+    """Open the capture of a time step, from which frames will be made; no image is read.
 
-    Args:
-        folder: of the capture.
-        request: the whole request.
-        captures: how many there are; the caches and maps of several lie in folders named as theirs.
-        frames: that are made from this capture.
+    The caches and maps of several `captures` lie in folders named as theirs.
 
     Raises:
         StageError: bad input; names file and field.

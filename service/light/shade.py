@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.relight.environment import Weighting
 from kernels.relight.shading import shade as shade_surface
 from kernels.relight.sources import join
 from service.errors import RequestError
@@ -22,12 +21,12 @@ from service.light.findings import FrameFindings
 from service.light.guide import Guide
 from service.light.layers import check_layers, frame_matte, hard_matte, read_maps, still_layers
 from service.light.lighting import CaptureLighting, ModelUse
-from service.light.model_light import light_samples
-from service.light.near_light import NearLight, near_lights
+from service.light.model_light import NearLight, light_samples, near_lights
 from service.light.outputs import check_outputs
 from service.light.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.light.surface_model import SurfaceModel
 from service.light.time_steps import capture_files
+from service.light.weighting import Weighting
 from service.light.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata

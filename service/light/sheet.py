@@ -27,11 +27,7 @@ DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
 
 
 def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
-    """Write a contact sheet: the frames at the exposure that they were made with.
-
-    Args:
-        path: the PNG.
-        frames: EXR files, in order.
+    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with.
 
     Raises:
         StorageError: the sheet cannot be written, or a frame cannot be read.
@@ -48,12 +44,7 @@ def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
 
 
 def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:
-    """Write pictures with titles, row by row, as one PNG.
-
-    Args:
-        path: the PNG.
-        rows: (title, [rows, cols, 3] display values 0…1) of each picture.
-        height: that each picture is scaled to, pixels.
+    """Write (title, [rows, cols, 3] display values 0…1) of pictures, each scaled to a height in pixels, row by row as one PNG.
 
     Raises:
         StorageError: the picture cannot be written.
@@ -77,14 +68,9 @@ def read_frame(path: Path) -> tuple[np.ndarray, str]:
 
 
 def display(pixels: np.ndarray, space: str) -> np.ndarray:
-    """Return display values of scene-linear ones, through OpenColorIO's ACES view.
+    """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through OpenColorIO's ACES view.
 
-    Args:
-        pixels: [rows, cols, 3] radiance.
-        space: its scene-linear colour space.
-
-    Returns:
-        [rows, cols, 3] float32, 0…1; black becomes the background of a sheet.
+    Black becomes the background of a sheet.
     """
     lit = pixels.any(axis=-1)
     shown = np.empty(pixels.shape, dtype=np.float32)

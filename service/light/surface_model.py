@@ -23,7 +23,6 @@ from stage.maps import LOBES, SurfaceMaps
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
 
-
 NORMAL_CELLS = 32
 """Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
 
@@ -48,9 +47,6 @@ class SurfaceModel:
             device: where.
             chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
             by_normal: True to make pixels of like normals neighbours within each batch; else pixels ascend.
-
-        Raises:
-            ResultError: a layer is not there, or none of the pixels is solved.
         """
         for name in ("normal", "diffuse_albedo", "height"):
             if getattr(maps, name) is None:

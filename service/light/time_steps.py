@@ -16,13 +16,10 @@ SHARED = {"camera.resolution": "resolution", "color_space": "colour space"}
 
 
 def time_steps(path: Path) -> list[Path]:
-    """Return the capture folders that frames are made from.
+    """Return the captures that frames are made from, in the order of the file, else of name; the path alone where it is no sequence.
 
     Args:
         path: a capture, or a sequence: a sequence.json, its folder, or a folder without capture.json whose sub-folders have one.
-
-    Returns:
-        The captures in the order of the file, else in order of name; the path alone where it is no sequence.
 
     Raises:
         RequestError: two captures differ in resolution or colour space.

@@ -27,7 +27,6 @@ from stage.matte import Matte
 COMPRESSIONS = {FrameCompression.ZIP: exr.Compression.ZIP, FrameCompression.PIZ: exr.Compression.PIZ,
                 FrameCompression.DWAA: exr.Compression.DWAA}
 
-
 BEAUTY_PART = "rgba"
 """The name of the part that holds the picture, as Nuke calls it."""
 ALPHA = "A"
@@ -129,9 +128,8 @@ class FrameWriter:
         """Wait until the chunk before is written, then begin to write this one.
 
         Args:
-            files: one for each frame.
+            files, form: the files of the frames, and the format of all.
             frames: [frames, 3, pixels] float32 radiance; the writer may change it.
-            form: the format of these frames.
             colours: further layers of radiance by name, each [frames, 3, pixels] float32, which the writer may change; where `form` has
                 parts, `specular` is among them.
 
@@ -148,10 +146,6 @@ class FrameWriter:
 
         The function gets the first row and the one behind the last, the frames [frames, 3, pixels] and further layers as `put` does. It
         waits until the block before is written, then begins to write this one.
-
-        Args:
-            files: one for each frame.
-            form: the format of these frames.
 
         Raises:
             StorageError: a frame cannot be written; none of this chunk is left behind.

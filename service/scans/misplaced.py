@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.fusion.compare import compare_views
+from kernels.fusion.residuals import compare_views
 from kernels.fusion.views import upload_views
 from service.scans.range_images import PreparedScan
 from service.scans.surface import world_points

@@ -18,12 +18,9 @@ class DepthJoiner:
     _track: Track | None = None
 
     def join(self, alone: DepthMaps) -> tuple[DepthMaps, dict[str, Any]]:
-        """Return the depth of a step joined with those before, and what the report says.
+        """Return the depth of a step, of which `alone` was found, joined with those before, and what the report says.
 
         The joined depth has no decoded projector coordinates, which are those of one step.
-
-        Args:
-            alone: of the step alone.
         """
         sigma = np.zeros_like(alone.depth) if alone.sigma is None else alone.sigma.astype(np.float32)
         valid = alone.mask & (sigma > 0)  # a depth whose deviation is not known agrees with nothing
@@ -54,13 +51,7 @@ class DepthJoiner:
 
 
 def moved_points(cloud: PointCloud, alone: DepthMaps, joined: DepthMaps) -> PointCloud:
-    """Return the points of a step, moved along their lines of sight to the joined depth of their pixels.
-
-    Args:
-        cloud: of the step alone.
-        alone: its depth.
-        joined: the depth that it becomes.
-    """
+    """Return the points of a step, moved along their lines of sight from its own depth to the joined depth of their pixels."""
     camera = alone.camera
     cols, rows = (np.floor(place).astype(np.int64) for place in camera.image_coordinates(cloud.points))
     inside = (rows >= 0) & (rows < camera.height) & (cols >= 0) & (cols < camera.width)

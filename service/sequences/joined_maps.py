@@ -39,15 +39,11 @@ class MapsJoiner:
     _others: dict[str, Track] = field(default_factory=dict)
 
     def join(self, alone: SurfaceMaps) -> tuple[SurfaceMaps, dict[str, Any]]:
-        """Return the maps of a step joined with those before, and what the report says.
-
-        Args:
-            alone: of the step alone.
-        """
+        """Return the maps of a step, of which `alone` was found, joined with those before, and what the report says."""
         assert alone.normal is not None and alone.sigma is not None
         sigma = np.radians(alone.sigma.astype(np.float32))
         if self._before is None or self._normal is None:
-            self._begin(alone, sigma, np.ones_like(sigma), {})
+            self._begin(alone, sigma, np.ones_like(sigma))
             self._before = alone
             return alone, {"joined_pixels": 0, "steps_joined": {"median": 1.0, "most": 1}}
         before = self._before
@@ -56,7 +52,7 @@ class MapsJoiner:
         declared = sigma**2 + np.radians(before.sigma.astype(np.float32)) ** 2
         share = noise_share(alone.normal - before.normal, declared, both, 2)
         if (self._normal.count[both] == 1).all():  # only now is known how much of the first step is noise
-            self._begin(before, np.radians(before.sigma.astype(np.float32)), share, {})
+            self._begin(before, np.radians(before.sigma.astype(np.float32)), share)
         new = begin(alone.normal, sigma, share, alone.mask)
         rest = agree(new.mean - self._normal.mean, new.noise + self._normal.noise, both, 2)
         gain = self._gain_of(alone, rest)
@@ -87,7 +83,7 @@ class MapsJoiner:
             "noise_share": {"normal": _middle(share, both), **shares}, "brightness": round(gain, 5),
             **({} if offset is None else {"height_offset": float(f"{offset:.6g}")})}
 
-    def _begin(self, maps: SurfaceMaps, sigma: np.ndarray, share: np.ndarray, shares: dict[str, float]) -> None:
+    def _begin(self, maps: SurfaceMaps, sigma: np.ndarray, share: np.ndarray) -> None:
         assert maps.normal is not None
         self._normal = begin(maps.normal, sigma, share, maps.mask)
         if maps.diffuse_albedo is not None:
@@ -145,9 +141,7 @@ class MapsJoiner:
 
     def _height_of(self, alone: SurfaceMaps, rest: np.ndarray) -> tuple[np.ndarray | None, float | None]:
         """Return the height, joined with that of the steps before; under distant lights in the place of the part at rest."""
-        if alone.height is None or self._height is None:
-            return None, None
-        if not self.anchored:
+        if alone.height is None or self._height is None or not self.anchored:
             return None, None
         offset = float(np.median(alone.height[rest] - self._height.mean[rest][:, 0])) if rest.any() else 0.0
         height = np.where(alone.mask, alone.height - offset, 0)

@@ -41,12 +41,9 @@ def request_of_step(request: AnyRequest, step: TimeStep) -> AnyRequest:
 
 def solve_alone(request: SolveRequest, step: TimeStep, progress: Progress, lights: LightsOverTime,
                 sharing: SharedSolve | None = None) -> tuple[SolveRequest, bool]:
-    """Solve one step unless it is done.
+    """Solve one step of a sequence unless it is done.
 
     Args:
-        request: of the sequence.
-        step: the step.
-        progress: of the step.
         lights: what the steps before have found; takes what this one finds.
         sharing: the part of this process where several share the solve.
 
@@ -77,16 +74,9 @@ def depth_alone(request: DepthRequest, step: TimeStep, progress: Progress) -> tu
 
 
 def solve_number(request: SolveRequest, number: int, progress: Progress, sharing: SharedSolve | None = None) -> None:
-    """Solve one step alone, for a caller who does the steps one by one, and then calls solve_sequence.
+    """Solve one step alone, by its number from 1, for a caller who does the steps in order, and then calls solve_sequence.
 
-    Args:
-        request: of the sequence.
-        number: of the step, from 1; the steps before it are done.
-        progress: told of every stage.
-        sharing: the part of this process where several share the solve.
-
-    Raises:
-        as solve_sequence.
+    `sharing` is the part of this process where several share the solve. Errors are those of solve_sequence.
     """
     sequence = _checked(request, number)
     lights = _lights_before(request, sequence, number)

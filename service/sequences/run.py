@@ -28,7 +28,6 @@ FIGURES = re.compile(r"\d[\d.]*")
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
 """What the report says of a sequence without a file."""
 
-
 OF_LIGHTS = ("found", "suspect_lights")
 """What the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
 
@@ -88,14 +87,10 @@ def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> S
 
 
 def depth_sequence(request: DepthRequest, progress: Progress | None = None) -> SequenceResult:
-    """Measure the depth of every capture of a sequence, and join what agrees from step to step.
-
-    Args:
-        request: as for solve_sequence.
-        progress: told of every stage of every step.
+    """Measure the depth of every capture of a sequence, and join what agrees from step to step; as solve_sequence.
 
     Raises:
-        as solve_sequence; ResultError: a step is decoded and cannot be triangulated.
+        ResultError: a step is decoded and cannot be triangulated.
     """
     sequence, _ = _open(request)
     joiner = DepthJoiner()

@@ -77,12 +77,7 @@ def capture_digest(folder: Path, request: Request, shared: object) -> str:
 
 
 def done(folder: Path, content: str) -> dict[str, Any] | None:
-    """Return what a step that is done has left for others, or None where it is not done, or not from this content.
-
-    Args:
-        folder: of its result.
-        content: of capture_digest.
-    """
+    """Return what a step that is done has left for others, or None where it is not done, or not from this content of capture_digest."""
     found = _done_file(folder)
     left = found.get("left")
     return left if isinstance(left, dict) and found.get("content") == content and (folder / REPORT_FILE).is_file() else None
@@ -98,16 +93,7 @@ def _done_file(folder: Path) -> dict[str, Any]:
 
 
 def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> tuple[dict[str, Any], bool]:
-    """Do a step unless it is done.
-
-    Args:
-        folder: of its result.
-        content: of capture_digest.
-        work: does it, and returns what it leaves for others, as plain data.
-
-    Returns:
-        What it leaves for others, and whether it was done before.
-    """
+    """Do a step unless it is done from this content, and say what it leaves for others, as plain data, and whether it was done before."""
     left = done(folder, content)
     if left is not None:
         return left, True
@@ -118,11 +104,7 @@ def do_step(folder: Path, content: str, work: Callable[[], dict[str, Any]]) -> t
 
 
 def left_by(folder: Path) -> dict[str, Any]:
-    """Return what a step that is done has left for others; nothing where its file is not there.
-
-    Args:
-        folder: of its result.
-    """
+    """Return what a step that is done has left for others; nothing where its file is not there."""
     left = _done_file(folder).get("left")
     return left if isinstance(left, dict) else {}
 

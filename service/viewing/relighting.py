@@ -1,7 +1,7 @@
 """What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
 
 The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
-captured images together do (kernels.relight.tile_basis has the method and its sources).
+captured images together do (kernels.relight.basis has the method and its sources).
 """
 
 import math
@@ -11,12 +11,11 @@ import numpy as np
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.basis import gram
+from kernels.relight.basis import gram, light_factor, tile_bases
 from kernels.relight.beyond import reach, share_beyond
-from kernels.relight.kernel_quadrature import quadrature_of
 from kernels.relight.latlong import first_of_equals
-from kernels.relight.smooth import share_smooth
-from kernels.relight.tile_basis import light_factor, tile_bases
+from service.light.quadrature import quadrature_of
+from service.light.triangulation import share_smooth
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
 from service.viewing.held_out import HeldOutLights
@@ -158,8 +157,8 @@ def write_quadrature(lights: DistantLights, file: BlockFile) -> dict[str, Any]:
     """Write what a page needs to share light out as `relit relight --weights kernel` does, and return what view.json says of it.
 
     Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with
-    them gives the energies of the lights, none below 0 (kernels.relight.kernel_quadrature). Light from beyond them is shared by a table
-    over the grid of directions, since its parts add up (kernels.relight.smooth).
+    them gives the energies of the lights, none below 0 (service.light.quadrature). Light from beyond them is shared by a table
+    over the grid of directions, since its parts add up (service.light.triangulation).
 
     Args:
         lights: of the captured images.

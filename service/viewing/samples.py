@@ -16,7 +16,6 @@ from service.reporting.provenance import other_inputs
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import row_bands, step_within
 from service.viewing.result_layers import ResultLayers
-from stage.errors import ResultError
 from stage.ingest import TOP_EXPONENT
 from stage.maps import LOBES, SurfaceMaps
 from stage.point_lights import DistantLights, PlacedLights

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.beyond import share_beyond
-from kernels.relight.environment import Weighting, light_weights
-from kernels.relight.sample_energy import share_samples
+from service.light.weighting import Weighting, light_weights, share_samples
 from stage.point_lights import DistantLights
 
 COLS, ROWS = 64, 32

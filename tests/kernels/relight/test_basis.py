@@ -8,9 +8,8 @@ from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.relight.basis import MAX_CHUNKS, gram, gram_kernel, principal, projection
-from kernels.relight.many_frames import combine_batch
-from kernels.relight.residual import residual_kernel, squared_residual
+from kernels.relight.basis import MAX_CHUNKS, gram, gram_kernel, principal, projection, residual_kernel, squared_residual
+from kernels.relight.combine import combine_batch
 from tests.kernels.scenes import HALF_ROUNDING, store
 from tests.reference.light_basis import truncation
 from tests.reference.relight import weighted_sum

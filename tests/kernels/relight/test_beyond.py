@@ -5,6 +5,7 @@ import pytest
 
 from kernels import packs
 from kernels.relight.beyond import LONGEST_REACH, compare_beyond, followed, inward_pairs, reach, share_beyond, spacing
+from kernels.relight.captured import Captured
 from tests.kernels.relight.lights import AXES, icosahedron, scattered
 from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import cap, colours
@@ -57,8 +58,9 @@ def sums(pixels, readings, device, *, clipped=None):
     if clipped is not None:
         bits = np.packbits(np.pad(clipped, ((0, stack.shape[1] - len(clipped)), (0, 0))), axis=0, bitorder="little")
     visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8)
-    got = compare_beyond(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE,
-                         scale, PAIRS)
+    images = Captured.of(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE,
+                         scale)
+    got = compare_beyond(images, PAIRS)
     return got.numpy()[:, : len(pixels.normal)], held
 
 

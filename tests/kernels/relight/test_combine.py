@@ -8,7 +8,7 @@ from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.relight import many_frames, one_frame
+from kernels.relight import combine as combining
 from tests.kernels.scenes import cap, colours, shade, store
 from tests.reference.relight import weighted_sum
 
@@ -38,7 +38,7 @@ def close(got, stack, weights):
 def test_one_frame_is_the_weighted_sum(lights, pixels, device):
     stack = captured(lights, pixels)
     weights = drawn((3, stack.shape[1]))
-    frame = one_frame.combine(packs.upload(stack, device=device), weights).numpy()
+    frame = combining.combine(packs.upload(stack, device=device), weights).numpy()
     assert close(frame[:, :pixels], stack, weights)
     assert (frame[:, pixels:] == 0).all()
 
@@ -48,7 +48,7 @@ def test_one_frame_is_the_weighted_sum(lights, pixels, device):
 def test_a_batch_is_its_frames(pixels, frames, device):
     stack = captured(21, pixels)
     weights = drawn((frames, 3, 24))
-    got = many_frames.combine_batch(packs.upload(stack, device=device), weights).numpy()
+    got = combining.combine_batch(packs.upload(stack, device=device), weights).numpy()
     assert got.shape[:2] == (frames, 3)
     for f in range(frames):
         assert close(got[f, :, :pixels], stack, weights[f])
@@ -57,19 +57,19 @@ def test_a_batch_is_its_frames(pixels, frames, device):
 def test_a_frame_is_the_same_to_the_last_bit_whichever_others_are_made(device):
     stack, weights = captured(21, 1000), drawn((19, 3, 24))
     band = packs.upload(stack, device=device)
-    whole = many_frames.combine_batch(band, weights, with_cublas=False).numpy()
+    whole = combining.combine_batch(band, weights, with_cublas=False).numpy()
     for kept in ([3], [18, 0], list(range(5, 17))):
-        assert np.array_equal(many_frames.combine_batch(band, weights[kept], with_cublas=False).numpy(), whole[kept])
+        assert np.array_equal(combining.combine_batch(band, weights[kept], with_cublas=False).numpy(), whole[kept])
 
 
 def test_a_batch_of_many_chunks(device):
     stack = captured(40, MANY)
     weights = drawn((2, 3, 40))
     band = packs.upload(stack, device=device)
-    got = many_frames.combine_batch(band, weights).numpy()
+    got = combining.combine_batch(band, weights).numpy()
     for f in range(2):
         assert close(got[f, :, :MANY], stack, weights[f])
-        single = one_frame.combine(band, weights[f]).numpy()
+        single = combining.combine(band, weights[f]).numpy()
         assert close(single[:, :MANY], stack, weights[f])
 
 
@@ -81,15 +81,15 @@ def test_rows_are_summed_as_images_are(frames, channels, device):
     weights = drawn((frames, channels, 50))
     packed = wp.array(rows.reshape(channels * 50, -1, devices.pack_width(device)), dtype=pack_type(devices.pack_width(device), wp.float32),
                       device=device)
-    got = many_frames.combine_rows(packed, weights).numpy()
+    got = combining.combine_rows(packed, weights).numpy()
     assert got.shape == (frames, channels, 96)
     for f in range(frames):
         assert close(got[f], rows, weights[f])
     alone = np.zeros_like(weights)
     alone[frames // 2] = weights[frames // 2]
-    assert np.array_equal(many_frames.combine_rows(packed, alone).numpy()[frames // 2], got[frames // 2])
+    assert np.array_equal(combining.combine_rows(packed, alone).numpy()[frames // 2], got[frames // 2])
     with pytest.raises(ArrayError, match="expected"):
-        many_frames.combine_rows(packed, weights[:, :, :-1])
+        combining.combine_rows(packed, weights[:, :, :-1])
 
 
 def fours(stack):
@@ -105,12 +105,12 @@ def test_the_kernels_of_cuda(pixels):
     values = fours(stack)
     weights = drawn((8, 3, 16))
     frame = wp.zeros((3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
-    devices.launch(one_frame.register_kernel(4), 3 * values.shape[1],
+    devices.launch(combining.frame_register_kernel(4), 3 * values.shape[1],
                    [values, wp.array(weights[0], dtype=wp.float32, device="cpu")], [frame], device="cpu")
     assert close(frame.numpy().reshape(3, -1)[:, :pixels], stack, weights[0])
     two = np.concatenate([weights, -2 * weights])  # two groups of register frames
     frames = wp.zeros((16, 3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
-    devices.launch(many_frames.register_kernel(4), 2 * 3 * values.shape[1],
+    devices.launch(combining.batch_register_kernel(4), 2 * 3 * values.shape[1],
                    [values, wp.array(two, dtype=wp.float32, device="cpu")], [frames], device="cpu")
     got = frames.numpy().reshape(16, 3, -1)[:, :, :pixels]
     for f in range(16):
@@ -128,7 +128,7 @@ def test_superposition(chosen, powers):
     together = np.einsum("clp,l->cp", alone, lit)
     weights = np.zeros((3, 24), dtype=np.float32)
     weights[:, :20] = lit
-    frame = one_frame.combine(packs.upload(store(alone), device="cpu"), weights).numpy()[:, :100]
+    frame = combining.combine(packs.upload(store(alone), device="cpu"), weights).numpy()[:, :100]
     # half rounding of each stored image, its step below the normal range, and float32 weights and sums
     assert (np.abs(frame - together) <= 2.0**-11 * 1.001 * together + lit.sum() * 2.0**-25 + 1e-30).all()
 
@@ -138,15 +138,15 @@ def test_superposition(chosen, powers):
 def test_frames_add_up_as_their_weights_do(a, b, seed):
     stack, first, second = captured(16, 40, seed), drawn((3, 16), seed), drawn((3, 16), seed + 1)
     band = packs.upload(stack, device="cpu")
-    both = one_frame.combine(band, a * first + b * second).numpy()[:, :40]
-    one, other = (one_frame.combine(band, w).numpy()[:, :40] for w in (first, second))
+    both = combining.combine(band, a * first + b * second).numpy()[:, :40]
+    one, other = (combining.combine(band, w).numpy()[:, :40] for w in (first, second))
     size = weighted_sum(stack, abs(a) * np.abs(first) + abs(b) * np.abs(second))
     np.testing.assert_array_less(np.abs(both - (a * one + b * other)), 20 * 2.0**-23 * size + 1e-30)  # 16 sums and the mixing
 
 
 def test_no_frame_is_no_frame(device):
     band = packs.upload(captured(8, 40), device=device)
-    assert many_frames.combine_batch(band, np.zeros((0, 3, 8), dtype=np.float32)).shape[0] == 0
+    assert combining.combine_batch(band, np.zeros((0, 3, 8), dtype=np.float32)).shape[0] == 0
 
 
 @pytest.mark.parametrize("weights, message", [
@@ -158,14 +158,14 @@ def test_no_frame_is_no_frame(device):
 def test_bad_weights_are_refused(weights, message, device):
     band = packs.upload(captured(8, 4), device=device)
     with pytest.raises(ArrayError, match=message):
-        one_frame.combine(band, weights)
+        combining.combine(band, weights)
     frames = np.stack([np.zeros_like(weights), weights])
     with pytest.raises(ArrayError, match=message.replace(r"\(", r"\(2, ") if "expected" in message else message):
-        many_frames.combine_batch(band, frames)
+        combining.combine_batch(band, frames)
 
 
 def test_a_band_without_colour_is_refused(device):
     band = packs.upload(np.zeros((1, 8, 4), dtype=np.float16), device=device)
-    for call in (lambda: one_frame.combine(band, np.zeros((3, 8))), lambda: many_frames.combine_batch(band, np.zeros((1, 3, 8)))):
+    for call in (lambda: combining.combine(band, np.zeros((3, 8))), lambda: combining.combine_batch(band, np.zeros((1, 3, 8)))):
         with pytest.raises(ArrayError, match="the band has 1 channels, expected 3"):
             call()

@@ -9,8 +9,8 @@ import pytest
 
 from kernels import packs
 from kernels.relight import cublas
+from kernels.relight.combine import combine_batch
 from kernels.relight.cublas import GROUP, SPLIT_BITS, Product, combine_by, split
-from kernels.relight.many_frames import combine_batch
 
 LIGHTS, PIXELS = 16, 200
 

@@ -8,7 +8,7 @@ from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.relight.display import encode, encode_kernel
+from kernels.relight.rti import encode, encode_kernel
 from tests.kernels.scenes import store
 from tests.reference.light_basis import srgb
 

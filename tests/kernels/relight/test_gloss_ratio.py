@@ -5,6 +5,7 @@ import pytest
 
 from kernels import packs
 from kernels.errors import ArrayError
+from kernels.relight.captured import Captured
 from kernels.relight.gloss_ratio import MOST_RATIO, sum_shown
 from tests.kernels.relight.surfaces import LOBE, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import cap, colours
@@ -17,9 +18,8 @@ IRRADIANCE = 3 * colours(24, seed=4)
 def shown(pixels, readings, energy, device, visible=None):
     stack, scale, held = stored(readings, IRRADIANCE)
     visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    got = sum_shown(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale,
-                    np.asarray(energy))
-    return got, held
+    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    return sum_shown(images, np.asarray(energy)), held
 
 
 @pytest.mark.parametrize("count", [1, 45, 64])

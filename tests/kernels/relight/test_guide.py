@@ -5,9 +5,10 @@ import pytest
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.around import left_out
+from kernels.relight.captured import Captured
 from kernels.relight.guide import LEAST_ALPHA, POOL, compare_model, fit_trust, seen_lobes
 from kernels.relight.shading import SecondLobe, upload_surface
+from service.light.triangulation import left_out
 from tests.kernels.relight.lights import AXES, icosahedron
 from tests.kernels.relight.surfaces import LOBE, facing, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import HALF_ROUNDING, HALF_STEP, cap, colours, store
@@ -28,8 +29,8 @@ def compared(pixels, readings, device, *, visible=None, shares=SHARES):
     """[2, P] of compare_model, and the readings that its band holds."""
     stack, scale, held = stored(readings, IRRADIANCE)
     visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8) if visible is None else visible
-    got = compare_model(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale,
-                        NEIGHBOURS, shares)
+    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    got = compare_model(images, NEIGHBOURS, shares)
     return got.numpy()[:, : len(pixels.normal)], held
 
 
@@ -100,7 +101,8 @@ def test_a_model_of_two_materials_explains_its_images(device):
     def sums(second):
         surface = upload_surface(*pixels, second=second, device=device)
         band = packs.upload(stack, device=device)
-        return compare_model(band, surface, visible, LIGHTS, IRRADIANCE, scale, NEIGHBOURS, SHARES).numpy()[:, :45]
+        images = Captured.of(band, surface, visible, LIGHTS, IRRADIANCE, scale)
+        return compare_model(images, NEIGHBOURS, SHARES).numpy()[:, :45]
 
     top, bottom = sums(SecondLobe(other.f0, other.roughness, share))
     _, missing, told = reference.trust(held, parts, NEIGHBOURS, SHARES)
@@ -276,8 +278,9 @@ def test_a_black_model_is_not_trusted(black, device):
 
 def call(device, *, pixels=40, band_pixels=40, seen=(24, 40), stack_lights=24, channels=3, neighbours=NEIGHBOURS, shares=SHARES):
     stack = store(np.ones((channels, stack_lights, band_pixels)))
-    return compare_model(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
-                         pack_bytes(np.full(seen, 255, np.uint8), device), LIGHTS, IRRADIANCE, np.ones(24, np.float32), neighbours, shares)
+    images = Captured.of(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
+                         pack_bytes(np.full(seen, 255, np.uint8), device), LIGHTS, IRRADIANCE, np.ones(24, np.float32))
+    return compare_model(images, neighbours, shares)
 
 
 @pytest.mark.parametrize("change, message", [

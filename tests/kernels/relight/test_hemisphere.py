@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.relight.hemisphere import HSH_TERMS, biquadratic, fit_weights, hemispherical_harmonics
-from kernels.relight.luminance import separate
+from kernels.relight.rti import HSH_TERMS, biquadratic, fit_weights, hemispherical_harmonics, separate
 from tests.kernels.scenes import cap, shade
 from tests.reference.light_basis import harmonics, polynomial, relative_rms
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from kernels import packs
+from kernels.relight.captured import Captured
 from kernels.relight.lobe_profile import PLAIN, fit_profile, profile_moments
 from kernels.relight.shading import shade, upload_surface
 from kernels.relight.sources import far
@@ -37,8 +38,8 @@ def fitted(pixels, readings, device, *, clipped=None):
     stack, scale, _ = stored(readings, IRRADIANCE)
     visible = np.full((len(LIGHTS), len(pixels.normal)), 255, np.uint8)
     bits = None if clipped is None else np.packbits(clipped, axis=0, bitorder="little")
-    moments = profile_moments(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS,
-                              IRRADIANCE, scale)
+    moments = profile_moments(Captured.of(packs.upload(stack, bits, device=device), upload(pixels, device), pack_bytes(visible, device),
+                                          LIGHTS, IRRADIANCE, scale))
     return fit_profile(moments.numpy()[:, : len(pixels.normal)], np.arange(SIDE * SIDE), (SIDE, SIDE))
 
 

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernels.relight import sources
-from kernels.relight.discs import disc_samples
-from kernels.relight.marching import grouped
+from kernels.relight.sources import disc_samples, grouped
 from tests.kernels.relight.lights import scattered
 
 FIRST = 40

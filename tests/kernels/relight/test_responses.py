@@ -5,10 +5,10 @@ import pytest
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight import many_frames, sources
+from kernels.relight import combine, sources
+from kernels.relight.captured import Captured
 from kernels.relight.responses import empty_responses, respond, shown_gloss
-from kernels.relight.shading import upload_sources
-from kernels.relight.small_lights import shade_frames, upload_frames
+from kernels.relight.shading import shade_frames, upload_sources
 from tests.kernels.relight.lights import scattered
 from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, radiance, scattered_pixels, stored, upload
 from tests.kernels.scenes import cap, colours
@@ -69,20 +69,12 @@ def test_gloss_is_as_bright_as_the_images_show_it(device):
     parts = reference.parts(pixels, LIGHTS)
     stack, scale, held = stored(parts.sum(axis=0) * np.random.default_rng(3).uniform(0.5, 1.6, 50), IRRADIANCE)
     _, _, found = responses(pixels, own, visible, device)
-    got = shown_gloss(packs.upload(stack, device=device), upload(pixels, device), found, LIGHTS, IRRADIANCE, scale)
+    images = Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), LIGHTS, IRRADIANCE, scale)
+    got = shown_gloss(images, found)
     ratio = reference.shown(held, parts)
     assert ratio.min() < 0.8 and ratio.max() == 1.25
     got = got.numpy().reshape(3, len(LIGHTS), -1)[:, :, :50]
     np.testing.assert_allclose(got, (ratio * parts[1]).swapaxes(0, 1), rtol=3 * LOBE, atol=8 * FLOAT)
-
-
-def test_images_of_other_pixels_are_refused(device):
-    pixels = scattered_pixels(50)
-    own = sources.own_rows(sources.far(LIGHTS, IRRADIANCE))
-    stack, scale, _ = stored(np.ones((len(LIGHTS), 3, 90)), IRRADIANCE)
-    _, _, found = responses(pixels, own, np.full((len(LIGHTS), 50), 255, np.uint8), device)
-    with pytest.raises(ArrayError, match="give the same pixels and lights"):
-        shown_gloss(packs.upload(stack, device=device), upload(pixels, device), found, LIGHTS, IRRADIANCE, scale)
 
 
 def test_a_frame_is_the_sum_of_its_samples(device):
@@ -91,10 +83,10 @@ def test_a_frame_is_the_sum_of_its_samples(device):
     visible = np.random.default_rng(6).integers(0, 256, (6, 70)).astype(np.uint8)
     energy = np.random.default_rng(7).gamma(1.0, 1.0, (3, 40, 3)).astype(np.float32)
     _, _, found = responses(pixels, given, visible, device)
-    matt = many_frames.combine_rows(found.matt, np.ascontiguousarray(energy.swapaxes(1, 2)).reshape(9, 1, 40)).numpy().reshape(3, 3, -1)
-    gloss = many_frames.combine_rows(found.gloss, np.ascontiguousarray(energy.swapaxes(1, 2))).numpy()
+    matt = combine.combine_rows(found.matt, np.ascontiguousarray(energy.swapaxes(1, 2)).reshape(9, 1, 40)).numpy().reshape(3, 3, -1)
+    gloss = combine.combine_rows(found.gloss, np.ascontiguousarray(energy.swapaxes(1, 2))).numpy()
     frames = [given._replace(energy=each) for each in energy]
-    several = shade_frames(upload(pixels, device), upload_frames(sources.join(frames), [40] * 3, device),
+    several = shade_frames(upload(pixels, device), upload_sources(sources.join(frames), device, [40] * 3),
                            pack_bytes(visible, device)).numpy()
     for frame, each in enumerate(frames):
         whole = radiance(pixels, each, device, visible)
@@ -105,7 +97,7 @@ def test_a_frame_is_the_sum_of_its_samples(device):
 
 def test_frames_may_have_no_samples(device):
     pixels, given = scattered_pixels(40), hidden_samples(7, 2)
-    frames = upload_frames(given, [0, 7, 0], device)
+    frames = upload_sources(given, device, [0, 7, 0])
     got = shade_frames(upload(pixels, device), frames, pack_bytes(np.full((2, 40), 255, np.uint8), device)).numpy()
     assert (got[[0, 2]] == 0).all() and got[1].max() > 0
 
@@ -113,6 +105,6 @@ def test_frames_may_have_no_samples(device):
 def test_near_samples_are_refused(device):
     near = sources.point(np.array([0, 0, 2.0]), np.ones(3))
     with pytest.raises(ArrayError, match="samples are 1, 1 of them near, for frames of 1: give the far samples of all frames"):
-        upload_frames(near, [1], device)
+        upload_sources(near, device, [1])
     with pytest.raises(ArrayError, match="samples are 7, 0 of them near, for frames of 6"):
-        upload_frames(hidden_samples(7, 2), [2, 4], device)
+        upload_sources(hidden_samples(7, 2), device, [2, 4])

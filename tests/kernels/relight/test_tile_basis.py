@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.relight.tile_basis import light_factor, tile_bases
+from kernels.relight.basis import light_factor, tile_bases
 
 FLOAT = 2e-4
 """Products of single floats, summed over the pixels of a tile, and their eigenvalues' square roots."""

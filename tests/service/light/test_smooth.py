@@ -5,8 +5,9 @@ from hypothesis import strategies as st
 
 from kernels.errors import ArrayError
 from kernels.relight.latlong import cut
-from kernels.relight.smooth import integrate_smooth, locate
-from kernels.relight.triangulation import triangulate_sphere
+from kernels.relight.smooth import locate
+from service.light.triangulation import triangulate_sphere
+from service.light.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
 from tests.reference import relight as reference

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kernels.relight.environment import Weighting, integrate
 from kernels.relight.latlong import shared_turns
+from service.light.weighting import Weighting, integrate
 from stage.frames import rotation_about, rotation_about_y
 from tests.kernels.scenes import cap
 

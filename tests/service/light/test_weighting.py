@@ -5,9 +5,8 @@ from hypothesis import strategies as st
 
 from kernels.errors import ArrayError
 from kernels.relight.cells import integrate_cells
-from kernels.relight.environment import Weighting, integrate, light_weights
-from kernels.relight.kernel_quadrature import integrate_kernel
-from kernels.relight.smooth import integrate_smooth
+from service.light.quadrature import integrate_kernel
+from service.light.weighting import Weighting, integrate, integrate_smooth, light_weights
 from tests.kernels.relight.lights import AXES, STILL, turn
 from tests.kernels.scenes import cap
 from tests.reference.relight import texel_solid_angles

@@ -25,7 +25,7 @@ from kernels.errors import ArrayError
 from kernels.relight.beyond import share_beyond
 from kernels.relight.environment_sources import sample_environment
 from kernels.relight.latlong import check, first_of_equals
-from kernels.relight.smooth import share_smooth
+from service.light.triangulation import share_smooth
 
 NEIGHBOURS = 6
 """Number of lights around one, as a triangular lattice has them."""
@@ -50,18 +50,10 @@ REMEMBERED = 4
 
 
 def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Share a lat-long map out over the lights by kernel quadrature, for several rotations of the map.
-
-    Args:
-        environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
-        directions: [lights, 3] unit vectors from the object to the lights (without padding).
-        rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
+    """Share a lat-long map out over the lights by kernel quadrature; arguments are those of weighting.integrate.
 
     Returns:
         [frames, lights, 3] float64 energy of each light, 0 or above; it sums to that of the map. Of lights in one place the first gets all.
-
-    Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite (counted).
     """
     directions, rotations = check(environment, directions, rotations)
     parts = ceil(MIN_ROWS / len(environment))
@@ -72,16 +64,11 @@ def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations:
 
 
 def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share the energy of samples out over the captured lights by kernel quadrature.
-
-    Args:
-        samples: [n, 3] unit vectors to the samples.
-        energy: [n, channels] of each, 0 or above.
-        directions: [lights, 3] unit vectors to the lights, one or more; of several in one place the first gets all.
+    """Share the energy [n, channels] of samples, 0 or above, out over the captured lights by kernel quadrature.
 
     Returns:
-        [lights, channels] float64, 0 or above; its sum is that of the samples. If the lights are fewer than four or all in one plane,
-        light from beyond them is shared out by the kernel too.
+        [lights, channels] float64, 0 or above; its sum is that of the samples. Of lights in one place the first gets all. If the lights are
+        fewer than four or all in one plane, light from beyond them is shared out by the kernel too.
     """
     kept = first_of_equals(directions)
     towards = np.ascontiguousarray(directions[kept], dtype=np.float64)
@@ -119,11 +106,7 @@ class Quadrature(NamedTuple):
 
 
 def quadrature_of(directions: np.ndarray) -> Quadrature:
-    """Return the quadrature of lights.
-
-    Args:
-        directions: [lights, 3] unit vectors, all in different places.
-    """
+    """Return the quadrature of lights [lights, 3], unit vectors, all in different places."""
     return _solve(np.ascontiguousarray(directions, dtype=np.float64).tobytes())
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from kernels.errors import ArrayError
-from kernels.relight.around import left_out, lights_around
+from service.light.triangulation import left_out, lights_around
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
 from tests.kernels.scenes import cap
 from tests.reference.shading import shares_around

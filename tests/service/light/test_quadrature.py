@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from kernels.errors import ArrayError
 from kernels.relight.beyond import share_beyond
 from kernels.relight.cells import integrate_cells
-from kernels.relight.kernel_quadrature import integrate_kernel, share_kernel
-from kernels.relight.smooth import integrate_smooth, share_smooth
+from service.light.quadrature import integrate_kernel, share_kernel
+from service.light.triangulation import share_smooth
+from service.light.weighting import integrate_smooth
 from tests.kernels.relight.lights import AXES, CUBE, STILL, SUM, dodecahedron, icosahedron, ring, scattered, sun, turn
 from tests.kernels.scenes import cap
 from tests.reference.relight import best_weights, matern, rotation_about_y, samples, texel_directions, texel_solid_angles

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.relight.discs import disc_samples, integrate_discs
-from kernels.relight.environment import Weighting, integrate
+from kernels.relight.sources import disc_samples
+from service.light.weighting import Weighting, integrate, integrate_discs
 from tests.reference.relight import texel_directions, texel_solid_angles
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from kernels.relight.triangulation import triangulate_sphere
+from service.light.triangulation import triangulate_sphere
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
 from tests.kernels.scenes import cap
 
