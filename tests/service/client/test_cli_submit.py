@@ -130,7 +130,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(relit, arguments, sentence):
 
 def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]:
     """The job, and the program, ended by Ctrl-C while it waits."""
-    process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-5000", "--wait"],
+    process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-300", "--wait"],
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     line = process.stdout.readline()
