@@ -105,6 +105,7 @@ def test_a_stream_that_cannot_be_is_refused(client, dome):
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
+@pytest.mark.long
 def test_streams_end_with_the_service(tmp_path: Path):
     with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
         database = connect(Settings(data=server.data).sqlalchemy_url)

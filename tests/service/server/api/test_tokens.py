@@ -161,6 +161,7 @@ def test_settings_that_cannot_be(settings, words):
         Settings(**settings)
 
 
+@pytest.mark.long
 def test_a_service_takes_tokens_beside_keys_and_audits_both(issuer, tmp_path):
     with serving(tmp_path, "--device", "none", oidc_issuer=issuer.url, oidc_grants=GRANTS, min_free_bytes="0") as server:
         with server.client(issuer.token()) as client:

@@ -20,6 +20,8 @@ from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 
+pytestmark = pytest.mark.long
+
 WAIT_S = 20.0
 BURST, CAPTURES, QUEUED, AT_ONCE = 120, 4, 3, 8
 

@@ -26,6 +26,8 @@ from tests.service.server.jobs.test_sharing import WORKERS, begun, both_at_work,
 from tests.service.server_process import SABOTAGE
 from tests.stage.scans.test_registration import seen
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
@@ -109,7 +111,7 @@ def test_two_workers_find_the_same_poses_as_one_process(both, depths, alone):
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
     assert json.loads((both.results(job) / "report.json").read_text())["pairs"] == json.loads(
         (alone.parent / "report.json").read_text())["pairs"]
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "removed")
 
 
 def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tmp_path):
@@ -123,10 +125,9 @@ def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tm
     tiles = {path.name: path.read_bytes() for path in (expected / "tiles").glob("*.ply")}
     assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (both.results(job) / "tiles").glob("*.ply")} == tiles
     assert (both.results(job) / "site.usda").exists()
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "removed")
 
 
-@pytest.mark.long
 def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths, alone):
     job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
     holder, _ = both_at_work(both, job)
@@ -134,4 +135,4 @@ def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths
     row = both.ended(job)
     assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
-    assert not pieces_folder(both, job).exists()
+    both.until(lambda: not pieces_folder(both, job).exists(), "removed")

@@ -67,6 +67,7 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     assert json.loads(download.value.path().read_text()) == report
 
 
+@pytest.mark.long
 def test_patterns_are_drawn_from_the_page_of_jobs(page):
     """A job that reads nothing; its periods are typed as in a command."""
     page.goto("/jobs")
@@ -81,6 +82,7 @@ def test_patterns_are_drawn_from_the_page_of_jobs(page):
     page.locator("#results").get_by_text("patterns.json").wait_for()
 
 
+@pytest.mark.long
 def test_forms_of_several_captures_and_images(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
@@ -119,6 +121,7 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
 
 
+@pytest.mark.long
 def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
@@ -153,6 +156,7 @@ def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
         assert client.get(f"/v1/jobs/{job}").status_code == 404
 
 
+@pytest.mark.long
 def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
     with server.client() as client, cuttable(server.url) as way:

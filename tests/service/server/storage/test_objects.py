@@ -286,6 +286,7 @@ def test_the_settings_choose(tmp_path):
         open_storage(Settings(data=tmp_path, storage_url="ftp://store"))
 
 
+@pytest.mark.long
 def test_a_damaged_answer_is_asked_for_again(s3, tmp_path, monkeypatch):
     """obstore takes an answer that is no HTTP for final, whatever its number of retries."""
     with tcp_proxy(int(os.environ["AWS_ENDPOINT_URL"].rpartition(":")[2])) as damaged:

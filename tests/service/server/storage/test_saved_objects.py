@@ -21,7 +21,7 @@ PIECE = "uploads/up_x/0"
 HIDDEN = "projects/larch/jobs/job_x/.maps.exr", "projects/larch/shared/job_x/piece", "projects/larch/captures/cap_gone/000.exr"
 
 
-@pytest.fixture(params=["file", "s3"])
+@pytest.fixture(params=["file", pytest.param("s3", marks=pytest.mark.long)])
 def url(request, tmp_path) -> str:
     return (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
 
