@@ -10,6 +10,7 @@ from service.gltf import container, textures
 from service.gltf.asset import write_asset
 from service.gltf.container import read_glb
 from stage.errors import StorageError
+from tests.service.full_disk import files_of_at_most
 from tests.service.gltf.surfaces import SURFACES
 
 
