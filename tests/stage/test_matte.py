@@ -26,7 +26,7 @@ def edge_error(scene: Covered, coverage, grey=None, factor=None):
 
 
 @pytest.mark.parametrize(("options", "most"), [
-    ({}, 0.05), ({"lights": 96, "size": 64}, 0.05), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
+    ({}, 0.05), pytest.param({"lights": 96, "size": 64}, 0.05, marks=pytest.mark.long), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
 ], ids=["lights around", "many lights", "lights in front", "a hole"])
 def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options, most):
     """The limits are what shading that changes within a pixel of the rim leaves open: more where no light comes from the side."""

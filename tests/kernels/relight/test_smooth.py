@@ -121,6 +121,7 @@ def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     np.testing.assert_allclose(got.energy[0], energy, rtol=SHARE)
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), rows=st.integers(1, 400), seed=st.integers(0, 1000), count=st.integers(4, 30), axis=st.integers(0, 1000),
        spread=st.sampled_from([0.02, 0.3, 2.0, None]))

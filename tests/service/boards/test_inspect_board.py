@@ -68,6 +68,7 @@ def test_planted_defects_are_found_and_nothing_else(relit, tmp_path, golden):
     assert (tmp_path / "b" / "out" / "inspection.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_a_good_board_with_missing_pixels_does_not_pass_as_a_whole(relit, tmp_path, golden):
     views = scan(SURFACE, across=2, down=2, side=SIDE, step=STEP, seed=3, stage=PIXEL)
     views[0].height[40:60, 30:45] = np.nan

@@ -91,6 +91,7 @@ def woven(points):
     return np.repeat((waves * fields)[..., None], 3, axis=-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("planes", "span"), [(70, 0.05), (12, 0.09)], ids=["dense", "far apart"])
 def test_texture_is_divided_out_or_in_sigma(relit, tmp_path, planes, span):
     scene = SCENE._replace(albedo=woven(SCENE.points))
@@ -109,6 +110,7 @@ def test_texture_is_divided_out_or_in_sigma(relit, tmp_path, planes, span):
         assert np.median(np.abs(maps.depth - scene.depth)[keep]) < 0.25e-3  # without the division 0.6 mm
 
 
+@pytest.mark.long
 def test_texture_that_a_sweep_shows_does_not_move_the_stripe(relit, tmp_path):
     planes = [plane(x) for x in np.linspace(-0.025, 0.025, 36)]
     medians = []

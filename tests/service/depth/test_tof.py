@@ -179,6 +179,7 @@ def test_calibration_takes_wiggling_offset_and_drift_out(tmp_path):
     assert report["found"]["wiggling"] == list(tof.HZ)
 
 
+@pytest.mark.long
 def test_histograms_pile_up_and_returns(tmp_path):
     view, camera = tof.room(ROWS // 2, COLS // 2), {**CAMERA, "resolution": [COLS // 2, ROWS // 2], "focal_px": [55.0, 55.0]}
     counts = tof.histogram(view, 4000, pulses=3000, background=0.05, seed=2)

@@ -147,10 +147,10 @@ def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
 
 
 @pytest.mark.parametrize(("change", "sentence"), [
-    (lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored"),
+    pytest.param(lambda points: points * [-1, 1, 1], "s3: has no pose: fits the others if it is mirrored", marks=pytest.mark.long),
     (lambda points: points * 1000, "s3: has no pose: fits the others if its coordinates are multiplied by 0.001, as if it were in mil"),
-    (lambda points: points * 1.01, "s3: is about 0."),
-    (lambda points: points[:, [0, 2, 1]] * [1, 1, -1] * [1, 1, 0.3], "s3: has no pose"),
+    pytest.param(lambda points: points * 1.01, "s3: is about 0.", marks=pytest.mark.long),
+    pytest.param(lambda points: points[:, [0, 2, 1]] * [1, 1, -1] * [1, 1, 0.3], "s3: has no pose", marks=pytest.mark.long),
 ], ids=["mirrored", "millimetres", "one per cent", "squeezed"])
 def test_a_scan_that_does_not_belong_is_named(relit, tmp_path, change, sentence):
     seen = views(figure, 0, 30, 60, 45)

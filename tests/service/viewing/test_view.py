@@ -28,6 +28,7 @@ def atlas(folder: Path) -> np.ndarray:
     return oiio.ImageBuf(str(folder / "thumbnails.jpg")).get_pixels(oiio.UINT8)
 
 
+@pytest.mark.long
 def test_the_owl(relit, tmp_path):
     outcome = relit("view", ROOT / "samples" / "owl", "--cache", tmp_path / "cache", "--out", tmp_path / "out")
     assert outcome.code == 0 and outcome.err == ""
