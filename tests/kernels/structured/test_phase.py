@@ -89,7 +89,8 @@ def test_three_periods_reach_a_seventieth_of_a_pixel_without_a_wrong_wrap(device
     assert np.median(np.abs(coordinate - u)[ok]) <= 0.014
 
 
-@pytest.mark.parametrize("periods", [(17, 19, 23.5), (1024,), *(pytest.param(periods, marks=pytest.mark.long) for periods in ((1000, 100, 12), (40, 41.7)))])
+@pytest.mark.parametrize("periods", [
+    (17, 19, 23.5), (1024,), pytest.param((1000, 100, 12), marks=pytest.mark.long), pytest.param((40, 41.7), marks=pytest.mark.long)])
 def test_any_set_of_periods_is_the_most_likely_place(periods, device):
     patterns = phase_patterns("column", periods, 4)
     u = places(200, WIDTH)

@@ -73,7 +73,8 @@ def with_ball(folder):
 
 
 CAPTURES = [(distant, "lambert"), (distant, "robust"), (distant, "svbrdf"), (near, "robust"), (with_ball, None),
-            pytest.param(near, "svbrdf", marks=pytest.mark.long), pytest.param(extended, None, marks=pytest.mark.long), pytest.param(polarised, None, marks=pytest.mark.long)]
+            pytest.param(near, "svbrdf", marks=pytest.mark.long), pytest.param(extended, None, marks=pytest.mark.long),
+            pytest.param(polarised, None, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize(("write", "method"), CAPTURES, ids=lambda value: getattr(value, "__name__", value or "-"))
