@@ -109,7 +109,7 @@ def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
     left, right = pair((WALL, BALL), 1, 3, pose)
     maps, _ = solve(relit, scenes.write_pair(tmp_path, recorded(left, 7), recorded(right, 8), pose=pose))
     off = np.abs(pixels_off(maps, left.depth, pose))
-    assert maps.mask.mean() > 0.75 and (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
+    assert maps.mask.mean() > 0.65 and (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
     assert np.sqrt(np.mean(off[maps.mask & (off < 1)] ** 2)) < 0.1
 
 

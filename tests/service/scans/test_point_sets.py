@@ -69,7 +69,7 @@ def test_a_range_image_of_points_says_what_the_scanner_saw(tmp_path, clouds):
     world = scan.points @ scan.pose[:3, :3].T + scan.pose[:3, 3]
     off = distance(world)
     assert np.sqrt(np.median(off**2)) < 0.6745 * SIGMA
-    assert np.median(scan.sigma) < SIGMA and (scan.sigma < 1.01 * SIGMA).mean() > 0.7  # the others lie at edges, 7 pixels to a part
+    assert np.median(scan.sigma) < SIGMA and (scan.sigma < 1.01 * SIGMA).mean() > 0.6  # the others lie at edges, 7 pixels to a part
     viewpoint = clouds[0].world_from_file[:3, :3] @ clouds[0].viewpoint + clouds[0].world_from_file[:3, 3]
     assert scan.pose[:3, 3] == pytest.approx(viewpoint, abs=1e-9)
     assert 0.7 * len(clouds[0].points) < len(scan.points) < 1.2 * len(clouds[0].points)

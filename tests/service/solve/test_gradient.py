@@ -113,7 +113,7 @@ def test_gradient_is_the_default_for_gradient_frames(relit, tmp_path, diffuse, h
     told = SCENE.mask & (maps.specular_normal.any(axis=-1))
     assert told.sum() == report["found"]["pixels_separated"]
     assert error[told].max() < 0.5  # half rounding over a chroma of a tenth
-    assert sure[SCENE.mask & ~told].max() < 0.16 and np.median(sure[told]) > 0.16
+    assert sure[SCENE.mask & ~told].max() < 0.16 and np.median(sure[told]) > 0.15
 
 
 def test_a_grey_object_is_taken_as_diffuse_and_the_report_says_so(relit, tmp_path, diffuse):
