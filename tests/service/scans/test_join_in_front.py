@@ -51,7 +51,7 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     error, left = scene(before.points), scene(after.points)
     border = np.abs(before.points[:, :2]).max(axis=1) > 0.15  # the wall ends there, and the views see behind it
     high = before.points[:, 2] > 0.008
-    assert rms(left) < rms(error)  # all vertices; the same noise is in both, so that their ratio scatters by a per cent
+    assert rms(left) < rms(error)  # all vertices; the noise is the same in both
     for part in (border, ~border & high, ~border & ~high):
         assert np.count_nonzero(part) > 500 and rms(left[part]) < rms(error[part])
     assert np.median(np.abs(left)) < 0.5 * np.median(np.abs(error))
