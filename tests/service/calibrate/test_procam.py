@@ -132,6 +132,7 @@ def test_poses_with_phases_alone_calibrate(relit, rig, tmp_path):
     assert np.abs(np.array(Capture.open(copies[0]).manifest.projector.focal_px) / PROJECTOR.focal - 1).max() < 0.01
 
 
+@pytest.mark.long
 def test_poses_at_several_exposures_calibrate(relit, rig, tmp_path):
     """Taken again at a fifth of the time and at three times it, where white clips: joined, the board is seen as at one good exposure."""
     folders, _ = rig

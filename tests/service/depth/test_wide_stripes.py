@@ -28,6 +28,7 @@ def solve(relit, folder, world, light, axis, stripe, *, inverses=True):
     return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", RIGS)
 @pytest.mark.parametrize("blur", [0.4, 2.0])
 def test_edges_number_the_periods(relit, tmp_path, axis, blur):

@@ -105,6 +105,7 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mixed", [False, True])
 def test_range_images_of_orthographic_cameras_are_fused(tmp_path, shots, mixed):
     """Cameras whose frame lies in the middle of the statue, so that half of the depths are below 0; every third is perspective if mixed."""
@@ -136,6 +137,7 @@ def _moved(by: float) -> np.ndarray:
     return pose
 
 
+@pytest.mark.long
 def test_joined_maps_replace_the_depth_by_a_better_one(tmp_path):
     """Depths of 2 mm of noise beside heights of .1 mm, as `relit join` leaves them."""
     noise, joined = 2e-3, 1e-4

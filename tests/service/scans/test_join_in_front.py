@@ -37,6 +37,7 @@ def degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(one - other, axis=-1) / 2, 0, 1)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "sigma"), NOISE)
 def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     scene = SCENES[name]
@@ -79,6 +80,7 @@ def test_normals_of_another_surface_are_refused(tmp_path):
     assert not (tmp_path / "joined").exists()
 
 
+@pytest.mark.long
 def test_normals_that_contradict_a_third_of_the_depth_are_told(tmp_path):
     """Normals are flipped in the left part of every view: what they show stays as its depth has it."""
     scene = SCENES["disc"]

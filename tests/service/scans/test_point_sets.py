@@ -38,6 +38,7 @@ def errors(result) -> np.ndarray:
     return np.abs(distance(read_ply_points(result.mesh_path).points))
 
 
+@pytest.mark.long
 def test_points_are_fused_as_well_as_range_images(tmp_path, clouds):
     (tmp_path / "clouds").mkdir()
     points = fused(write_set(tmp_path / "clouds", [entry(cloud, tmp_path / "clouds", number) for number, cloud in enumerate(clouds)]))

@@ -110,6 +110,7 @@ def pair_of(places_b: dict[str, np.ndarray], seed: int = 0, names: tuple[str, ..
     return pose_by_targets(a, targets_of(truth, 2 * seed + 1, places_b), first_row=(0, 0)), truth
 
 
+@pytest.mark.long
 def test_the_pose_of_a_pair_is_as_wrong_as_it_says():
     """χ² with six degrees of freedom has a mean of 6, of 200 draws ± .25."""
     squares = []
