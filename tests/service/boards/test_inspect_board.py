@@ -160,7 +160,7 @@ def test_a_golden_map_that_does_not_fit_is_one_sentence(relit, tmp_path, golden,
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"schema": "relit.board-scan/2"}, "schema: is \"relit.board-scan/2\", this program reads relit.board-scan/1"),
+    ({"schema": "relit.board-scan/2"}, "schema: is \"relit.board-scan/2\", this program reads"),
     ({"tiles": []}, "tiles: has 0 entries, needs 1 or more"),
     ({"tiles": [{"path": "tile_00"}, {"path": "tile_00"}]}, "tiles: tile_00 is given twice"),
     ({"tiles": [{"path": "../tile_00"}]}, "../tile_00 leads out of the folder"),

@@ -81,7 +81,7 @@ def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
         assert outcome.code == 2 and outcome.err.count("\n") == 1, outcome.err
         return outcome.err
 
-    assert "--step-m 50: is 50 m, more than a step has: give metres, such as 0.05 for 50 mm" in refused(folder, step=("--step-m", 50))
+    assert "50: is 50 m, more than a step has: give metres, such as 0.05" in refused(folder, step=("--step-m", 50))
     assert "give --board and --square-m for a chessboard, or --step-m" in refused(folder, step=())
     assert "give --board and --square-m for a chessboard, or --step-m" in refused(folder, "--board", "9x6", "--square-m", 0.03)
     assert "--board and --square-m belong together" in refused(folder, "--board", "9x6", step=())

@@ -108,7 +108,7 @@ def test_the_size_of_the_projector_may_stand_in_the_manifests(relit, rig, tmp_pa
     for folder in copies:
         edit_manifest(folder, projector={"resolution": [256, 192], "response": [0, 0.5, 1]}, camera={
             "projection": "orthographic", "resolution": [CAMERA.width, CAMERA.height]})
-    assert "projector    256x192, not calibrated: see relit calibrate procam" in relit("info", copies[0]).out
+    assert "projector    256x192, not calibrated: see relit calibrate" in relit("info", copies[0]).out
     outcome = relit("depth", copies[0], "--out", tmp_path / "out")
     assert outcome.code == 0 and "without depth" in outcome.out  # tests/service/depth/test_decoded_only.py
     outcome = relit("calibrate", "procam", *copies, "--board", "9x6", "--square-m", 0.03)

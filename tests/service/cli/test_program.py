@@ -76,7 +76,7 @@ def test_doctor_finds_this_installation_sound(relit):
     (["solve"], "missing argument 'CAPTURE'"),
     (["solve", "cap"], "missing option '--out'"),
     (["solve", "cap", "--out", "o", "--method", "magic"],
-     "invalid value for '--method': 'magic' is not one of 'lambert', 'robust'"),
+     "invalid value for '--method': 'magic' is not one of"),
     (["solve", "cap", "--colour"], "no such option: --colour"),
     (["import", "zip", "a", "b"], "no such command 'zip'"),
     (["bench", "--repeats", "1"], "repeats: is 1: input should be greater than or equal to 3"),

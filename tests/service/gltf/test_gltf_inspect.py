@@ -105,7 +105,7 @@ def test_the_command_prints_facts_and_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["relit", "inspect", str(path)])
     assert run(main) == 0
     printed = capsys.readouterr().out
-    assert "texture    metallicRoughnessTexture: metallic_roughness, 24×24, 3 × 16 bits" in printed and "KHR_materials_ior" in printed
+    assert " metallicRoughnessTexture: metallic_roughness, 24×24, 3 × 16" in printed and "KHR_materials_ior" in printed
     monkeypatch.setattr("sys.argv", ["relit", "inspect", "--json", str(path)])
     assert run(main) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(dataclasses.asdict(inspect_glb(path))))

@@ -96,9 +96,9 @@ def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):
             fuse(FuseRequest(out=tmp_path / "out", device="cpu", **{"texture": False, **changes}))
 
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    refused(r"needs xatlas: pip install 'relit\[scans\]', or give --no-texture", scan_set=write_scans(tmp_path, shots[:1]), texture=True)
+    refused(r"xatlas: pip install 'relit\[scans\]', or give --no-texture", scan_set=write_scans(tmp_path, shots[:1]), texture=True)
     file = write_scans(tmp_path, shots[:2], poses=[shots[0].world_from_camera, None])
-    refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit register first", scan_set=file)
+    refused(r"scans\[1\] \(view 1\): scan_to_world is missing: run relit", scan_set=file)
     pair = [shots[0], shoot(shots[0].world_from_camera, shots[0].side, shots[0].focal, seed=5)]
     refused("the poses contradict each other: run relit register first",
             scan_set=write_scans(tmp_path, pair, poses=[pair[0].world_from_camera, pair[0].world_from_camera @ _moved(OFF)]))

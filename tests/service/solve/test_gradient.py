@@ -86,7 +86,7 @@ def test_a_declared_leak_is_taken_off_the_diffuse_frames(relit, tmp_path, diffus
     assert np.allclose(maps.specular[inside], 0.04, atol=0.002)
     write(tmp_path / "crossed", {"cross": diffuse / 2}, polarizer_leak=leak)
     outcome = relit("solve", tmp_path / "crossed", "--out", tmp_path / "none")
-    assert outcome.code == 2 and "polarizer_leak: is 0.05, and no frame has polarization parallel" in outcome.err
+    assert outcome.code == 2 and "polarizer_leak: is 0.05, and no frame has polarization" in outcome.err
 
 
 def test_metal_has_the_normal_of_its_highlight(relit, tmp_path, highlight):

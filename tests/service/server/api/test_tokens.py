@@ -88,7 +88,7 @@ def test_a_token_gives_the_project_and_the_scope_of_its_groups(issuer, reader):
 def test_of_several_projects_the_request_names_one(issuer, reader):
     token = issuer.token(groups=["artists", "guests"])
     assert reader.caller(token, "willow")[:2] == ("willow", Scope.READ)
-    with pytest.raises(ApiError, match="the token allows larch, willow: name one in the header Relit-Project"):
+    with pytest.raises(ApiError, match="the token allows larch, willow: name one in the header"):
         reader.caller(token, None)
     with pytest.raises(ApiError, match="the token does not allow oak"):
         reader.caller(token, "oak")
