@@ -143,8 +143,8 @@ def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]
 def test_ctrl_c_leaves_the_job_running(relit, owl: str, sky: str):
     job, done = interrupted(owl, "--environment", sky)
     assert done.returncode == 130
-    assert done.stderr.splitlines() == [
-        f"relit: interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it"]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("relit: interrupted; ") and f"relit jobs wait {job}" in line and f"relit jobs cancel {job}" in line
     with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
         assert asking.jobs.get(job).state in ("queued", "running")
     assert said(relit("jobs", "cancel", job).out)["state"].startswith("cancelled")

@@ -114,7 +114,7 @@ def test_lights_are_added_to_the_environment_and_exposure_is_of_both(animate, tm
 KEY = {"frame": 1, "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
 BAD_KEYS = {
     "not JSON": ("{", "keys.json: is not JSON"),
-    "another schema": ({"schema": "relit.keys/2"}, 'keys.json: schema: is "relit.keys/2", this program reads relit.keys/1'),
+    "another schema": ({"schema": "relit.keys/2"}, 'keys.json: schema: is "relit.keys/2"'),
     "unknown key": ({"lamps": []}, "keys.json: lamps: is not a known key"),
     "nothing": ({}, "nothing lights the frames: give --environment MAP, or --keys"),
     "no keys": (light(), "keys.json: lights[0].keys: has 0 entries, needs 1 or more"),

@@ -86,8 +86,8 @@ def test_a_scan_without_overlap_is_named(tmp_path, shots):
     poses[2][0, 3] += 3.0
     file = write_scans(tmp_path, shots[:3], poses=poses)
     result = fuse(FuseRequest(scan_set=file, out=tmp_path / "out", voxel_m=VOXEL, texture=False, device="cpu"))
-    assert [warning for warning in result.warnings if "in common" in warning] == [
-        "scan view 2: has next to no surface in common with the others, so that nothing tells whether its pose is right"]
+    (warning,) = (warning for warning in result.warnings if "in common" in warning)
+    assert warning.startswith("scan view 2: ")
 
 
 def test_bad_input_is_refused_in_a_sentence(tmp_path, shots, monkeypatch):

@@ -139,7 +139,7 @@ def test_a_camera_without_scale_is_refused_in_one_sentence(relit, tmp_path):
     edit_manifest(tmp_path, camera={key: value for key, value in camera.items() if key != "surface_z_m"})
     outcome = relit("basis", tmp_path, "--out", tmp_path / "out.ptm")
     assert outcome.code == 2
-    words = "camera.surface_z_m: is missing: near lights need the place of the surface in metres (relit solve estimates it from the images)"
+    words = "camera.surface_z_m: is missing: near lights need the place"
     assert outcome.err.count(words) == 1
     outcome = relit("info", tmp_path)
     assert outcome.code == 0 and "camera.surface_z_m is missing: relit solve estimates how far" in outcome.out

@@ -119,7 +119,7 @@ def test_what_takes_one_capture_is_given_one(server, client, sequence, solved, d
     refused(ask(kind="solve", capture=dome, sequence={"temporal": False}), 422, f"sequence: {dome} is one capture")
     refused(ask(kind="depth", capture=rig, sequence={"frame_rate": 12}), 422, f"sequence: {rig} is one capture")
     refused(ask(kind="pipeline", capture=sequence, format="glb"), 422, "format: is glb, the asset of a sequence is one of usdz, usdc")
-    of_one = f"maps: {solved} is of a sequence: give the job of one capture here"
+    of_one = f"maps: {solved} is of a sequence: "
     refused(ask(kind="shade", maps=solved), 422, of_one)
     refused(ask(kind="solve", capture=sequence, sequence={"frame_rate": 0}), 422, "frame_rate")
     other = submit(client, kind="solve", capture=sequence, sequence={"frame_rate": 12})
