@@ -90,7 +90,7 @@ def test_the_standard_error_of_mirrored_normals_is_the_error_that_they_have(tmp_
      "frames[].light.irradiance: it is missing or wrong (every"),
     (SCENE._replace(images=SCENE.images / SCENE.irradiance[:, None, None, :]), {},
      "frames[].light.irradiance: the images look as if they were"),
-    (SCENE._replace(images=encoded(SCALED)), {}, "the images look display-encoded, but lin_rec709_scene is"),
+    (SCENE._replace(images=encoded(SCALED)), {}, "color_space: the images look display-encoded, but lin_rec709"),
     (SCENE._replace(images=decoded(encoded(SCALED))), {"color_space": "srgb_texture"},
      "color_space: the images look linear, but srgb_texture is"),
     (SCENE._replace(directions=SCENE.directions[::-1], irradiance=SCENE.irradiance[::-1]), {}, "frames[].light: the order looks reversed"),

@@ -54,7 +54,7 @@ def test_every_fault_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(("change", "sentence"), [
-    ({"schema": "relit.scan/1"}, "is \"relit.scan/1\", this program reads relit.scan-set/1"),
+    ({"schema": "relit.scan/1"}, 'schema: is "relit.scan/1", this program reads'),
     ({"scans": []}, "scans: has 0 entries, needs 1 or more"),
     ({"turntable": {"axis_point_m": [0, 0, 0], "axis": [0, 0, 0]}}, "turntable.axis: has zero length"),
 ])
