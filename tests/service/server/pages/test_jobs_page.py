@@ -1,15 +1,17 @@
 """Jobs are submitted by forms, followed, cancelled and continued; a lost connection is said and regained."""
 
 import json
+import math
 import re
 import shlex
 import subprocess
 import sys
+from urllib.parse import urlsplit
 
 import pytest
 
 from tests.service.server.pages.conftest import SAMPLES, new_context
-from tests.service.server.pages.cuttable import cuttable
+from tests.service.server.tcp_proxy import tcp_proxy
 
 JOB_MS = 120_000
 """Time for a small job on a loaded machine."""
@@ -159,12 +161,12 @@ def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
 @pytest.mark.long
 def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
-    with server.client() as client, cuttable(server.url) as way:
+    with server.client() as client, tcp_proxy(urlsplit(server.url).port) as way:
         job = slow_job(client, capture, sky)
         page = new_context(browser, base_url=way.url).new_page()
         page.goto(f"/jobs/{job}")
         page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
-        way.cut()
+        way.cut(away_s=math.inf)
         page.get_by_role("status").filter(has_text="The connection is lost").wait_for(timeout=JOB_MS)
         client.post(f"/v1/jobs/{job}/cancel")
         way.mend()
