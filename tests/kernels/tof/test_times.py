@@ -82,6 +82,7 @@ def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
     assert 1.4826 * np.median(np.abs(part)) == pytest.approx(1, abs=0.04)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("apart", [2.5, 3.0, 4.0, 6.0])
 def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, device):
     """Pulses of two bins, `apart` of their standard deviations apart."""

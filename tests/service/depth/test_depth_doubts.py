@@ -42,6 +42,7 @@ PHASES = {"three periods": phase_patterns("column", (16, 18, 21), 3),
           "micro": micro_patterns(WIDTH, "column")}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PHASES)
 def test_the_response_is_taken_off_waves(relit, tmp_path, light, name):
     write_capture(tmp_path, bent(light), PHASES[name], light=light, response=GAMMA)
@@ -52,6 +53,7 @@ def test_the_response_is_taken_off_waves(relit, tmp_path, light, name):
     assert 0.5 < np.median(error / maps.sigma[maps.mask]) < 1.4 and (error > 5 * maps.sigma[maps.mask]).mean() < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PHASES)
 def test_bent_waves_are_found(relit, tmp_path, light, name):
     """Without the response σ holds the error, and a sentence says what to measure; a linear projector gives no sentence."""

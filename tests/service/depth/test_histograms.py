@@ -79,6 +79,7 @@ def plain(tmp_path_factory):
     return counts, solve(tmp_path_factory.mktemp("plain"), counts)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [10.0, 0.02])
 def test_counts_in_other_units_have_the_same_sigma(plain, factor, tmp_path):
     counts, plain = plain

@@ -35,6 +35,7 @@ def fused(tmp_path_factory, shots):
     return fuse(FuseRequest(scan_set=file, out=folder / "out", voxel_m=VOXEL, texture=False, device="cpu"))
 
 
+@pytest.mark.long
 def test_the_fused_statue_is_better_than_its_scans(fused):
     ply = read_ply_points(fused.mesh_path)
     error = distance(ply.points)
