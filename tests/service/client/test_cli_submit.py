@@ -51,6 +51,7 @@ def test_a_folder_becomes_maps_frames_and_an_asset(relit, tmp_path: Path):
     assert "asset.usdz" in relit("jobs", "results", said(exported.out)["job"]).out
 
 
+@pytest.mark.long
 def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
     registered = relit("submit", "relight", f"server:{OWL}", "--environment", f"server:{SKY}", "--wait")
     assert registered.code == 0
@@ -66,6 +67,7 @@ def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
     assert one == other
 
 
+@pytest.mark.long
 def test_images_and_captures_that_are_several(relit, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     for name in ("d0.exr", "d1.exr"):

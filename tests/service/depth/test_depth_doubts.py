@@ -103,6 +103,7 @@ def changed(**fields):
     return [p.model_copy(update={name: change(p) for name, change in fields.items() if hasattr(p, name)}) for p in GRAY]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("declared", "words"), [
     (changed(inverse=lambda p: not p.inverse), "patterns and inverses are exchanged"),
     (changed(axis=lambda p: "row"), "columns and rows are exchanged"),

@@ -70,6 +70,7 @@ def test_the_report_lists_the_holes_and_what_was_seen(fused):
     assert all(0.3 < scan["residual_median_sigmas"] < 1.2 for scan in facts["scans"])
 
 
+@pytest.mark.long
 def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots]
     poses[4][:3, 3] += OFF * poses[4][:3, 0]

@@ -53,6 +53,7 @@ def test_points_are_fused_as_well_as_range_images(tmp_path, clouds):
     assert np.percentile(off, 95) < 15  # over 1.25 pixels of 7.5 mm the colour changes by 9 of 255
 
 
+@pytest.mark.long
 def test_points_and_range_images_make_one_surface(tmp_path, clouds):
     shots = turntable(VIEWS, (160, 120))
     file = write_scans(tmp_path, shots)

@@ -62,6 +62,7 @@ def test_the_general_solver(relit, tmp_path, dome):
     assert report["found"]["near"]["rounds"]["svbrdf"] <= 2
 
 
+@pytest.mark.long
 def test_cast_shadows_end_at_the_lamp(relit, tmp_path):
     """The general solver leaves out what the height hides from a lamp, and no more."""
     near_lights.write(tmp_path, SMALL, lamps(SMALL, 48, RADII, widest=85), cast_steps=200)
@@ -71,6 +72,7 @@ def test_cast_shadows_end_at_the_lamp(relit, tmp_path):
     assert angle.mean() < 0.05 and angle.max() < 2  # the rim of a shadow, within its margin of 0.3 pixels
 
 
+@pytest.mark.long
 def test_a_white_bowl_is_neither_flatter_nor_brighter_than_it_is(relit, tmp_path):
     """Bounced light adds a third to the readings: left in, the albedo is 1.07 for 0.8; taken off once, with that albedo, 0.68."""
     scene = bowl.bowl(20)
@@ -82,6 +84,7 @@ def test_a_white_bowl_is_neither_flatter_nor_brighter_than_it_is(relit, tmp_path
     assert report["found"]["near"]["rounds"]["svbrdf"] > 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("exponent", [1.0, 4.0])
 def test_lamps_that_shine_forward(relit, tmp_path, exponent):
     """Anisotropy: lamps aimed beside the centre; taken as the same all round, the height is wrong."""

@@ -67,6 +67,7 @@ def test_sources_that_a_horn_hides_in_part(relit, tmp_path):
     assert np.allclose(np.median(maps.diffuse_albedo[scene.mask], axis=0), horn.ALBEDO, rtol=0.02)
 
 
+@pytest.mark.long
 def test_a_mirror_with_a_distant_light_among_the_sources(relit, tmp_path):
     """The distant light shows in a few pixels alone; all others have to bear a reading of zero."""
     radiance = twin.mirror(NORMALS, VIEW, CENTRES, SHARPNESS, f0=0.9)[..., None] * COLOUR

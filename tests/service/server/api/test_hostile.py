@@ -161,6 +161,7 @@ def test_hostile_captures_are_refused_by_name(server, client, registered):
         assert found["problem"] in failures(server)
 
 
+@pytest.mark.long
 def test_hostile_environments_are_refused_by_name(server, client, registered):
     folder = registered / "environments"
     folder.mkdir()

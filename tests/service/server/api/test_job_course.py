@@ -36,6 +36,7 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     assert not (server.data / "projects/default/jobs" / job["id"]).exists()
 
 
+@pytest.mark.long
 def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-150", "spin_degrees": 360}}
     job = submit(client, **request)

@@ -38,6 +38,7 @@ def test_a_folder_is_uploaded_whole(server, page, folder):
     assert "128 × 128" in page.locator("#facts").inner_text()
 
 
+@pytest.mark.long
 def test_hidden_files_stay_here(server, page, folder):
     (folder / ".relit").mkdir()
     (folder / ".relit" / "cache").write_bytes(b"0")
