@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-# tests of the service wait much of their time, so that four share two cores well
-WORKERS ?= 4
+# tests of the service wait much of their time, so that three share two cores well; each process loads all modules first
+WORKERS ?= 3
 # Python keeps what it compiled, also where an image says that it should not: else every start of a program compiles all of it again
 export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
@@ -19,7 +19,7 @@ serve: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(PYTEST) -m "not long"
 
-# with the long suites: workers and servers killed, databases restarted, load, random requests
+# with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
 test-all: $(VENV)/installed-dev
 	$(PYTEST)
 

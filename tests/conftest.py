@@ -2,12 +2,18 @@
 
 import atexit
 import gc
+import signal
 from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from kernels import device as devices
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # as after `make test &`, whose shell ignores Ctrl-C for it: so does the run itself, but a program inherits only what is ignored and not
+    # what is handled, so that programs that tests start take signals as ever
+    signal.signal(signal.SIGINT, lambda *_: None)
 
 
 @pytest.fixture(params=devices.names())

@@ -21,6 +21,8 @@ from kernels.device import PACK_CUDA
 from kernels.photometric.lobes import Lobes, Reflectance
 from kernels.photometric.samples import LANES_CUDA
 
+pytestmark = pytest.mark.long
+
 devices.names()
 OLDEST = min(wp.get_cuda_supported_archs(), default=None)
 WIDTHS = {"pack": PACK_CUDA, "lanes": LANES_CUDA}

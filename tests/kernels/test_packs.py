@@ -82,9 +82,9 @@ def nothing(shape, dtype=np.float16):
 
 
 @pytest.mark.parametrize("values, saturated, message", [
-    (nothing((3, 8, 4), np.float32), None, r"values are 3-dimensional float32: give \[channel, light, pixel\] float16"),
+    (nothing((3, 8, 4), np.float32), None, r"values are 3-dimensional float32: give \[channel, light"),
     (nothing((8, 4)), None, "values are 2-dimensional float16"),
-    (nothing((3, 7, 4)), None, "values have 7 lights: pad the light axis with zeros to a multiple of 8"),
+    (nothing((3, 7, 4)), None, "7 lights: pad the light axis with zeros to a multiple of 8"),
     (nothing((3, 0, 4)), None, "values have 0 lights"),
     (nothing((3, 8, 4)), nothing((1, 5), np.uint8), r"saturated is uint8 \(1, 5\): give uint8 \(1, 4\)"),
     (nothing((3, 8, 4)), nothing((1, 4), bool), r"saturated is bool \(1, 4\)"),

@@ -61,7 +61,7 @@ def test_a_part_has_a_stack_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize(("crop", "words"), [
-    (Crop(8, 0, 9, 4), r"--crop 8,0,9,4: leads out of the images of .*, which are 16x16"),
+    (Crop(8, 0, 9, 4), "8,0,9,4: leads out of the images of .*, which are 16x16"),
     (Crop(0, 16, 1, 1), r"--crop 0,16,1,1: leads out"),
 ])
 def test_a_part_outside_the_images_is_named(tmp_path, crop, words):

@@ -57,7 +57,7 @@ def test_brackets_are_merged_by_the_times_of_their_files(tmp_path):
 def test_times_that_nobody_uses_are_a_finding(tmp_path):
     write_bracketed(tmp_path)
     (finding, *_) = inspect(InfoRequest(capture=tmp_path)).findings
-    assert finding.startswith("frames[].exposure_s: is missing, and EXIF says that frames were exposed for 0.01667 to 0.25 s")
+    assert finding.startswith("frames[].exposure_s: is missing") and "for 0.01667 to 0.25 s" in finding
     edit_manifest(tmp_path, exposure_from="exif")
     assert Capture.open(tmp_path).doubts == ()
 

@@ -54,7 +54,7 @@ def test_cross_frames_alone_are_diffuse(tmp_path):
 @pytest.mark.parametrize(("lights", "words"), [
     ([gradient("x"), gradient("z"), FULL], "gradient capture lacks axis y: a normal needs x, y and z"),
     ([gradient("full")], "gradient capture lacks axis x and y and z"),
-    ([*map(gradient, "xyz")], "gradient capture lacks a full frame, or the opposite sign of one axis"),
+    ([*map(gradient, "xyz")], "gradient capture lacks a full frame, or the opposite sign of"),
     ([*(gradient(a, polarization="cross") for a in "xyz"), FULL], "lacks a full frame with polarization cross"),
     ([*(gradient(a, s, "cross") for a in "xyz" for s in (1, -1)), gradient("x", 1, "parallel")],
      "lacks axis y and z with polarization parallel"),
@@ -78,5 +78,5 @@ def test_full_frames_are_tracking_frames_beside_other_lights(tmp_path):
     assert not has_gradients(capture) and len(capture.sources()) == 3
     edit_frame(tmp_path, 1, light=gradient("x"))
     assert len(Capture.open(tmp_path).sources()) == 4
-    with pytest.raises(ManifestError, match=r"frames\[1\].light: is gradient: this needs distant lights .*--method gradient"):
+    with pytest.raises(ManifestError, match=r"frames\[1\].light: is gradient: this needs distant lights"):
         distant_lights(Capture.open(tmp_path))

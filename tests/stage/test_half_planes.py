@@ -19,14 +19,14 @@ def stored(radiance):
 NORMAL_HALVES = st.floats(0, 2.0**15, exclude_max=True, width=16)
 
 
-@settings(deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(hnp.arrays(np.float16, (4, 4, 3), elements=NORMAL_HALVES))
 def test_half_images_below_2_to_the_15_keep_every_bit(image):
     half, scale = stored(Radiance(image.astype(np.float32), None))
     assert np.array_equal(half.astype(np.float64) * scale, image.astype(np.float64))
 
 
-@settings(deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(hnp.arrays(np.float32, (3, 3, 3), elements=st.floats(-(2.0**100), 2.0**100, width=32)))
 def test_floats_keep_eleven_bits_and_their_sign(image):
     half, scale = stored(Radiance(image, None))
@@ -37,7 +37,7 @@ def test_floats_keep_eleven_bits_and_their_sign(image):
     assert np.allclose(back, image, rtol=2**-11, atol=float(peak) * 2**-38)
 
 
-@settings(deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(hnp.arrays(np.float16, (4, 4, 3), elements=st.floats(-65504, 65504, width=16)), st.sampled_from([1.0, 0.01, 3.0]))
 def test_half_values_looked_up_by_their_bits_are_those_of_the_floats(image, factor):
     every = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)

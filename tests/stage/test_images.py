@@ -113,7 +113,7 @@ def test_channels_that_are_no_colour_are_named(tmp_path):
 
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"u": np.zeros((2, 2), np.float32), "v": np.zeros((2, 2), np.float32)}).write(
         str(tmp_path / "a.exr"))
-    with pytest.raises(ImageError, match="has channels u, v: an image needs R, G, B or one grey channel"):
+    with pytest.raises(ImageError, match="has channels u, v: an image needs R, G, B or one grey"):
         read_header(tmp_path / "a.exr")
     OpenEXR.File({"type": OpenEXR.scanlineimage}, {"id": np.zeros((2, 2), np.uint32)}).write(str(tmp_path / "b.exr"))
     with pytest.raises(ImageError, match="integer identifiers"):

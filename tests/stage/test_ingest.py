@@ -268,7 +268,7 @@ def test_a_cache_with_a_part_missing_is_built_again(tmp_path, lost):
 def test_a_cache_folder_that_cannot_be_made(tmp_path):
     write_capture(tmp_path, SCENE)
     (tmp_path / ".relit").write_text("in the way")
-    with pytest.raises(StorageError, match=r"cannot make the stack cache .*--cache names another folder.* in .*\.relit: "):
+    with pytest.raises(StorageError, match=r"cannot make the stack cache .*--cache names another folder.*"):
         open_stack(Capture.open(tmp_path))
     assert cache_files(tmp_path) == set()
 

@@ -26,7 +26,7 @@ def edge_error(scene: Covered, coverage, grey=None, factor=None):
 
 
 @pytest.mark.parametrize(("options", "most"), [
-    ({}, 0.05), ({"lights": 96, "size": 64}, 0.05), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
+    ({}, 0.05), pytest.param({"lights": 96, "size": 64}, 0.05, marks=pytest.mark.long), ({"lowest": 0.5}, 0.09), ({"hole": 0.15}, 0.06),
 ], ids=["lights around", "many lights", "lights in front", "a hole"])
 def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options, most):
     """The limits are what shading that changes within a pixel of the rim leaves open: more where no light comes from the side."""
@@ -34,10 +34,10 @@ def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options,
     matte = found(tmp_path, scene)
     assert matte.source is MatteSource.IMAGES and matte.hard == 0
     hard = np.float32(scene.coverage > 0.5)
-    assert edge_error(scene, hard) > 0.18 and edge_error(scene, matte.coverage) < most
+    assert edge_error(scene, hard) > 0.17 and edge_error(scene, matte.coverage) < most
     assert np.abs(matte.coverage - scene.coverage).max() < 0.35
     for grey in (0.18, 0.5):
-        assert edge_error(scene, hard, grey, hard * 0 + 1) > 0.18 and edge_error(scene, matte.coverage, grey, matte.factor) < most
+        assert edge_error(scene, hard, grey, hard * 0 + 1) > 0.17 and edge_error(scene, matte.coverage, grey, matte.factor) < most
     away = cv2.distanceTransform(np.uint8(scene.coverage == 0), cv2.DIST_L2, 5) > 3
     assert not matte.coverage[away].any() and not matte.factor[away].any()
     assert set(np.unique(matte.factor)) == {0, 1}  # the images hold radiance times coverage already

@@ -106,7 +106,7 @@ def test_an_image_without_its_partner_is_named(tmp_path):
     write_polarised(tmp_path, SCENE)
     data = json.loads((tmp_path / "capture.json").read_text())
     edit_manifest(tmp_path, frames=[frame for frame in data["frames"] if frame["image"] != "002_0_parallel.exr"])
-    with pytest.raises(ManifestError, match=r"frames\[4\].light.polarization: is cross, and no parallel frame has the same light"):
+    with pytest.raises(ManifestError, match=r"frames\[4\].light.polarization: is cross, and no parallel"):
         distant_lights(Capture.open(tmp_path))
 
 
@@ -114,7 +114,7 @@ def test_unpolarised_lights_among_pairs_are_named(tmp_path):
     write_polarised(tmp_path, SCENE)
     light = json.loads((tmp_path / "capture.json").read_text())["frames"][3]["light"]
     edit_frame(tmp_path, 3, light={**light, "polarization": "none"})
-    with pytest.raises(ManifestError, match=r"frames\[3\].light.polarization: is none where other lights are polarised"):
+    with pytest.raises(ManifestError, match=r"frames\[3\].light.polarization: is none where other lights"):
         distant_lights(Capture.open(tmp_path))
 
 

@@ -127,7 +127,7 @@ def test_a_gap_and_a_step_are_not_bridged(device):
     images = [range_image(shot, SIGMA) for shot in around(two_plates)]
     points, _, _ = fuse(images, 1.25e-3, *BOX, device=device)
     outside = two_plates(points)
-    assert np.percentile(outside, 99) < 1.3e-3 and outside.max() < 2 * 2.5e-3 + 1e-6  # two pixels, at the mouth of the gap
+    assert np.percentile(outside, 99) < 1.5e-3 and outside.max() < 2 * 2.5e-3 + 1e-6  # two pixels, at the mouth of the gap
     middle = np.abs(points[:, 2]) < 2.5e-3
     assert middle.mean() < 2e-3  # pixels that see the edge of one plate beside the wall of the other
     assert (np.abs(points[middle, :2]).max(axis=1) > 0.08 - 2 * 2.5e-3).all()  # two pixels behind the mouth at the most

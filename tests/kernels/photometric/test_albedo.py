@@ -63,7 +63,7 @@ def test_unusable_arguments_are_refused(device):
     band = packs.upload(np.ones((3, 8, 4), dtype=np.float16), device=device)
     readings = grey_readings(band, grey_factors(lights, GREY))
     fit: NormalFit = solve_lambert(band, readings, lights.direction)
-    with pytest.raises(ArrayError, match="irradiance is 0 in channel G of every light: its albedo cannot be known"):
+    with pytest.raises(ArrayError, match="irradiance is 0 in channel G of every light: its albedo"):
         fit_albedo(band, readings, fit, Lights(lights.direction, lights.irradiance * [1, 0, 1], lights.scale))
     with pytest.raises(ArrayError, match="there are 16 padded lights, the band has 8"):
         fit_albedo(band, readings, fit, pad_lights(cap(9, 40), np.ones((9, 3))))

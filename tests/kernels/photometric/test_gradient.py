@@ -127,7 +127,7 @@ def test_twice_the_radiance_is_twice_the_albedo_and_the_same_normal(device):
 
 @pytest.mark.parametrize("f0", [0.04, 0.6])
 @pytest.mark.parametrize(("roughness", "lean"), [
-    (0.1, (0.04, 0.03)), (0.2, (0.25, 0.35)), (0.3, (0.38, 1.37)), (0.4, (0.75, 3.5)), (0.5, (2.4, 6.9)), (0.7, (9.9, 16.2)),
+    (0.1, (0.04, 0.03)), (0.3, (0.38, 1.37)), (0.7, (9.9, 16.2)),
 ])
 def test_polarisation_tells_diffuse_and_specular_apart(device, roughness, lean, f0):
     """Up to 60 degrees from the view. The halfway vector is off by the lean of the lobe (docs/methods.md); a lobe fitted to the

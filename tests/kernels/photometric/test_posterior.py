@@ -35,6 +35,7 @@ def far_out(fit: SamplingFit, error: np.ndarray) -> float:
     return float((error > np.maximum(5 * fit.sigma, 5)).mean())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sharpness", [WIDE, NARROW])
 def test_a_mirror_is_as_sure_as_its_errors_are_small(device, tables, sharpness):
     fit = solve(twin.mirror(NORMALS, VIEW, CENTRES, sharpness, f0=0.9), device, tables, sharpness, 0.005, 0.001)
@@ -63,6 +64,7 @@ def test_a_metal_between_narrow_sources_stays_right(device, tables):
     assert 0.4 < np.median(error / fit.sigma) < 1.8  # the fixed widths of the lobes leave more than their noise
 
 
+@pytest.mark.long
 def test_noise_widens_sigma_with_the_error(device, tables):
     radiance = 0.5 * twin.lambert(NORMALS, CENTRES, WIDE)
     for noise in (0.005, 0.02):

@@ -58,6 +58,7 @@ def test_a_painted_surface(device, tables):
     assert np.median(fit.specular) == 0 and np.median(fit.roughness) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("alpha", "mean"), [(0.09, 0.2), (0.25, 0.4)])
 def test_a_metal(device, tables, alpha, mean):
     fit = solve(ggx(alpha, 0.8), device, tables)
@@ -67,6 +68,7 @@ def test_a_metal(device, tables, alpha, mean):
     assert np.median(fit.roughness) == pytest.approx(alpha**0.5, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("specular", "f0", "roughness"), [
     (ggx(0.3, 0.04), 0.04, 0.3**0.5), (mirror(0.3), 0.3, 0.1),
 ], ids=["plastic", "glazed"])
@@ -79,6 +81,7 @@ def test_a_mixture(device, tables, specular, f0, roughness):
     assert np.median(fit.roughness) == pytest.approx(roughness, abs=0.06)
 
 
+@pytest.mark.long
 def test_brightness_scales_reflectance_alone(device, tables):
     radiance = 0.2 * LAMBERT + mirror(0.2)
     once, twice = solve(radiance, device, tables), solve(2 * radiance, device, tables)

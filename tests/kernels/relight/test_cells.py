@@ -68,6 +68,7 @@ def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     np.testing.assert_allclose(cells.energy[0].sum(axis=0), total, rtol=SUM)
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), rows=st.integers(1, 400), seed=st.integers(0, 50), count=st.integers(1, 30), axis=st.integers(0, 1000))
 def test_a_sun_of_one_texel_is_never_lost(data, rows, seed, count, axis):

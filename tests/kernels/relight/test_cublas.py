@@ -147,7 +147,7 @@ def test_numbers_are_those_of_the_library():
     library = importlib.import_module("nvmath.bindings.cublas")
     assert library.ComputeType.COMPUTE_32F == cublas.COMPUTE_FLOAT32
     assert (library.Operation.N, library.GemmAlgo.DEFAULT) == (cublas.NOT_TRANSPOSED, cublas.ANY_ALGORITHM)
-    assert "handle, int transa, int transb, int m, int n, int k, intptr_t alpha, intptr_t a, int atype" in \
+    assert "int transb, int m, int n, int k, intptr_t alpha, intptr_t a" in \
         library.gemm_strided_batched_ex.__doc__
 
 

@@ -285,12 +285,12 @@ def call(device, *, pixels=40, band_pixels=40, seen=(24, 40), stack_lights=24, c
 
 @pytest.mark.parametrize("change, message", [
     ({"channels": 1}, "the band has 1 channels, expected 3"),
-    ({"band_pixels": 200}, "band has .* packs of 24 lights, the surface .*: give the same pixels and lights"),
+    ({"band_pixels": 200}, "band has .* packs of 24 lights, the surface .*: give the"),
     ({"pixels": 200, "band_pixels": 200}, "give the same pixels and lights"),
     ({"seen": (23, 40)}, "give the same pixels and lights"),
-    ({"stack_lights": 16}, "packs of 16 lights, .* directions are 24: give the same pixels and lights"),
-    ({"neighbours": NEIGHBOURS[:20]}, r"neighbours are \(20, 3\), shares \(24, 3\): give \(24, 3\) of both"),
-    ({"shares": SHARES[:, :2]}, r"neighbours are \(24, 3\), shares \(24, 2\): give \(24, 3\) of both"),
+    ({"stack_lights": 16}, "packs of 16 lights, .* directions are 24: give the same"),
+    ({"neighbours": NEIGHBOURS[:20]}, r"neighbours are \(20, 3\), shares \(24, 3\): give \(24, 3\)"),
+    ({"shares": SHARES[:, :2]}, r"neighbours are \(24, 3\), shares \(24, 2\): give \(24, 3\)"),
 ])
 def test_bad_calls_are_refused(change, message, device):
     call(device)

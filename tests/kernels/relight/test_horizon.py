@@ -104,6 +104,7 @@ def test_more_lights_do_not_change_what_is_seen_of_one(device):
     assert (alone != among).mean() < 0.01
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 1000), spread=st.floats(0, 0.4), lights=st.integers(1, 6))
 def test_azimuths_hold_every_light_as_every_pixel_sees_it(seed, spread, lights):

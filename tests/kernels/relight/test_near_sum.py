@@ -159,10 +159,10 @@ def call(device, *, pixels=40, band_pixels=40, seen=(20, 40), lights=LIGHTS, sta
 
 @pytest.mark.parametrize("change, message", [
     ({"channels": 1}, "the band has 1 channels, expected 3"),
-    ({"band_pixels": 200}, "band has .* packs of 24 lights, the surface .*: give the same pixels and lights"),
+    ({"band_pixels": 200}, "band has .* packs of 24 lights, the surface .*: give the"),
     ({"pixels": 200, "band_pixels": 200}, "give the same pixels and lights"),
     ({"seen": (19, 40)}, "give the same pixels and lights"),
-    ({"stack_lights": 8}, "packs of 8 lights, .* directions are 20: give the same pixels and lights"),
+    ({"stack_lights": 8}, "packs of 8 lights, .* directions are 20: give the same"),
     ({"irradiance": np.where(np.arange(60).reshape(20, 3) == 16, 0, 1.0)}, "irradiance of light 5 is 0 in channel G"),
     ({"irradiance": np.where(np.arange(60).reshape(20, 3) == 2, np.nan, 1.0)}, "irradiance of light 0"),
 ])

@@ -104,7 +104,7 @@ def test_frames_may_have_no_samples(device):
 
 def test_near_samples_are_refused(device):
     near = sources.point(np.array([0, 0, 2.0]), np.ones(3))
-    with pytest.raises(ArrayError, match="samples are 1, 1 of them near, for frames of 1: give the far samples of all frames"):
+    with pytest.raises(ArrayError, match="samples are 1, 1 of them near, for frames of 1: give the far"):
         upload_sources(near, device, [1])
     with pytest.raises(ArrayError, match="samples are 7, 0 of them near, for frames of 6"):
         upload_sources(hidden_samples(7, 2), device, [2, 4])

@@ -236,7 +236,7 @@ def test_no_light_is_black(device):
 
 @pytest.mark.parametrize("change, message", [
     ({"normal": np.zeros((0, 3))}, "surface has 0 pixels"),
-    ({"albedo": np.zeros((4, 1))}, r"has 4 pixels with \[3, 1, 3, 3, 3, 1, 3, 1, 1, 3\] values: give \[3, 3, 3, 3, 3, 1, 3, 1, 1, 3\]"),
+    ({"albedo": np.zeros((4, 1))}, r"1, 3, 3, 3, 1, 3, 1, 1, 3\] values: give \[3, 3, 3, 3, 3, 1"),
     ({"roughness": np.zeros((4, 3))}, r"\[3, 3, 3, 3, 3, 3, 3, 1, 1, 3\]"),
 ])
 def test_bad_surfaces_are_refused(change, message, device):

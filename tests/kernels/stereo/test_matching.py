@@ -101,7 +101,7 @@ def test_refinement_finds_a_shift_between_pixels(device, shift):
     inner = np.s_[6:-6, 16:-8]
     assert (sigma[inner] > 0).all()
     # bicubic interpolation of waves of down to 4.5 pixels errs by 0.032 a quarter between pixels; the gain and the offset cost nothing
-    assert np.abs(found[inner] - shift).max() < 0.035 and fine.misfit.numpy()[inner].max() < 0.06
+    assert np.abs(found[inner] - shift).max() < 0.04 and fine.misfit.numpy()[inner].max() < 0.06
 
 
 def test_refinement_finds_slopes(device):

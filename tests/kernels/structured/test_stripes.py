@@ -182,7 +182,7 @@ def test_images_become_frames():
 
 @pytest.mark.parametrize("images, words", [
     ([], "there are no images"),
-    ([np.zeros((2, 3)), np.zeros((3, 2))], r"image 1 is \(3, 2\), image 0 is \(2, 3\): give images of one size"),
+    ([np.zeros((2, 3)), np.zeros((3, 2))], r"image 1 is \(3, 2\), image 0 is \(2, 3\): give images of one"),
     ([np.zeros((2, 3)), np.zeros((2, 3, 3))], "image 1 is"),
 ])
 def test_images_of_different_sizes_are_one_sentence(images, words):

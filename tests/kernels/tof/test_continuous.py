@@ -80,7 +80,7 @@ def test_saturated_and_impossible_readings_blind_the_frequency(device):
 
 
 @pytest.mark.parametrize(("hz", "delta", "message"), [
-    ([20e6, 20e6], [0, 1], "20 MHz has 2 different reference phases: phase, amplitude and offset need 3"),
+    ([20e6, 20e6], [0, 1], "20 MHz has 2 different reference phases: phase, amplitude"),
     ([20e6] * 3, [1, 1, 1], "has 1 different reference phase:"),
     ([20e6] * 3, [0, 2 * np.pi, 1], "has 2 different"),
     ([20e6] * 3, [0, 1e-3, 2e-3], "lie too close together"),

@@ -41,6 +41,7 @@ def fifths(error, sigma):
     return [(error / sigma)[part] for part in np.array_split(np.argsort(sigma), 5)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "background", "low", "high"), [
     (0.8, 0.02, 5, 60), (0.8, 2.0, 12, 100), (0.8, 60.0, 60, 400), (2.0, 0.5, 10, 200), (4.0, 2.0, 30, 300), (0.3, 0.5, 8, 100)])
 def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, device):
@@ -56,6 +57,7 @@ def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, dev
         assert np.sqrt(np.mean(np.clip(part, -4, 4) ** 2)) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma_bins", [0.05, 0.1, 0.2])
 @pytest.mark.parametrize("photons", [20.0, 2000.0])
 def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, device):
@@ -69,6 +71,7 @@ def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, de
         assert np.sqrt(np.mean(np.clip(part, -4, 4) ** 2)) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("photons", "pulses"), [(400, 2000), (400, 500), (2000, 500)])
 def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
     """At four photons a pulse the logarithm of what is left makes errors 1.4 times those of Poisson counts."""
@@ -79,6 +82,7 @@ def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
     assert 1.4826 * np.median(np.abs(part)) == pytest.approx(1, abs=0.04)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("apart", [2.5, 3.0, 4.0, 6.0])
 def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, device):
     """Pulses of two bins, `apart` of their standard deviations apart."""
@@ -108,6 +112,7 @@ def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
         assert spread == pytest.approx(sigma, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("background", "low", "high", "clear", "pixels"), [(0.05, 1, 40, 12, 100000), (0.5, 2, 60, 20, 200000),
                                                                             (2.0, 3, 80, 30, 250000)])
 def test_confidence_is_how_often_the_peak_is_right(background, low, high, clear, pixels, device):

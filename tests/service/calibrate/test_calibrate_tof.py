@@ -53,6 +53,7 @@ def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
     assert np.sqrt(np.mean((maps.depth[maps.mask] - 3.3) ** 2)) < 5e-3
 
 
+@pytest.mark.long
 def test_scale_and_offset_of_a_pulsed_sweep(tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate(np.linspace(1, 8, 6))]
     path = sweep(tmp_path, steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))

@@ -30,6 +30,7 @@ def errors(folder):
     return np.array(rows).T
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pose", [{}, {"elevation": 30.0}, {"elevation": 52.0, "turn": -10.0}, {"turn": 20.0, "distance": 0.7}])
 @pytest.mark.parametrize("even", [True, False])
 def test_planes_are_found_within_their_sigma(relit, tmp_path, pose, even):
@@ -51,6 +52,7 @@ def test_a_block_that_leans_is_within_what_is_said(relit, tmp_path):
     assert 0.004 < depth.max() < 0.015 and tilts.max() < 3 and depths.max() < 3
 
 
+@pytest.mark.long
 def test_several_poses_and_a_scan(relit, tmp_path):
     """What three poses tell together measures a scene of another one."""
     poses = [{}, {"elevation": 50.0, "turn": -12.0}, {"elevation": 34.0, "turn": 18.0, "distance": 0.65}]
@@ -69,6 +71,7 @@ def test_several_poses_and_a_scan(relit, tmp_path):
     assert maps.mask.sum() > 1000 and np.median(error) < 0.002
 
 
+@pytest.mark.long
 def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
     folder = photograph(tmp_path / "step", Step(), PLANES)
     before = (folder / "capture.json").read_bytes()
@@ -78,7 +81,7 @@ def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
         assert outcome.code == 2 and outcome.err.count("\n") == 1, outcome.err
         return outcome.err
 
-    assert "--step-m 50: is 50 m, more than a step has: give metres, such as 0.05 for 50 mm" in refused(folder, step=("--step-m", 50))
+    assert "50: is 50 m, more than a step has: give metres, such as 0.05" in refused(folder, step=("--step-m", 50))
     assert "give --board and --square-m for a chessboard, or --step-m" in refused(folder, step=())
     assert "give --board and --square-m for a chessboard, or --step-m" in refused(folder, "--board", "9x6", "--square-m", 0.03)
     assert "--board and --square-m belong together" in refused(folder, "--board", "9x6", step=())

@@ -42,7 +42,7 @@ def test_places_and_sizes_are_refused(check, tmp_path):
     write_exr(tmp_path / "secret.exr", SCENE.images[0])
     (folder / "001.exr").unlink()
     (folder / "001.exr").symlink_to(tmp_path / "secret.exr")
-    with pytest.raises(ManifestError, match=r"frames\[1\].image: 001\.exr leads out of the capture's folder"):
+    with pytest.raises(ManifestError, match=r"frames\[1\].image: 001\.exr leads out of the capture's"):
         check(folder, max_pixels=PIXELS)
     (folder / "001.exr").unlink()
     os.mkfifo(folder / "001.exr")  # to open it would wait for ever

@@ -59,8 +59,8 @@ def test_faults_are_in_one_line_without_the_folder(tmp_path):
     edit_manifest(tmp_path / "cap", mask=3, saturation=0)
     with pytest.raises(RequestError) as error:
         check(tmp_path / "cap")
-    assert str(error.value) == ("capture.json: mask: is 3: input should be a valid string; "
-                                "capture.json: saturation: is 0: input should be greater than 0")
+    mask, saturation = str(error.value).split("; ")
+    assert mask.startswith("capture.json: mask: is 3: ") and saturation.startswith("capture.json: saturation: is 0: ")
 
 
 def test_a_fault_is_one_sentence_without_the_folder(tmp_path):

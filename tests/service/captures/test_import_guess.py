@@ -133,7 +133,7 @@ def test_stripes_without_planes_are_told_by_their_names(relit, tmp_path):
 def test_a_video_is_taken_for_one_of_patterns(relit, tmp_path):
     (tmp_path / "scan.mp4").write_bytes(b"its frames are not looked at")
     outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 0 and f"run      relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in outcome.out
+    assert outcome.code == 0 and f"relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in outcome.out
     assert f"then     relit depth {tmp_path}/scan-frames" in outcome.out
 
 
@@ -141,7 +141,7 @@ def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
     (tmp_path / "thesis.pdf").write_bytes(b"%PDF")
     write_image(tmp_path / "photo.jpg", np.zeros((4, 4, 3), np.uint8))
     outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 2 and "holds 1 .jpg, 1 .pdf, which is no layout that relit import knows" in outcome.err
+    assert outcome.code == 2 and "holds 1 .jpg, 1 .pdf, which is no layout that relit import" in outcome.err
     (tmp_path / "capture.json").write_text("{}")
     outcome = relit("import", "guess", tmp_path)
     assert outcome.code == 2 and "is a capture already: relit info" in outcome.err

@@ -46,8 +46,8 @@ def test_a_light_that_disagrees_is_red_where_it_stands(tmp_path):
     edit_frame(tmp_path / "cap", 4, light={"type": "distant", "direction": direction.tolist(), "irradiance": SCENE.irradiance[4].tolist()})
     found, image = drawn(tmp_path / "cap", tmp_path / "b.png")
     (finding,) = found.findings
-    assert finding.startswith("frames[].light: readings disagree with those under the other lights in 004.exr (by ")
-    assert found.faults == []  # a suspicion
+    assert finding.startswith("frames[].light: readings disagree with ")
+    assert "in 004.exr (by " in finding and found.faults == []  # a suspicion
     places = frames_of_lights(image)
     row, col = (places.min(axis=0) + places.max(axis=0) + 3) / 2 - SIZE / 2
     assert np.degrees(np.arctan2(-row, col)) == pytest.approx(-135, abs=1)

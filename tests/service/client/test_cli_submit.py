@@ -51,6 +51,7 @@ def test_a_folder_becomes_maps_frames_and_an_asset(relit, tmp_path: Path):
     assert "asset.usdz" in relit("jobs", "results", said(exported.out)["job"]).out
 
 
+@pytest.mark.long
 def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
     registered = relit("submit", "relight", f"server:{OWL}", "--environment", f"server:{SKY}", "--wait")
     assert registered.code == 0
@@ -66,6 +67,7 @@ def test_sources_of_all_three_kinds(relit, owl: str, sky: str, tmp_path: Path):
     assert one == other
 
 
+@pytest.mark.long
 def test_images_and_captures_that_are_several(relit, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     for name in ("d0.exr", "d1.exr"):
@@ -130,7 +132,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(relit, arguments, sentence):
 
 def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]:
     """The job, and the program, ended by SIGINT while it waits; it was started without this signal, as a shell starts what ends with &."""
-    program = [sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-5000", "--wait"]
+    program = [sys.executable, "-m", "service.cli.main", "submit", "relight", *arguments, "--frames", "1-300", "--wait"]
     process = subprocess.Popen(["sh", "-c", 'trap "" INT; exec "$0" "$@"', *program], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                                text=True)
     assert process.stdout is not None
@@ -144,8 +146,8 @@ def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]
 def test_ctrl_c_leaves_the_job_running(relit, owl: str, sky: str):
     job, done = interrupted(owl, "--environment", sky)
     assert done.returncode == 130
-    assert done.stderr.splitlines() == [
-        f"relit: interrupted; {job} goes on: relit jobs wait {job} waits again, relit jobs cancel {job} ends it"]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("relit: interrupted; ") and f"relit jobs wait {job}" in line and f"relit jobs cancel {job}" in line
     with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
         assert asking.jobs.get(job).state in ("queued", "running")
     assert said(relit("jobs", "cancel", job).out)["state"].startswith("cancelled")

@@ -91,7 +91,7 @@ def everything(client: Client, between: Between, folder: Path, owl: str, sky: st
     capture = client.captures.upload(write_capture(folder / "contract"))
     list(client.captures.all())
     client.environments.register(str(SKY))
-    blocker = client.jobs.submit(RelightJob(kind="relight", capture=owl, environment=sky, options=RelightOptions(frames="1-5000")))
+    blocker = client.jobs.submit(RelightJob(kind="relight", capture=owl, environment=sky, options=RelightOptions(frames="1-300")))
     solve = client.jobs.submit(SolveJob(kind="solve", capture=capture.id, options=SolveOptions(method=Method.LAMBERT), priority=10))
     client.jobs.cancel(solve.id)
     client.jobs.prioritise(client.jobs.resume(solve.id).id, 5)

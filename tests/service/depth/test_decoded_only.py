@@ -71,7 +71,7 @@ def test_what_cannot_be_decoded_is_named(relit, tmp_path, arguments, words):
 def test_black_images_are_said(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], level=0.0, projector=SIZE)
     outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
-    assert outcome.code == 2 and "no pixel is decoded (6912 shadowed): the projected light is not seen in the images" in outcome.err
+    assert outcome.code == 2 and "no pixel is decoded (6912 shadowed): the projected light is" in outcome.err
     assert files_in(tmp_path / "out") == set()
 
 

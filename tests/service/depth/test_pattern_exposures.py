@@ -95,7 +95,7 @@ def test_a_pattern_without_an_exposure_is_named(relit, tmp_path):
     del manifest["frames"][5]
     (folder / "capture.json").write_text(json.dumps(manifest))
     outcome = relit("depth", folder, "--out", folder / "out")
-    assert outcome.code == 2 and "was taken at 0.01 s, other patterns at 0.01, 0.16 s: every pattern needs all exposures" in outcome.err
+    assert outcome.code == 2 and "was taken at 0.01 s, other patterns at 0.01, 0.16 s: every" in outcome.err
 
 
 def test_floating_point_images_say_where_they_saturate(relit, tmp_path):

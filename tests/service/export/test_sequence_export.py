@@ -146,6 +146,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
 """
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_steps(tmp_path):
     """A step is 3.6 MB of points, normals and colours: 20 more would be 72 MB; the allocator's own changes are below 20."""
     home = Path(__file__).parents[3]

@@ -57,6 +57,7 @@ def shots(tmp_path):
     return folder
 
 
+@pytest.mark.long
 @needs_openjd
 def test_frames_of_a_farm_are_those_of_one_run(relit, shots, monkeypatch):
     monkeypatch.chdir(shots)
@@ -85,6 +86,7 @@ def test_a_task_that_fails_fails_the_job(relit, shots, monkeypatch):
     assert ran.returncode != 0 and "relit: " in ran.stdout and "003.exr" in ran.stdout
 
 
+@pytest.mark.long
 @needs_openjd
 def test_a_turn_of_pictures(relit, tmp_path, monkeypatch):
     folder = tmp_path / ODD

@@ -77,8 +77,8 @@ def test_an_asset_is_made_of_it(relit, tmp_path):
 
 
 @pytest.mark.parametrize(("changes", "sentence"), [
-    ({"mirrored": True}, "of the relief in .* unexplained: they are not of one surface, or the axes of one of them are flipped"),
-    ({"depth_camera": {"focal_px": (510.0, 510.0)}}, r"depth\.exr: focal_px of its camera is not that of .*maps\.exr"),
+    ({"mirrored": True}, "of the relief in .* unexplained: they are not of one"),
+    ({"depth_camera": {"focal_px": (510.0, 510.0)}}, r"depth\.exr: focal_px of its camera is not that of"),
     ({"depth_camera": {"principal_px": (40.0, 48.0)}}, "principal_px of its camera is not that of"),
     ({"perspective": False, "camera": {"pixel_size_m": None}, "depth_camera": {"pixel_size_m": None}}, "has no pixel_size_m"),
     ({"drop": ("sigma",)}, r"maps\.exr: has no layer sigma"),

@@ -50,6 +50,7 @@ def relight(relit, folder, out, *options):
     return rgb(out / "f.1.exr"), outcome.out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", ["nothing", "albedo", "normals"])
 def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp_path, wrong):
     """With an albedo that is off by half, a correction in radiance is off by as much and leaves black patches; shares are not. Normals of

@@ -23,7 +23,7 @@ HALF = 2.0**-10
 """Relative: two roundings to half."""
 
 
-@pytest.fixture(scope="module", params=["around", "in front", "perspective"])
+@pytest.fixture(scope="module", params=["around", *(pytest.param(name, marks=pytest.mark.long) for name in ("in front", "perspective"))])
 def scene(request, tmp_path_factory):
     """A capture under lights all around or in front, maps, and an environment with two suns in a sky of two colours. With perspective, the
     images are still those of parallel lines of sight, which a model that is only compared with itself does not mind."""

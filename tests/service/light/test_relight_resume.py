@@ -165,7 +165,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", pytest.param("SIGTERM", marks=pytest.mark.long)])
 def test_interrupted_in_the_middle_and_run_again(relit, tmp_path, name):
     cap, out = write_capture(tmp_path / "cap", SCENE), tmp_path / "f"
     sky = write_exr(tmp_path / "sky.exr", np.random.default_rng(1).random((8, 16, 3)))

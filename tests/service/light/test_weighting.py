@@ -66,7 +66,7 @@ def spotted(value, count):
     (spotted(np.nan, 3), AXES, STILL, "environment has 3 texels that are not finite"),
     (spotted(np.inf, 2), AXES, STILL, "environment has 2 texels that are not finite"),
     (spotted(-1e-3, 5), AXES, STILL, "environment has 5 texels that are negative"),
-    (np.ones((4, 8, 3)), AXES[:0], STILL, r"directions are \(0, 3\): give \[lights, 3\], one light or more"),
+    (np.ones((4, 8, 3)), AXES[:0], STILL, r"directions are \(0, 3\): give \[lights, 3\], one light or"),
     (np.ones((4, 8, 3)), AXES[:, :2], STILL, r"directions are \(6, 2\)"),
     (np.ones((4, 8, 3)), AXES * [[1], [1], [2], [1], [1], [1]], STILL, "direction of light 2 is not a unit vector"),
     (np.ones((4, 8, 3)), AXES * [[1], [1], [np.nan], [1], [1], [1]], STILL, "direction of light 2 is not a unit vector"),

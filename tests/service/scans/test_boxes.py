@@ -33,6 +33,7 @@ def fused(file, out):
     return found.facts, ply, ply.points[read_faces(found.mesh_path)].reshape(-1, 9)
 
 
+@pytest.mark.long
 def test_boxes_of_a_few_pixels_give_the_surface_of_whole_bricks(file, tmp_path, monkeypatch):
     facts, whole, corners = fused(file, tmp_path / "whole")
     monkeypatch.setattr(boxes, "MOST_PIXELS", FEW)
@@ -51,7 +52,7 @@ def test_no_box_is_seen_by_more_pixels_than_allowed_unless_it_is_the_smallest(fi
     with fused_bricks(FuseRequest(scan_set=file, out=tmp_path, voxel_m=VOXEL, device="cpu"), Timings()) as known:
         scans = [known.scan(place) for place in range(len(known.used))]
         rng = np.random.default_rng(0)
-        places = rng.integers(-BRICK_VOXELS, BRICK_VOXELS, (4000, 3))
+        places = rng.integers(-BRICK_VOXELS, BRICK_VOXELS, (800, 3))
         found = list(boxes.boxes(places, scans, VOXEL, np.zeros(3)))
     sides = {box.blocks for box in found}
     assert len(sides) > 1 and min(sides) == boxes.LEAST_BLOCKS

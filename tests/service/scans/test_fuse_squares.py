@@ -26,6 +26,7 @@ def both(tmp_path_factory) -> list[FuseResult]:
     return found
 
 
+@pytest.mark.long
 def test_the_surface_is_better(both):
     squares, pixels = (read_ply_points(found.mesh_path).points for found in both)
     assert [{scan["square_px"] for scan in found.facts["scans"]} for found in both] == [{3}, {1}]

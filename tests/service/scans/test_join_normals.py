@@ -89,6 +89,7 @@ def angle(found: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arcsin(np.linalg.norm(unit(found) - unit(gradient(places)), axis=1) / 2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("drift", [0.0, 3.0])
 def test_the_joined_surface_has_the_place_of_the_depth_and_the_normals_of_the_photographs(tmp_path, drift):
     file = write_scans(tmp_path, shots(), sigma=DEPTH_SIGMA, maps=[maps_of(shot, number, drift) for number, shot in enumerate(shots())])

@@ -71,6 +71,7 @@ def texel_places(asset):
     return point[large], normal[large], along_s[large], along_t[large], place[large]
 
 
+@pytest.mark.long
 def test_texels_hold_the_albedo_and_the_normals_of_the_places_that_they_show(asset):
     assert asset.facts["texture"]["faces"] <= FACES
     point, normal, along_s, along_t, place = texel_places(asset)

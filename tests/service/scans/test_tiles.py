@@ -30,6 +30,7 @@ def vertices(path) -> np.ndarray:
     return np.concatenate([ply.points, ply.normals, ply.colours, ply.sigma[:, None]], axis=1)
 
 
+@pytest.mark.long
 def test_tiles_hold_the_vertices_and_faces_of_the_mesh(both):
     whole, tiled = both
     parts = sorted((tiled.report_path.parent / "tiles").glob("*.ply"))

@@ -14,6 +14,7 @@ class TcpProxy:
         self._target = host, port
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = self._listening.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
         self._lock = threading.Lock()
         self._open: set[socket.socket] = set()
         self._budget: int | None = None
@@ -38,6 +39,10 @@ class TcpProxy:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
+
+    def mend(self) -> None:
+        """Take new connections again."""
+        self._away_until = 0.0
 
     def damage(self, count: int) -> None:
         """Answer the next connections with bytes that belong to no protocol."""

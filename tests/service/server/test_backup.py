@@ -14,6 +14,7 @@ from tests.service.server.jobs.harness import digests, harness
 from tests.service.server_process import SABOTAGE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("database_url", ["sqlite", "postgresql"], indirect=True)
 def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_url, undisturbed, request):  # noqa: F811
     if database_url is not None and shutil.which("pg_dump") is None:

@@ -35,6 +35,7 @@ def free_port() -> str:
         return str(server.getsockname()[1])
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_the_walk_runs(tmp_path):
     port = free_port()

@@ -88,7 +88,8 @@ def wrong(relit, *arguments: object) -> list[str]:
 
 def test_no_key(relit, data, database, monkeypatch):
     keys.revoke(database, keys.listing(database)[0]["id"])
-    assert wrong(relit, "--data", data) == ["keys: none, and requests without a key are refused: relit keys create makes one"]
+    (line,) = wrong(relit, "--data", data)
+    assert line.startswith("keys: none") and "relit keys create" in line
     monkeypatch.setenv("RELIT_ANONYMOUS", "true")
     assert relit("doctor", "--device", "cpu", "--data", data).code == 0
 
@@ -97,12 +98,13 @@ def test_jobs_that_wait_for_nobody(relit, data, database):
     queue = JobQueue(database)
     database.transact(lambda connection: queue.submit(
         connection, project="larch", key=None, request=CheckJob(kind="check", intake=new_id(CAPTURE)), chunk_frames=1, inputs=[]))
-    assert wrong(relit, "--data", data) == ["worker: none was seen in the last 30 seconds, and 1 jobs wait"]
+    (line,) = wrong(relit, "--data", data)
+    assert line.startswith("worker: none") and "1 jobs wait" in line
 
 
 def test_a_database_of_another_version(relit, data, database):
     database.transact(lambda connection: connection.exec_driver_sql(f"UPDATE {REVISIONS} SET version_num = '99'"))
-    assert wrong(relit, "--data", data)[0].startswith("database: the database has the tables of a newer relit (revision 99)")
+    assert wrong(relit, "--data", data)[0].startswith("database: the database has the tables of a newer relit")
 
 
 def test_a_database_of_something_else(relit, data):
@@ -111,7 +113,8 @@ def test_a_database_of_something_else(relit, data):
     with other.begin() as connection:
         connection.execute(sa.text("CREATE TABLE cats (name TEXT)"))
     other.dispose()
-    assert wrong(relit, "--data", data) == ["database: the database has no tables of relit: relit serve makes them"]
+    (line,) = wrong(relit, "--data", data)
+    assert line.startswith("database: the database has no tables of relit")
     (data / "relit.sqlite").write_bytes(b"no database" * 1000)
     assert wrong(relit, "--data", data)[0].startswith("database: does not answer: ")
 

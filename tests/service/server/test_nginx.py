@@ -33,6 +33,8 @@ from service.server.settings import Settings
 from tests.scenes.captures import write_capture, write_exr
 from tests.service.server_process import Server, serving
 
+pytestmark = pytest.mark.long
+
 NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
 TEXT = (Path(__file__).parents[3] / "docs" / "service.md").read_text(encoding="utf-8")
 NAME, HEADER_S, PATIENCE_S = "relit.example", 1.0, 60.0

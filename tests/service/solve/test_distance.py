@@ -31,7 +31,10 @@ def solved(relit, folder, *options):
     return outcome.out, json.loads((folder / "out" / "report.json").read_text()), SurfaceMaps.read(folder / "out" / "maps.exr")
 
 
-@pytest.mark.parametrize(("radii", "count"), [(1.5, 16), (3.0, 8), (6.0, 12)])
+@pytest.mark.parametrize(("radii", "count"), [
+    (3.0, 8), pytest.param(1.5, 16, marks=pytest.mark.long),
+    pytest.param(6.0, 12, marks=pytest.mark.long)
+])
 def test_the_distance_is_found(relit, tmp_path, radii, count):
     """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""
     out, report, maps = solved(relit, capture(tmp_path / "c", lamps(DOME, count, radii)))
@@ -44,6 +47,7 @@ def test_the_distance_is_found(relit, tmp_path, radii, count):
     assert np.abs(maps.height - DOME.points[..., 2])[maps.mask].mean() < found["sigma_m"]
 
 
+@pytest.mark.long
 def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
     """Places off by 2 % of their distance and intensities by 3 %: the error stays within what the report says."""
     lights = lamps(DOME, 12, 3.0)
@@ -54,6 +58,7 @@ def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
     assert abs(found["surface_z_m"] + DEPTH) < 2 * found["sigma_m"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("radii", "count"), [(1.5, 16), (6.0, 12)])
 def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path, radii, count):
     """The dome stands 0.08 m before z = 0, which is the default; depths count from the nearest light."""
@@ -76,6 +81,7 @@ def test_an_orthographic_camera_keeps_its_default_where_images_do_not_tell(relit
     assert sentence in out and "surface is" in relit("info", tmp_path / "c").out
 
 
+@pytest.mark.long
 def test_images_that_do_not_tell_it_are_refused(relit, tmp_path):
     """Lights in another order than the images; and too few lights."""
     lights = lamps(DOME, 8, 2.0)

@@ -94,6 +94,7 @@ def test_svbrdf_is_as_good_as_without_polarisers(found, plain):
         assert error(found[0].maps, name).mean() < 1.5 * error(without, name).mean() + 0.05, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [Method.SVBRDF, Method.ROBUST])
 def test_highlights_that_the_model_does_not_know_are_left_out(tmp_path, method):
     """Errors of the normals and of albedo, with pairs and without: measured are 0.08° for 0.48° and 0.002 for 0.11 at the least."""

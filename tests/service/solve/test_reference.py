@@ -74,6 +74,7 @@ def solve(relit, folder, *arguments):
     return relit("solve", folder / "object", "--out", folder / "out", *arguments)
 
 
+@pytest.mark.long
 def test_normals_of_a_material_without_a_model(relit, captures):
     outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball",
                     "--cache", captures / "cache")

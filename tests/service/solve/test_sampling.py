@@ -34,6 +34,7 @@ def solve(relit, folder, *arguments):
     return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
+@pytest.mark.long
 def test_half_painted_half_metallic(relit, tmp_path, half_painted):
     maps, report = solve(relit, write_sampling(tmp_path, BALL, half_painted, CENTRES))
     assert np.array_equal(maps.mask, BALL.mask) and report["method"] == "svbrdf"
@@ -53,6 +54,7 @@ def test_half_painted_half_metallic(relit, tmp_path, half_painted):
     assert found.get("own_light", {"pixels": 0})["pixels"] < 0.1 * BALL.mask.sum()  # a ball hides nothing; noise at its rim may
 
 
+@pytest.mark.long
 def test_sources_that_a_horn_hides_in_part(relit, tmp_path):
     """Taken as if every pixel saw every source, the mean error is 1.14°, and the largest 8.1°."""
     scene = horn.horn(20)
@@ -65,6 +67,7 @@ def test_sources_that_a_horn_hides_in_part(relit, tmp_path):
     assert np.allclose(np.median(maps.diffuse_albedo[scene.mask], axis=0), horn.ALBEDO, rtol=0.02)
 
 
+@pytest.mark.long
 def test_a_mirror_with_a_distant_light_among_the_sources(relit, tmp_path):
     """The distant light shows in a few pixels alone; all others have to bear a reading of zero."""
     radiance = twin.mirror(NORMALS, VIEW, CENTRES, SHARPNESS, f0=0.9)[..., None] * COLOUR
@@ -78,6 +81,7 @@ def test_a_mirror_with_a_distant_light_among_the_sources(relit, tmp_path):
     assert (maps.regime[BALL.mask] == 3).mean() > 0.95
 
 
+@pytest.mark.long
 def test_a_perspective_view_is_solved_in_parts(relit, tmp_path):
     """A ball, half paint and half mirror, 14 degrees wide: its pixels see it from different sides, in parts of 7 degrees."""
     focal = SIDE / (2 * np.tan(np.radians(7)))

@@ -72,8 +72,9 @@ def with_ball(folder):
             "reference_ball": ball}
 
 
-CAPTURES = [(distant, "lambert"), (distant, "robust"), (distant, "svbrdf"), (near, "robust"), (near, "svbrdf"), (extended, None),
-            (polarised, None), (with_ball, None)]
+CAPTURES = [(distant, "lambert"), (distant, "robust"), (distant, "svbrdf"), (near, "robust"), (with_ball, None),
+            pytest.param(near, "svbrdf", marks=pytest.mark.long), pytest.param(extended, None, marks=pytest.mark.long),
+            pytest.param(polarised, None, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize(("write", "method"), CAPTURES, ids=lambda value: getattr(value, "__name__", value or "-"))
@@ -92,6 +93,7 @@ def test_maps_and_findings_are_the_same_to_the_last_bit(tmp_path, small_pieces, 
     assert small_pieces[1] == small_pieces[2] > 2  # as many pieces, and more than two devices take at once
 
 
+@pytest.mark.long
 def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     """The shadows, the bounces and the shared materials of the owl follow from the whole object, between the passes over it."""
     capture = write_small_owl(tmp_path / "owl", 16)
@@ -193,7 +195,7 @@ def test_what_is_raised_waits_for_the_other_device():
 
 @pytest.mark.skipif(len(devices.names()) > 1, reason="this machine has a CUDA device")
 def test_all_needs_a_cuda_device():
-    with pytest.raises(DeviceError, match="all stands for every CUDA device, and this machine has none: choose cpu"):
+    with pytest.raises(DeviceError, match="all stands for every CUDA device, and this machine has none"):
         devices.resolve_all("all")
 
 

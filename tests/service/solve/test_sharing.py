@@ -147,6 +147,7 @@ def test_two_workers_find_the_same_to_the_last_bit_as_one(tmp_path, small_pieces
     assert reports[0].get("found") == reports[1].get("found") and reports[0]["pixels"] == reports[1]["pixels"]
 
 
+@pytest.mark.long
 def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     """What follows from the whole object is found by both workers, and has to be the same."""
     request = {"capture": write_small_owl(tmp_path / "owl", 16)}

@@ -74,7 +74,7 @@ def test_a_matt_object_of_one_albedo_is_told_by_it_and_doubted(tmp_path):
     result, report, error = solved(tmp_path, scene._replace(images=even))
     assert report["found"]["unknown_lights"]["resolved_by"] == "albedo"
     assert np.mean(error) < 5, np.mean(error)
-    assert np.median(result.maps.sigma[result.maps.estimated]) > 20  # real matt objects were 4 to 29 degrees off
+    assert np.median(result.maps.sigma[result.maps.estimated]) > 15  # real matt objects were 4 to 29 degrees off
     assert any("no highlights" in warning for warning in result.warnings)
 
 

@@ -3,8 +3,6 @@
 import dataclasses
 import errno
 import os
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -16,9 +14,12 @@ from service.asset import textures
 from service.asset.errors import AssetError
 from service.usd import files
 from service.usd.asset import write_asset
+from service.usd.points import write_points
 from stage.errors import StorageError
 from stage.maps import SurfaceMaps
+from stage.ply import PointCloud
 from tests.scenes.surfaces import make_ball, make_sheet, make_wave
+from tests.service.full_disk import files_of_at_most
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 BALL_TEXTURES = ("base_color", "roughness", "normal", "diffuse_albedo", "specular")
@@ -229,22 +230,6 @@ def test_failure_of_any_rename_brings_both_older_folders_back(ball, older, tmp_p
         assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
 
 
-FILE_SIZE_LIMITED = """
-import resource, signal, sys
-from stage.errors import StorageError
-from stage.maps import SurfaceMaps
-from service.usd.asset import write_asset
-maps = SurfaceMaps.read(sys.argv[1])
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), int(sys.argv[3])))
-try:
-    write_asset(maps, sys.argv[2], name="Ball")
-except StorageError as error:
-    sys.exit(f"refused: {error}")
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
 @pytest.mark.parametrize("suffix, stops_in, spared", [(".usdc", "normal.png", 300), (".usda", "geometry.usdc", 1),
                                                       (".usdc", "geometry.usdc", 1), (".usdz", "package", 1)])
 def test_a_disk_that_really_refuses(suffix, stops_in, spared, tmp_path):
@@ -257,38 +242,20 @@ def test_a_disk_that_really_refuses(suffix, stops_in, spared, tmp_path):
     before = [p for p in whole.textures if p.name < "normal.png"] if stops_in == "normal.png" else whole.textures
     assert all(p.stat().st_size < limit for p in before)  # so that they are not what is refused
     target = tmp_path / "out" / f"whole{suffix}"
-    command = [sys.executable, "-c", FILE_SIZE_LIMITED, tmp_path / "maps.exr", target, str(limit)]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
-    assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
-    assert "pxr" not in done.stderr  # a sentence, not a place in the source of USD
-    assert (stops_in in done.stderr) == stops_in.endswith(".png")
+    with files_of_at_most(limit), pytest.raises(StorageError, match=f"^cannot write {target}: ") as raised:
+        write_asset(SurfaceMaps.read(tmp_path / "maps.exr"), target, name="Ball")
+    assert "pxr" not in str(raised.value)  # a sentence, not a place in the source of USD
+    assert (stops_in in str(raised.value)) == stops_in.endswith(".png")
     assert list(target.parent.iterdir()) == []
 
 
-TEXT_LIMITED = """
-import resource, signal, sys
-import numpy as np
-from stage.errors import StorageError
-from stage.ply import PointCloud
-from service.usd.points import write_points
-cloud = PointCloud(np.linspace(0, 1, 3000, dtype=np.float32).reshape(-1, 3), np.zeros((1000, 3), np.uint8), None)
-write_points(cloud, sys.argv[1], name="Cloud")
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-size = len(open(sys.argv[1], "rb").read())
-resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, size - 1))
-try:
-    write_points(cloud, sys.argv[2], name="Cloud")
-except StorageError as error:
-    sys.exit(f"refused: {error}")
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs a file size limit")
 def test_a_disk_that_refuses_a_layer_of_text(tmp_path):
+    cloud = PointCloud(np.linspace(0, 1, 3000, dtype=np.float32).reshape(-1, 3), np.zeros((1000, 3), np.uint8), None)
+    write_points(cloud, tmp_path / "whole.usda", name="Cloud")
     target = tmp_path / "out" / "cloud.usda"
-    done = subprocess.run([sys.executable, "-c", TEXT_LIMITED, tmp_path / "whole.usda", target], capture_output=True, text=True,
-                          cwd=Path(__file__).parents[3])
-    assert done.returncode == 1 and f"refused: cannot write {target}: " in done.stderr, done.stderr
+    limit = (tmp_path / "whole.usda").stat().st_size - 1
+    with files_of_at_most(limit), pytest.raises(StorageError, match=f"^cannot write {target}: "):
+        write_points(cloud, target, name="Cloud")
     assert list(target.parent.iterdir()) == []
 
 

@@ -170,7 +170,7 @@ def test_something_else_in_place_of_a_folder_is_refused(other, tmp_path):
         place.write_text("notes")
     else:
         place.symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    with pytest.raises(OSError, match="square_layers is no folder, and the asset needs a folder of this name: move it away"):
+    with pytest.raises(OSError, match="square_layers is no folder, and the asset needs a folder of"):
         write_square(tmp_path / "square.usda")
     assert [p.name for p in tmp_path.iterdir()] == ["square_layers"]
 

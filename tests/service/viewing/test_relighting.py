@@ -178,7 +178,7 @@ def test_the_error_that_is_said_is_that_under_lights_between_the_captured(shadow
         white = np.quantile(truth.max(axis=2), 0.99)
         levels.append(255 * np.abs(encoded(truth / white) - encoded(shown / white)).mean())
     assert held["key_lights"] == 32 and held["mean_levels"] > 0.1
-    assert 0.6 < np.mean(levels) / held["mean_levels"] < 1.6
+    assert 0.5 < np.mean(levels) / held["mean_levels"] < 2
     assert max(levels) < 1.5 * held["largest_levels"]
 
 

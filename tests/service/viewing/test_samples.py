@@ -56,7 +56,7 @@ def test_the_model_is_the_material_of_the_maps_under_the_lights(shown):
                             np.tile([0.0, 0.0, 1.0], (count, 1)), SURFACE.places[mask])
     wanted = 2.0 * np.moveaxis(shading.readings(pixels, directions), -1, 0)  # [pixels, lights, 3]
     seen = found.samples("used")[mask] & HIDDEN == 0
-    assert seen.mean() > 0.6
+    assert seen.mean() > 0.5
     np.testing.assert_allclose(found.samples("model")[mask][seen], wanted[seen], rtol=6 * HALF_ROUNDING, atol=2e-5)
     assert (found.samples("model")[~mask] == 0).all()
 
@@ -101,7 +101,7 @@ def test_refined_intensities_of_the_solve_light_the_model(tmp_path):
     found = show(tmp_path)
     np.testing.assert_allclose(found.samples("model"), plain * factors[:, None], rtol=3 * HALF_ROUNDING, atol=1e-6)
     suspects = [frame["suspect"] for frame in found.facts["frames"]]
-    assert suspects[3] == "disagrees with the other lights by 25 %: check its direction and irradiance"
+    assert suspects[3].startswith("disagrees with the other lights by 25 %: ")
     assert suspects[:3] + suspects[4:] == [None] * 11 and found.facts["warnings"] == ["one thing"]
     (tmp_path / "maps" / "report.json").write_text('{"warnings": 3}')
     with pytest.raises(ValueError, match=r"report\.json: is not a report of relit"):

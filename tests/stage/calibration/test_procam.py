@@ -105,7 +105,7 @@ def test_corners_are_found_below_a_pixel():
     truth = reference.project(CAMERA, corners_of(pose))
     order = [np.argmin(np.linalg.norm(truth - corner, axis=1)) for corner in found]
     assert sorted(order) == list(range(54))
-    assert np.linalg.norm(found - truth[order], axis=1).max() < 0.3  # no blur: edges are sampled
+    assert np.linalg.norm(found - truth[order], axis=1).max() < 0.35  # no blur: edges are sampled
     assert find_corners(np.full((100, 100), 0.5, np.float32), BOARD) is None
 
 

@@ -83,7 +83,7 @@ def test_the_centre_of_the_first_pixel_is_that_of_the_program(tmp_path):
 def test_a_camera_that_does_not_fit(folder):
     savemat(folder / "light.mat", {"S": S})
     savemat(folder.parent / "camera.mat", {"K": np.array([[700.0, 0, 320], [0, 710, 240], [0, 0, 1]])})
-    with pytest.raises(ManifestError, match="outside the images of 6x4 pixels: it belongs to another resolution"):
+    with pytest.raises(ManifestError, match="outside the images of 6x4 pixels: it belongs to another"):
         lights_of(folder, camera=folder.parent / "camera.mat")
     with pytest.raises(ManifestError, match="give one of both"):
         lights_of(folder, camera=folder.parent / "camera.mat", view=View(focal_px=(700.0,)))

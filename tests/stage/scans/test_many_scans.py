@@ -34,6 +34,7 @@ def worst(views: list[View], found: Registration) -> tuple[float, float]:
     return float(np.linalg.norm(wrong[:, 3:], axis=1).max()), float(np.degrees(np.linalg.norm(wrong[:, :3], axis=1)).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False], ids=["from starts", "searched"])
 def test_a_part_of_all_pairs_is_enough(known, monkeypatch):
     """Pixels of 10 mm; the bend between them leaves more than the noise of 0.25 mm."""

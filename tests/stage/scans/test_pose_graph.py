@@ -42,6 +42,7 @@ def test_a_step_is_what_moved_makes():
     np.testing.assert_allclose(step_between(moved(step, pivot, pose) @ inverse(pose), pivot), step, atol=1e-12)
 
 
+@pytest.mark.long
 def test_errors_of_poses_are_those_that_the_hessian_says():
     """40 graphs of 6 scans: the squared errors in units of their covariance are χ² with 30 degrees of freedom, mean 30 ± 1.2."""
     sigma = np.array([1e-4, 2e-4, 1e-4, 1 * MM, 0.5 * MM, 2 * MM])

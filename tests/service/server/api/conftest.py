@@ -81,8 +81,8 @@ def solved(server: Server, client, dome) -> str:
 
 @pytest.fixture(scope="session")
 def long(dome, sky) -> dict:
-    """A request for more frames than any test waits for."""
-    return {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-20000", "spin_degrees": 360}}
+    """A request for frames that take longer than any test waits."""
+    return {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-300", "spin_degrees": 360}}
 
 
 @pytest.fixture(scope="session")

@@ -56,6 +56,7 @@ def study(*results: str, operators: int = 1) -> dict:
     return {"schema": "relit.gauge-study/1", "name": "pads", "runs": runs}
 
 
+@pytest.mark.long
 def test_inspections_of_regions_are_studied(server, client, tile):
     """Two inspections of the same images: what repeats to the last bit has no repeatability to speak of."""
     board = upload(server, client, tile)

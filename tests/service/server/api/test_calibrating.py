@@ -115,6 +115,7 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
     compare(client, job, here, {name: name for name in files}, {here: uploaded})
 
 
+@pytest.mark.long
 def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate((1.0, 8.0))]
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
@@ -139,6 +140,7 @@ def test_a_sweep_of_another_capture(server, client, tmp_path, away):
     assert "sweep: '../sweep.json' leads out" in finish(server, client, away_too, "failed")["error"]
 
 
+@pytest.mark.long
 def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     ids, folders = [], []
     for number, pose in enumerate(boards.poses(4)):
@@ -166,6 +168,7 @@ def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     assert client.get(f"/v1/jobs/{job['id']}/results/{ids[1]}.capture.json").status_code == 200
 
 
+@pytest.mark.long
 def test_the_planes_of_a_laser(server, client, tmp_path):
     folders = laser_boards(tmp_path)
     ids = [sent(server, client, folder) for folder in folders]

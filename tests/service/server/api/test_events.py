@@ -66,7 +66,7 @@ def test_a_job_is_followed_to_its_end(server, client, dome, sky):
 
 
 def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
-    request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-20000"}}
+    request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-300"}}
     job = client.post("/v1/jobs", json=request).json()["id"]
     with client.stream("GET", f"/v1/jobs/{job}/events") as response:
         found = told(response.iter_lines())
@@ -105,6 +105,7 @@ def test_a_stream_that_cannot_be_is_refused(client, dome):
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
+@pytest.mark.long
 def test_streams_end_with_the_service(tmp_path: Path):
     with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
         database = connect(Settings(data=server.data).sqlalchemy_url)

@@ -95,7 +95,7 @@ def wide(folder: Path) -> None:
 
 HUGE = 32_768  # squared: a billion pixels
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "parent": (named("../../data/relit.sqlite"), r"frames\[0\].*leads out of the capture's folder|leads out of the capture's folder"),
+    "parent": (named("../../data/relit.sqlite"), "leads out of the capture's folder"),
     "absolute": (named("/etc/passwd"), "leads out of the capture's folder"),
     "nul": (named("a\0b.exr"), r"frames\[0\].image: has a control character \(U\+0000\)"),
     "name": (edited(name="a\0b\ud800"), r"capture.json: name: has a control character \(U\+0000\)"),
@@ -161,6 +161,7 @@ def test_hostile_captures_are_refused_by_name(server, client, registered):
         assert found["problem"] in failures(server)
 
 
+@pytest.mark.long
 def test_hostile_environments_are_refused_by_name(server, client, registered):
     folder = registered / "environments"
     folder.mkdir()

@@ -27,7 +27,7 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     assert (cancelled.status_code, cancelled.json()["state"]) == (202, "cancelled")
     finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
     frames = made_by(client, job)
-    assert 5 <= len(frames) < 20000
+    assert 5 <= len(frames) < 300
     finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
     assert made_by(client, job) == frames  # nobody works on it any more
     assert client.get(f"/v1/jobs/{job['id']}").json() == cancelled.json()
@@ -36,6 +36,7 @@ def test_a_job_that_runs_is_cancelled_and_the_next_begins(server, client, long, 
     assert not (server.data / "projects/default/jobs" / job["id"]).exists()
 
 
+@pytest.mark.long
 def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     request = {"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-150", "spin_degrees": 360}}
     job = submit(client, **request)
@@ -85,7 +86,7 @@ def test_what_a_job_reads_stays_until_it_has_ended(server, client, long, solved)
 
 def test_a_job_that_is_cancelled_and_deleted_while_it_runs_is_no_error_in_the_log(server, client, dome, sky):
     """DBOS wrote a traceback, since the workflow that it ends is not there any more."""
-    job = submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-5000"})["id"]
+    job = submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-300"})["id"]
     server.wait(client, f"/v1/jobs/{job}", ("running",))
     client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
     assert client.delete(f"/v1/jobs/{job}").status_code == 204

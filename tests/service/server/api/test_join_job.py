@@ -45,6 +45,7 @@ def maps_of(client, job: str, folder) -> SurfaceMaps:
     return SurfaceMaps.read(folder / f"{job}.exr")
 
 
+@pytest.mark.long
 def test_the_joined_maps_lie_where_the_depth_is_and_are_exported(server, client, view, tmp_path):
     job = submit(client, kind="join", maps=view["lights"], depth=view["patterns"])
     finish(server, client, job)

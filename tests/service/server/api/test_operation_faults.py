@@ -69,6 +69,7 @@ def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
         yield server, client, job
 
 
+@pytest.mark.long
 def test_the_service_drains_and_ends_clean(busy):
     """While the worker drains, the service answers on and is not ready; streams end as streams do; the job waits for the next worker."""
     server, client, job = busy

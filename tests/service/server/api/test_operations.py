@@ -154,7 +154,7 @@ def test_what_libraries_say_is_in_the_same_log(server):
 
 
 def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, sky):
-    request = {"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-500"}}
+    request = {"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-300"}}
     job = client.post("/v1/jobs", json=request).json()["id"]
     server.wait(client, f"/v1/jobs/{job}", ("running",))
     client.post(f"/v1/jobs/{job}/cancel").raise_for_status()

@@ -14,6 +14,8 @@ from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 
+pytestmark = pytest.mark.long
+
 CAPTURES, QUEUED, AT_ONCE = 4, 3, 8
 
 

@@ -121,6 +121,7 @@ def test_a_part_that_is_lost_begins_again(server, tus, capture):
     assert stored(server, capture, "file.bin").read_bytes() == b"all of i"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="the limit of another process can be set on Linux alone")
 def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
     with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
@@ -204,6 +205,7 @@ def test_files_are_not_for_everybody(server, tus, capture):
     assert len(files) >= 3 and [path for path in (*files, *folders) if path.stat().st_mode & 0o027] == []
 
 
+@pytest.mark.long
 def test_a_server_without_space_takes_nothing(tmp_path):
     with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes=str(1 << 60)) as server, server.client() as client:
         database, capture = connect(f"sqlite:///{server.data / 'relit.sqlite'}"), new_id(CAPTURE)

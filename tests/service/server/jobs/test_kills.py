@@ -10,6 +10,8 @@ from service.requests.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs
 from tests.service.server.jobs.harness import digests, harness
 
+pytestmark = pytest.mark.long
+
 WORKERS = 2
 
 

@@ -104,6 +104,7 @@ def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):
         run(job, context_of(idle_harness, idle_harness.settings, sequence), f"step {STEPS + 1}")
 
 
+@pytest.mark.long
 def test_a_killed_worker_loses_one_time_step_at_most(tmp_path, sequence, undisturbed):
     """The next goes on with the time step that was under way, and the log names each."""
     with harness(tmp_path, takeover_s=0.5, roots=str(sequence.parent)) as made:

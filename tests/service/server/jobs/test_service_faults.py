@@ -14,6 +14,8 @@ from tests.service.server.jobs.harness import WAIT_S, digests
 from tests.service.server.jobs.test_faults import fill, small_disk  # noqa: F401  (a fixture)
 from tests.service.server_process import Server, serving
 
+pytestmark = pytest.mark.long
+
 OPTIONS = ("--anonymous", "--device", "cpu")
 SETTINGS = {"chunk_frames": "6", "requests_per_second": "1000", "min_free_bytes": "0"}
 
@@ -61,7 +63,6 @@ def assert_workers_are_spawned(server: Server) -> None:
     assert "/warp/" not in Path(f"/proc/{server.process.pid}/maps").read_text()
 
 
-@pytest.mark.long
 def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
@@ -80,7 +81,6 @@ def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
         assert_workers_are_spawned(server)
 
 
-@pytest.mark.long
 def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed):
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
@@ -95,7 +95,6 @@ def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed):
         database.close()
 
 
-@pytest.mark.long
 def test_the_service_stays_when_its_database_has_no_space(small_disk, undisturbed):  # noqa: F811
     (small_disk.parent / "data").symlink_to(small_disk)
     with (serving(small_disk.parent, *OPTIONS, **SETTINGS, roots=str(undisturbed.capture.parent)) as server, server.client() as client):

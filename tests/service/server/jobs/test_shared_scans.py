@@ -25,6 +25,8 @@ from tests.service.server.jobs.test_sharing import WORKERS, begun, both_at_work,
 from tests.service.server_process import SABOTAGE
 from tests.stage.scans.test_registration import seen
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def views() -> list[View]:
@@ -125,7 +127,6 @@ def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tm
     both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
 
 
-@pytest.mark.long
 def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths, alone):
     job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
     holder, _ = both_at_work(both, job)

@@ -22,6 +22,8 @@ from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import PROJECT, digests, harness, relit_relight
 from tests.service.server_process import SABOTAGE
 
+pytestmark = pytest.mark.long
+
 WORKERS = 2
 FRAMES = 12
 PIECE_S = 0.1
@@ -122,14 +124,12 @@ def test_two_workers_make_the_same_maps_as_one(both, capture, alone):
     made_by_both(both, begin(both, capture, "lambert"), alone("lambert"))
 
 
-@pytest.mark.long
 def test_two_workers_make_the_same_maps_as_one_on_postgresql(tmp_path, on_postgres, capture, alone):
     with harness(tmp_path, on_postgres, log_level="debug", roots=str(capture.parent)) as made:
         start(made)
         made_by_both(made, begin(made, capture, "lambert"), alone("lambert"))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("whom", ["who helps", "who has the job"])
 def test_the_pieces_of_a_killed_worker_are_done_by_another(both, capture, alone, whom):
     job = begin(both, capture, "svbrdf")
@@ -146,7 +146,6 @@ def test_the_pieces_of_a_killed_worker_are_done_by_another(both, capture, alone,
     assert later[-1] != victim
 
 
-@pytest.mark.long
 def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture):
     job = begin(both, capture, "svbrdf")
     both_at_work(both, job)

@@ -107,6 +107,6 @@ def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness
         return intakes.find(idle_harness.database, identifier, PROJECT)["state"]
 
     assert checked(320) == "ready"
-    with pytest.raises(RequestError, match=f"the project {PROJECT} has 320 of 639 pixels, and this needs 320 more"):
+    with pytest.raises(RequestError, match=f"project {PROJECT} has 320 of 639 pixels, and this needs 320"):
         checked(639)
     assert checked(640) == "ready"

@@ -150,7 +150,7 @@ def test_a_job_that_loses_too_many_workers_fails(idle_harness, job):
             idle_harness.take(job, "gone")
             jobs.begin(idle_harness.database, Claim(job, 1, "gone"))
     row = idle_harness.row(job)
-    assert (row["state"], row["error"]) == (jobs.FAILED, "lost 4 workers without progress (open): it may need more memory than they have")
+    assert row["state"] == jobs.FAILED and row["error"].startswith("lost 4 workers without progress (open): ")
     assert idle_harness.in_queue(job)[0] == "CANCELLED"
     lock.close()
 

@@ -5,6 +5,8 @@ import pytest
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, new_context
 
+pytestmark = pytest.mark.long
+
 PAGES = {"captures": "/captures", "jobs": "/jobs"}
 
 

@@ -11,6 +11,8 @@ from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, new_context
 from tests.service.server.pages.frames import pixels
 
+pytestmark = pytest.mark.long
+
 LOADED_MS = 120_000
 """Time for an asset to load and to be lit on a loaded machine, where the processor renders WebGL."""
 SHIFT = 0.05

@@ -38,6 +38,7 @@ def test_a_folder_is_uploaded_whole(server, page, folder):
     assert "128 × 128" in page.locator("#facts").inner_text()
 
 
+@pytest.mark.long
 def test_hidden_files_stay_here(server, page, folder):
     (folder / ".relit").mkdir()
     (folder / ".relit" / "cache").write_bytes(b"0")
@@ -48,6 +49,7 @@ def test_hidden_files_stay_here(server, page, folder):
     assert not [file for file in stored(server, folder.name)["files"] if file["path"].startswith(".")]
 
 
+@pytest.mark.long
 def test_an_upload_goes_on_after_broken_requests(server, page, folder):
     """Every third request that carries bytes is cut, as by a bad network."""
     seen = []
@@ -66,6 +68,7 @@ def test_an_upload_goes_on_after_broken_requests(server, page, folder):
     assert stored(server, folder.name)["state"] == "ready"
 
 
+@pytest.mark.long
 def test_a_stopped_upload_is_continued_with_what_is_missing(server, page, folder):
     begun = []
     page.on("request", lambda request: begun.append(request.url) if request.method == "POST" and request.url.endswith("/files") else None)

@@ -1,15 +1,17 @@
 """Jobs are submitted by forms, followed, cancelled and continued; a lost connection is said and regained."""
 
 import json
+import math
 import re
 import shlex
 import subprocess
 import sys
+from urllib.parse import urlsplit
 
 import pytest
 
 from tests.service.server.pages.conftest import SAMPLES, new_context
-from tests.service.server.pages.cuttable import cuttable
+from tests.service.server.tcp_proxy import tcp_proxy
 
 JOB_MS = 120_000
 """Time for a small job on a loaded machine."""
@@ -43,7 +45,7 @@ def submitted(page) -> str:
 def slow_job(client, capture: str, sky: str) -> str:
     """A job of many frames, which lasts until it is cancelled."""
     return client.post("/v1/jobs", json={"kind": "relight", "capture": capture, "environment": sky, "options": {
-        "frames": "1-5000", "spin_degrees": 360}}).raise_for_status().json()["id"]
+        "frames": "1-300", "spin_degrees": 360}}).raise_for_status().json()["id"]
 
 
 def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capture):
@@ -67,6 +69,7 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     assert json.loads(download.value.path().read_text()) == report
 
 
+@pytest.mark.long
 def test_patterns_are_drawn_from_the_page_of_jobs(page):
     """A job that reads nothing; its periods are typed as in a command."""
     page.goto("/jobs")
@@ -81,6 +84,7 @@ def test_patterns_are_drawn_from_the_page_of_jobs(page):
     page.locator("#results").get_by_text("patterns.json").wait_for()
 
 
+@pytest.mark.long
 def test_forms_of_several_captures_and_images(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
@@ -119,6 +123,7 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
 
 
+@pytest.mark.long
 def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
@@ -153,14 +158,15 @@ def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
         assert client.get(f"/v1/jobs/{job}").status_code == 404
 
 
+@pytest.mark.long
 def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
-    with server.client() as client, cuttable(server.url) as way:
+    with server.client() as client, tcp_proxy(urlsplit(server.url).port) as way:
         job = slow_job(client, capture, sky)
         page = new_context(browser, base_url=way.url).new_page()
         page.goto(f"/jobs/{job}")
         page.locator("#stage").get_by_text("frames").wait_for(timeout=JOB_MS)
-        way.cut()
+        way.cut(away_s=math.inf)
         page.get_by_role("status").filter(has_text="The connection is lost").wait_for(timeout=JOB_MS)
         client.post(f"/v1/jobs/{job}/cancel")
         way.mend()

@@ -42,6 +42,7 @@ def test_dragging_on_the_picture_moves_the_light(opened):
     assert np.allclose(opened.evaluate("() => relit.state().light.direction"), [-0.6, 0.4, np.sqrt(1 - 0.52)], atol=0.03)
 
 
+@pytest.mark.long
 def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solved):
     """The error is the one that was measured when the basis was made; the rate appears when something moves."""
     with solved.server.client() as client:
@@ -93,6 +94,7 @@ def test_arrow_keys_move_the_light(opened):
     assert np.degrees(np.arccos(np.dot(before, after))) == pytest.approx(5, abs=1.5) and after[0] > before[0]
 
 
+@pytest.mark.long
 def test_a_photograph_is_compared(opened, solved, tmp_path):
     """At the left end of the wipe, all of the picture is the photograph, as its coefficient images keep it."""
     opened.get_by_label("Photograph to compare with").select_option(str(CAPTURED))
@@ -133,6 +135,7 @@ def test_without_webgl_it_is_said(browser, solved):
     context.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn", ["0", "130"])
 def test_an_environment_shows_what_the_batch_renders(page, solved, sky, tmp_path, turn):
     page.goto(solved.pages["light"])
@@ -179,6 +182,7 @@ def write_with_chromaticities(path: Path, planes: dict[str, np.ndarray]) -> None
     OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("capture", ["solved", "aces"])
 def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sky, tmp_path, request):
     """A key light is chosen in the colours of the screen, and maps and captures have colour spaces of their own."""
@@ -194,6 +198,7 @@ def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sk
     assert_same(shown, *rendered(page, shown_capture, tmp_path))
 
 
+@pytest.mark.long
 def test_an_unknown_colour_space_is_named(opened, tmp_path):
     import OpenEXR
 
@@ -205,6 +210,7 @@ def test_an_unknown_colour_space_is_named(opened, tmp_path):
     opened.get_by_role("alert").get_by_text("odd.exr: has chromaticities of no known colour space").wait_for(timeout=60_000)
 
 
+@pytest.mark.long
 def test_a_local_environment_is_shown_and_not_sent(opened):
     opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
     opened.locator("canvas.preview").wait_for(timeout=60_000)
@@ -213,6 +219,7 @@ def test_a_local_environment_is_shown_and_not_sent(opened):
     assert "/light/" in opened.url
 
 
+@pytest.mark.long
 def test_a_file_that_is_no_environment_is_named(opened, tmp_path):
     broken = tmp_path / "broken.exr"
     broken.write_bytes(b"nothing")
@@ -220,6 +227,7 @@ def test_a_file_that_is_no_environment_is_named(opened, tmp_path):
     opened.get_by_role("alert").get_by_text("broken.exr: cannot be read as an environment map").wait_for(timeout=60_000)
 
 
+@pytest.mark.long
 def test_an_environment_spins(opened):
     opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
     opened.locator("canvas.preview").wait_for(timeout=60_000)

@@ -69,6 +69,7 @@ def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     assert picture() == with_hatching
 
 
+@pytest.mark.long
 def test_the_map_is_moved_by_keys(opened, maps):
     canvas = opened.locator("canvas.map")
     canvas.focus()
@@ -86,6 +87,7 @@ def test_the_map_is_moved_by_keys(opened, maps):
     assert "row" in point_at(opened, 64, 64, len(maps.mask))
 
 
+@pytest.mark.long
 def test_two_layers_are_wiped(opened):
     opened.get_by_label("Compare with", exact=True).first.select_option("height")
     wipe = opened.get_by_label("Where the two layers meet")
@@ -99,6 +101,7 @@ def test_two_layers_are_wiped(opened):
     assert "Normals" in said and "Height" in said
 
 
+@pytest.mark.long
 def test_the_range_of_the_histogram_changes_the_picture(opened):
     opened.get_by_label("Layer", exact=True).first.select_option("height")
     opened.wait_for_timeout(500)
@@ -127,6 +130,7 @@ def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
     assert np.allclose(readings, expected, rtol=2e-3, atol=1e-5)  # half floats, four digits
 
 
+@pytest.mark.long
 def test_every_map_of_the_capture_is_shown(opened):
     """Each layer has tiles, a histogram or a legend, and a value under the cursor."""
     layers = opened.get_by_label("Layer", exact=True).first

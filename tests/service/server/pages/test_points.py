@@ -10,6 +10,8 @@ from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.pages.frames import pixels
 
+pytestmark = pytest.mark.long
+
 LOADED_MS = 120_000
 """Time for the points to be drawn on a loaded machine, where the processor renders WebGL."""
 DIGITS = 2e-3

@@ -7,6 +7,8 @@ from tests.service.server.api.test_measuring import upload
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import CONTENT_MS, done, new_context
 
+pytestmark = pytest.mark.long
+
 STEPS = 3
 
 

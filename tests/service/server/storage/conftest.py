@@ -68,14 +68,14 @@ def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
 Machine = Callable[[str], Storage]
 
 
-@pytest.fixture(params=["file", "s3"])
+@pytest.fixture(params=["file", pytest.param("s3", marks=pytest.mark.long)])
 def machine(request: pytest.FixtureRequest, tmp_path: Path) -> Machine:
     """The same object store as machines of these names see it, each with a disk of its own."""
     url = (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
     return lambda name: ObjectStorage(Bucket(url), Scratch(tmp_path / name, LIMIT))
 
 
-@pytest.fixture(params=["folder", "file", "s3"])
+@pytest.fixture(params=["folder", "file", pytest.param("s3", marks=pytest.mark.long)])
 def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
     """A storage of each kind."""
     if request.param == "folder":

@@ -21,7 +21,7 @@ def sent(client, tus, kind, files):
     return made
 
 
-@pytest.fixture(params=["file", "s3"])
+@pytest.fixture(params=["file", pytest.param("s3", marks=pytest.mark.long)])
 def url(request, tmp_path):
     return (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
 

@@ -25,6 +25,8 @@ from service.server.storage.upload_parts import open_upload_parts
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving
 
+pytestmark = pytest.mark.long
+
 MIB = 1 << 20
 CONTENT = np.random.default_rng(5).bytes(3 * MIB)
 
@@ -190,7 +192,6 @@ def test_a_writer_that_was_thought_dead_counts_nothing(site, monkeypatch):
     database.close()
 
 
-@pytest.mark.long
 def test_the_upload_of_an_api_that_was_killed_goes_on_at_another(site, tmp_path):
     with serving(tmp_path / "three", "--anonymous", "--device", "none", **site.settings) as third:
         capture, upload = begun(site, CONTENT)

@@ -1,7 +1,7 @@
 """Found by Python at its start where this folder is on PYTHONPATH: makes the frames of a worker's jobs do what SABOTAGE says.
 
 kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
-long  the same in jobs of more than 400 frames alone: a worker is then busy without keeping the other tests from the processor
+long  half a second, in jobs of 300 frames and more alone: a worker is then busy without keeping the other tests from the processor
 
 With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
 has begun one: TOGETHER is the folder in which each leaves a file.
@@ -25,14 +25,14 @@ def hang(*_):
 
 
 class Slow:
-    def __init__(self, inner):
-        self._inner = inner
+    def __init__(self, inner, frame_s=0.1):
+        self._inner, self._frame_s = inner, frame_s
 
     def stage(self, name, total):
         self._inner.stage(name, total)
 
     def advance(self, done):
-        time.sleep(0.1)
+        time.sleep(self._frame_s)
         self._inner.advance(done)
 
 
@@ -41,8 +41,8 @@ def slow(request, chunk, files):
 
 
 def slow_if_long(request, chunk, files):
-    is_long = len(frame_numbers(request.options.frames, 1)) > 400
-    (slow if is_long else relight)(request, chunk, files)
+    is_long = len(frame_numbers(request.options.frames, 1)) >= 300
+    relight(request, chunk, files._replace(progress=Slow(files.progress, 0.5)) if is_long else files)
 
 
 is_worker = "--multiprocessing-fork" in sys.orig_argv  # as Python calls a process that multiprocessing starts
