@@ -43,7 +43,7 @@ gpu-bench: $(VENV)/installed
 
 # docs/manifest.md, every field of capture.json, from the models in stage/
 manifest-page: $(VENV)/installed-dev
-	$(BIN)/python -m stage.manifest_page
+	$(BIN)/python -m stage.capture.manifest_page
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev

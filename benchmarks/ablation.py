@@ -9,23 +9,23 @@ import numpy as np
 
 from benchmarks.accuracy import angles_deg, read_truth
 from kernels import packs
-from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, SearchOptions
-from kernels.photometric.lambert import NormalFit, solve_lambert
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.readings import Lights, grey_factors, grey_readings, pad_lights
-from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import Samples, evenly, gather
+from kernels.photometric.lambertian.lambert import NormalFit, solve_lambert
+from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings, pad_lights
+from kernels.photometric.lambertian.robust import solve_robust
+from kernels.photometric.model.samples import Samples, evenly, gather
+from kernels.photometric.search.diffuse_shape import choose_diffuse
+from kernels.photometric.search.hypotheses import Diffuse, SearchOptions
+from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.svbrdf import SHAPE_TEMPERATURE, average_normals, solve_svbrdf
 from kernels.status import Status
 from service.reporting.progress import Timings
-from service.solve.material import SPREAD_PIXELS, MaterialOptions, solve_material
-from service.solve.solution import SolveInput
-from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
+from service.solve.methods.material import SPREAD_PIXELS, MaterialOptions, solve_material
+from service.solve.sharing.solution import SolveInput
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights
+from stage.colour.colour import GREY_WEIGHTS
 from stage.importers import diligent
-from stage.ingest import open_stack
-from stage.lighting import distant_lights
+from stage.stack.ingest import open_stack
 
 PIXELS = 4000
 """The pixels of each object at even steps, which determine a mean to two digits."""

@@ -8,10 +8,10 @@ import numpy as np
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.formats import exr
 from stage.importers import diligent
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 

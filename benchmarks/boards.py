@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.boards.inspect_board import inspect_board
+from service.boards.stitching.grid import blocks_of, robust_sigma
+from service.boards.stitching.stitching import blend, stitch
 from service.boards.tiles import read_tiles
 from service.reporting.progress import Timings
 from service.requests.inspect_board import InspectBoardRequest
-from stage.board.grid import blocks_of, robust_sigma
-from stage.board.stitching import blend, stitch
 from stage.errors import BoardError
 from tests.scenes.board import PIXEL, SIGMA, Heights, components, domes, scan, write_scan
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.depth_breaks import connected, same_surface
+from stage.capture.camera import Camera
+from stage.results.depth_breaks import connected, same_surface
 
 COLS, ROWS, FOCAL_PX = 160, 120, 130.0
 STEPS = 24
@@ -109,7 +109,7 @@ def mixed(surfaces: list[Surface]) -> np.ndarray:
 
 
 def count(surfaces: list[Surface], noise: Callable[[np.ndarray], np.ndarray], *, mix: bool, by_slope: bool) -> Counts:
-    """Return what is found on one scene, by the slope alone or by stage.depth_breaks."""
+    """Return what is found on one scene, by the slope alone or by stage.results.depth_breaks."""
     x, y = CAMERA.plane_coordinates()
     true = cast(surfaces, x, y)
     seen = np.isfinite(true)

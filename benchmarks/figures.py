@@ -35,9 +35,9 @@ from service.demo.bench import bench
 from service.requests.demo import BenchRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.files import write_text
+from stage.formats import exr
 
 TARGET = Path(__file__).parents[1] / "docs" / "figures.md"
 DISTANT = (Method.LAMBERT, Method.ROBUST, Method.SVBRDF)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stage import exr
-from stage.capture import Capture
-from stage.lighting import distant_lights
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights
+from stage.formats import exr
 
 F0_GRID = np.arange(0.02, 0.08, 0.001)
 LARGEST_SHARE = 0.01

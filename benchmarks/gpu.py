@@ -26,19 +26,19 @@ import warp as wp
 from kernels import device as devices
 from kernels import packs
 from kernels.errors import DeviceError
-from kernels.photometric.hypotheses import Diffuse
-from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
-from kernels.photometric.robust import solve_robust
-from kernels.photometric.samples import gather
+from kernels.photometric.lambertian.lambert import solve_lambert
+from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.lambertian.robust import solve_robust
+from kernels.photometric.model.samples import gather
+from kernels.photometric.search.hypotheses import Diffuse
 from kernels.photometric.svbrdf import solve_svbrdf
-from kernels.relight import cublas
-from kernels.relight.combine import combine, combine_batch
-from kernels.structured.frames import NoiseModel, upload
+from kernels.relight.frames import cublas
+from kernels.relight.frames.combine import combine, combine_batch
+from kernels.structured.pattern_frames import NoiseModel, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly
 from kernels.surface.integrate import integrate_normals
-from kernels.tof.continuous import Noise, decode
+from kernels.tof.continuous.continuous import Noise, decode
 
 HOME = Path(__file__).resolve().parents[1]
 FIGURES, HEADING = HOME / "docs" / "figures.md", "## On a GPU"

@@ -16,10 +16,10 @@ import numpy as np
 from benchmarks.file_mutations import write_between
 from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
-from stage.scans.ply_points import read_ply_points
-from stage.scans.rigid import exponential
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import exponential
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 from tests.scenes import in_front
 from tests.scenes.statue import Shot, distance, nearest_part, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces

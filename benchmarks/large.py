@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage import exr
-from stage.manifest import SCHEMA, Manifest, write_manifest
+from stage.capture.manifest import SCHEMA, Manifest, write_manifest
+from stage.formats import exr
 
 MEGAPIXELS, LIGHTS, FRAMES = 50.0, 64, 100
 ASPECT = 1.5
@@ -143,8 +143,8 @@ def run_command(command: str, folder: Path, method: str, frames: int, compressio
 
         export(ExportRequest(maps=out, out=folder / "asset" / "asset.usdz"), peaks)
     else:
-        from service.light.relight import relight
-        from service.requests.picture import FrameCompression
+        from service.relight.relight import relight
+        from service.requests.light.picture_options import FrameCompression
         from service.requests.relight import RelightRequest
 
         relight(RelightRequest(capture=capture, environment=capture / "environment.exr", out=str(folder / "frames" / "frame.####.exr"),

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 
 SIDE = 4096
 HOLE_PX = 12

@@ -18,14 +18,14 @@ import numpy as np
 
 from benchmarks.relighting import rgb
 from benchmarks.rti_baselines import rti_fits
-from service.light.relight import relight
+from service.relight.relight import relight
 from service.requests.relight import LightWeights, RelightRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage.capture import Capture
-from stage.correction import Correction
+from stage.capture.capture import Capture
 from stage.importers import diligent
-from stage.maps import MAPS_FILE
+from stage.results.maps import MAPS_FILE
+from stage.stack.correction import Correction
 
 EVERY = 8
 """Every light with an index that this number divides is left out: 12 of 96."""

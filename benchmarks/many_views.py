@@ -23,11 +23,11 @@ import numpy as np
 from benchmarks.file_mutations import write_between
 from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.register import register_scans
-from stage.depth_maps import DepthMaps
-from stage.scans.ply_points import read_ply_points
-from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
-from stage.scans.rigid import applied, inverse, moved, step_between
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from tests.scenes.turntable import MM, View, figure, pose, see
 
 START, END = "<!-- made by benchmarks.many_views -->", "<!-- end of many_views -->"

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.fresnel import LARGEST_SHARE
-from kernels.photometric.readings import pad_lights
+from kernels.photometric.lambertian.readings import pad_lights
 from service.reporting.progress import Timings
-from service.solve.material import MaterialOptions, solve_material
-from service.solve.solution import SolveInput
-from stage import exr
-from stage.capture import Capture
-from stage.ingest import open_stack
-from stage.lighting import distant_lights
+from service.solve.methods.material import MaterialOptions, solve_material
+from service.solve.sharing.solution import SolveInput
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights
+from stage.formats import exr
+from stage.stack.ingest import open_stack
 from tests.reference import microfacet as twin
 
 TOO_BRIGHT = 0.03

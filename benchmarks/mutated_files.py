@@ -12,26 +12,26 @@ import OpenEXR
 import OpenImageIO as oiio
 
 from service.captures.admit import admit_capture, admit_environment
-from service.captures.inspect import inspect
+from service.captures.info import inspect
 from service.requests.captures import InfoRequest
-from service.requests.light_keys import LightKeys
-from service.server.settings import Settings
-from stage import exr, images
-from stage.calibration.opencv_file import read_matrices
-from stage.capture import Capture
-from stage.environment_maps import check_environment, read_environment
+from service.requests.light.light_keys import LightKeys
+from service.server.base.settings import Settings
+from stage.capture.capture import Capture
+from stage.capture.manifest import read_manifest
+from stage.colour.environment_maps import check_environment, read_environment
+from stage.colour.radiance import check_radiance
+from stage.formats import exr, images
 from stage.importers import lp
-from stage.ingest import open_stack
-from stage.manifest import read_manifest
-from stage.maps import SurfaceMaps
-from stage.radiance import check_radiance
+from stage.importers.opencv_file import read_matrices
+from stage.results.maps import SurfaceMaps
 from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization
+from stage.stack.ingest import open_stack
 from stage.tof.calibration import read_calibration, read_sweep
-from stage.tof.frames import read_array
+from stage.tof.raw_frames import read_array
 from stage.tof.scan import read_scan
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_image
-from tests.stage.test_maps import make_maps
+from tests.stage.results.test_maps import make_maps
 
 MAX_PIXELS = 4096
 """The setting of the checks; larger claims are refused."""

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import angles_deg, read_truth
-from service.light.sheet import write_sheet
+from service.relight.sheet import write_sheet
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.formats import exr
 
 TARGET = Path(__file__).parents[1] / "docs" / "errors.png"
 FULL_SCALE_DEG = 10.0

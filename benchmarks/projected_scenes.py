@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.images import write_png
-from stage.manifest import Frame
+from stage.capture.manifest import Frame
+from stage.formats.images import write_png
 from stage.patterns.codes import Pattern, draw
 from tests.reference.projector import look_at
 

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.accuracy import SAMPLES
-from service.light.relight import relight
-from service.light.shade import shade
-from service.light.sheet import display, write_sheet
+from service.relight.relight import relight
+from service.relight.shade import shade
+from service.relight.sheet import display, write_sheet
 from service.requests.relight import LightWeights, RelightRequest
 from service.requests.shade import ShadeRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
-from stage.capture import Capture
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 
 PICTURE = Path(__file__).parents[1] / "docs" / "relighting.png"
 GAIN = 4.0

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.file_mutations import write_between
-from service.server.settings import Settings
+from service.server.base.settings import Settings
 from tests.service.server.api import fuzz
 from tests.service.server.api.test_openapi import NO_LIMITS
 from tests.service.server_process import serving

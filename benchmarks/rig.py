@@ -14,13 +14,13 @@ from scipy.ndimage import binary_erosion
 
 from benchmarks.pictures import FULL_SCALE_DEG, heat
 from service.depth.depth import depth
-from service.light.sheet import write_sheet
+from service.relight.sheet import write_sheet
 from service.requests.depth import DepthRequest
-from stage import exr
-from stage.capture import Capture
-from stage.images import read_pixels
-from stage.ply import read_ply
-from stage.ranging import LaserPlane, LaserRay
+from stage.capture.capture import Capture
+from stage.capture.ranging import LaserPlane, LaserRay
+from stage.formats import exr
+from stage.formats.images import read_pixels
+from stage.formats.ply import read_ply
 
 TARGET = Path(__file__).parents[1] / "docs" / "depth.png"
 WRONG_PX = 4.0

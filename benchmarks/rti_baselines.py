@@ -10,7 +10,7 @@ imaging", CVIU 2018; Duchon, "Splines minimizing rotation-invariant semi-norms i
 import numpy as np
 from numpy.typing import NDArray
 
-from kernels.relight.rti import biquadratic, hemispherical_harmonics
+from kernels.relight.basis.rti import biquadratic, hemispherical_harmonics
 
 Matrix = NDArray[np.float64]
 

@@ -17,14 +17,14 @@ import numpy as np
 import OpenImageIO as oiio
 
 from benchmarks.many_views import off_surface, write_scans
-from service.light.sheet import BACKGROUND, INK, write_sheet
+from service.relight.sheet import BACKGROUND, INK, write_sheet
 from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import applied, inverse
 from service.scans.register import register_scans
-from stage.colour import pixels_of
-from stage.scans.ply_points import read_ply_points
-from stage.scans.records import read_scan_set
-from stage.scans.rigid import applied, inverse
+from stage.colour.colour import pixels_of
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import DISTANCE_M, MM, View, figure, turntable
 
 TARGET = Path(__file__).parents[1] / "docs" / "scans.png"

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.file_mutations import write_between
+from service.scans.points.rigid import about, applied, inverse, moved, step_between
+from service.scans.points.scan import Scan
 from service.scans.read import read_scan
-from stage.depth_maps import DepthMaps
-from stage.scans.records import ScanEntry, ScanSet, Turntable
-from stage.scans.registration import Registration, RegistrationOptions, register
-from stage.scans.rigid import about, applied, inverse, moved, step_between
-from stage.scans.scan import Scan
-from stage.scans.turntable import turned_pose
+from service.scans.registration.registration import Registration, RegistrationOptions, register
+from service.scans.registration.turntable import turned_pose
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import ScanEntry, ScanSet, Turntable
 from tests.scenes.turntable import MM, View, figure, pose, see
 
 CASES = {"18 scans, 20° apart": 18, "9 scans, 40° apart": 9, "6 scans, 60° apart": 6}

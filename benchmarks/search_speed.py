@@ -6,14 +6,14 @@ import numpy as np
 
 from benchmarks.timing import run_seconds
 from kernels import packs
-from kernels.photometric.candidates import rings
-from kernels.photometric.descent import descend
-from kernels.photometric.hypotheses import Diffuse, search_normals
-from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
-from kernels.photometric.samples import gather
+from kernels.photometric.lambertian.lambert import solve_lambert
+from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.model.candidates import rings
+from kernels.photometric.model.samples import gather
+from kernels.photometric.search.descent import descend
+from kernels.photometric.search.hypotheses import Diffuse, search_normals
 from kernels.photometric.svbrdf import solve_svbrdf
-from stage.colour import GREY_WEIGHTS
+from stage.colour.colour import GREY_WEIGHTS
 from tests.reference import hypotheses as twin
 
 LIGHTS, PIXELS, NUMPY_PIXELS = 96, 16384, 1024

@@ -12,11 +12,11 @@ import numpy as np
 
 from benchmarks.accuracy import angles_deg
 from benchmarks.pictures import heat
-from service.light.sheet import write_sheet
+from service.relight.sheet import write_sheet
 from service.requests.solve import Method, SolveRequest
 from service.sequences.run import solve_sequence
 from service.sequences.steps import ALONE
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 from tests.scenes.sequence import write_sequence
 
 TARGET = Path(__file__).parents[1] / "docs" / "sequences.png"

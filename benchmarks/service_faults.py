@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.postgres import Postgres, binaries, postgres

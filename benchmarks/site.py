@@ -23,13 +23,13 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.site_scene import STATUES, Scene, distance, look, make_scene
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import exponential, inverse, rigid_between
+from stage.capture.camera import Camera
 from stage.files import write_text
-from stage.ply import PointCloud, write_ply
-from stage.scans.ply_points import read_ply_points
-from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
-from stage.scans.rigid import exponential, inverse, rigid_between
+from stage.formats.ply import PointCloud, write_ply
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from tests.reference.projector import look_at
 
 FAR_SHARE, CLOUD_EVERY = 0.6, 10

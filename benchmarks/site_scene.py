@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from stage.camera import Camera
+from stage.capture.camera import Camera
 
 LENGTH, WIDTH, HEIGHT = 24.0, 16.0, 7.0
 STATUES = 10

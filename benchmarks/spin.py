@@ -10,8 +10,8 @@ from pathlib import Path
 
 from benchmarks.accuracy import SAMPLES
 from service.cli.main import BLAS_THREADS
-from service.light.relight import relight
-from service.requests.picture import FrameCompression
+from service.relight.relight import relight
+from service.requests.light.picture_options import FrameCompression
 from service.requests.relight import LightWeights, RelightRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve

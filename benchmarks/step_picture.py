@@ -14,15 +14,15 @@ import numpy as np
 
 from benchmarks.accuracy import angles_deg, read_truth
 from benchmarks.pictures import heat
-from kernels.photometric.readings import pad_lights
-from service.light.sheet import write_sheet
+from kernels.photometric.lambertian.readings import pad_lights
+from service.relight.sheet import write_sheet
 from service.reporting.progress import Timings
-from service.solve.material import WHOLE_SOLVER, solve_material
-from service.solve.solution import SolveInput
-from stage.capture import Capture
+from service.solve.methods.material import WHOLE_SOLVER, solve_material
+from service.solve.sharing.solution import SolveInput
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights
 from stage.importers import diligent
-from stage.ingest import open_stack
-from stage.lighting import distant_lights
+from stage.stack.ingest import open_stack
 
 TARGET = Path(__file__).parents[1] / "docs" / "steps.png"
 STEPS = {

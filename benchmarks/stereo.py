@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.timing import run_seconds
 from kernels import device as devices
 from kernels.status import Status
-from kernels.structured.frames import NoiseModel
-from service.depth.stereo_pair import Disparity, match
-from stage.camera import Camera
-from stage.stereo.frames import RectifiedFrames, smoothed
-from stage.stereo.other_camera import OtherCamera
-from stage.stereo.rectification import rectify
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.stereo.rectification import rectify
+from service.depth.stereo.rectified_frames import RectifiedFrames, smoothed
+from service.depth.stereo.stereo_pair import Disparity, match
+from stage.capture.camera import Camera
+from stage.capture.other_camera import OtherCamera
 from tests.scenes import stereo as scenes
 from tests.scenes.depth import entry_of
 from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.timing import run_seconds
 from kernels import device as devices
 from kernels.structured.binary import decode_gray
-from kernels.structured.frames import NoiseModel, upload
+from kernels.structured.pattern_frames import NoiseModel, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly
 from stage.patterns.binary import gray_of

@@ -9,11 +9,11 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from kernels.tof.bilateral import GUIDE_RELATIVE, LEAST_STEP, LEAST_VARIANCE, RANGE_SIGMAS, smooth
-from kernels.tof.continuous import Noise, decode
-from kernels.tof.decide import AGREEMENT_RAD, decide
-from kernels.tof.modulation import common_range_m, radians_per_metre
-from kernels.tof.unwrap import FLOOR_RAD, unwrap
+from kernels.tof.continuous.bilateral import GUIDE_RELATIVE, LEAST_STEP, LEAST_VARIANCE, RANGE_SIGMAS, smooth
+from kernels.tof.continuous.continuous import Noise, decode
+from kernels.tof.continuous.decide import AGREEMENT_RAD, decide
+from kernels.tof.continuous.modulation import common_range_m, radians_per_metre
+from kernels.tof.continuous.unwrap import FLOOR_RAD, unwrap
 from stage.tof.light_time import SPEED_OF_LIGHT
 from tests.reference import tof as scenes
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest, TofOptions
-from stage.depth_maps import DepthMaps
+from stage.results.depth_maps import DepthMaps
 from tests.reference import tof as scenes
 
 ROWS, COLS = 96, 128

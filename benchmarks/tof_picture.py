@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.pictures import heat
 from kernels.status import Status, refuse_unsure
-from service.depth.tof import solve_tof
-from service.light.sheet import write_sheet
+from service.depth.tof.tof import solve_tof
+from service.relight.sheet import write_sheet
 from service.reporting.progress import Timings
 from service.requests.depth import TofOptions
-from stage.camera import Camera
-from stage.capture import Capture
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
 from stage.tof.light_time import SPEED_OF_LIGHT
 from stage.tof.simulate import (
     CorrelationCamera,

@@ -19,10 +19,10 @@ import rendering
 from check_conventions import lambert_ggx_brdf
 from make_relight_checks import OBJECTS
 
-from kernels.relight.cells import integrate_cells
-from service.light.weighting import light_weights
-from stage import exr
-from stage.capture import Capture
+from kernels.relight.weights.cells import integrate_cells
+from service.relight.weights.weighting import light_weights
+from stage.capture.capture import Capture
+from stage.formats import exr
 
 PIXEL_POINTS = 4  # per pixel side, for the mean that a box filter sees
 LAMP_POINTS = 256  # per area light; with 64 a sphere is 0.4 % off

@@ -52,7 +52,7 @@ def import_mitsuba(variant: str = "llvm_ad_rgb") -> Any:
 def fibonacci_sphere(count: int) -> np.ndarray:  # -> [N, 3] float64, unit
     """Return directions that are spread evenly over the sphere, from +y to -y.
 
-    The committed captures were rendered from these directions, so `stage.frames.fibonacci_sphere`, which runs from +z to -z, must
+    The committed captures were rendered from these directions, so `stage.transforms.fibonacci_sphere`, which runs from +z to -z, must
     not replace them.
 
     Source: Gonzalez 2010, "Measurement of areas on a sphere using Fibonacci and latitude-longitude lattices".

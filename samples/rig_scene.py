@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera, Distortion
-from stage.frames import rotation_about, rotation_about_y
-from stage.projector import Projector
+from stage.capture.camera import Camera, Distortion
+from stage.capture.projector import Projector
+from stage.transforms import rotation_about, rotation_about_y
 
 WIDTH, HEIGHT = 256, 192
 CAMERA_FOCAL_PX, CAMERA_PRINCIPAL_PX = 340.0, (130.5, 94.0)

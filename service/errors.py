@@ -1,6 +1,7 @@
 """The errors whose text is a sentence for the person who asked, and the line that is shown for each.
 
 RequestError       a request asks for something impossible (frames that run backwards, a name without ####); names the option
+AssetError         these maps, or this path, cannot become an asset; says what is missing and what to do
 ValidationError    pydantic's: a field of a request has an invalid value; names the field
 DivergedError      a worker that helps finds something else than the one that has the job; only the log says so
 """
@@ -8,13 +9,16 @@ DivergedError      a worker that helps finds something else than the one that ha
 from pydantic import ValidationError
 
 from kernels.errors import KernelError
-from service.asset.errors import AssetError
 from stage.errors import StageError
 from stage.records import FieldName, describe, field_name
 
 
 class RequestError(ValueError):
     """A request asks for something impossible; the message names the option."""
+
+
+class AssetError(ValueError):
+    """The maps or the path cannot become an asset; its text is one plain sentence."""
 
 
 class DivergedError(Exception):

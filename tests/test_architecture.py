@@ -13,9 +13,10 @@ import pytest
 HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
 PRODUCTS = tuple(f"service.{name}" for name in (
-    "solve", "depth", "boards", "light", "calibrate", "basis", "captures", "demo", "export", "viewing", "joining", "scans", "sequences"))
+    "solve", "depth", "boards", "relight", "calibrate", "light_estimation", "basis", "captures", "demo", "export", "viewing", "joining",
+    "scans", "sequences"))
 """Where stage and kernels meet: captures go in, results come out."""
-WRITERS = ("service.asset", "service.usd", "service.gltf")
+WRITERS = ("service.asset",)
 """Meshes and textures of solved maps, and the formats that they are written in."""
 DOORS = ("service.cli", "service.client", "service.farm", "service.server")
 
@@ -77,13 +78,13 @@ def top(name: str) -> str:
 def test_the_imports_are_read():
     """If this fails, the others prove nothing."""
     assert len(FILES) > 60
-    assert Import("service.solve.solve", "stage.capture.Capture", False) in imports()
-    assert Import("service.cli.solve", "service.solve.solve.solve", True) in imports()
+    assert Import("service.solve.solve", "stage.capture.capture.Capture", False) in imports()
+    assert Import("service.cli.commands.solve", "service.solve.solve.solve", True) in imports()
     assert any(i.importer == "kernels.device" and i.target == "warp" for i in imports())
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy", "small_gicp"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -93,28 +94,30 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 
 
 @pytest.mark.parametrize(("library", "homes"), [
-    ("pxr", ["service.usd"]), ("pygltflib", ["service.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
+    ("pxr", ["service.asset.usd"]), ("pygltflib", ["service.asset.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
     ("fastapi", ["service.server.api", "service.server.pages"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
-    ("laspy", ["stage.las"]), ("small_gicp", ["stage.scans.neighbours"]), ("rawpy", ["stage.camera_raw"]),
-    ("fast_simplification", ["service.asset.levels", "service.asset.unwrap"]), ("xatlas", ["service.asset.unwrap"]),
-    ("MaterialX", ["service.asset.openpbr"]),
+    ("laspy", ["stage.formats.las"]), ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
+    ("fast_simplification", ["service.asset.content.levels", "service.asset.content.uv_unwrap"]),
+    ("xatlas", ["service.asset.content.uv_unwrap"]),
+    ("MaterialX", ["service.asset.content.openpbr"]),
 ])
 def test_a_library_lives_in_its_places(library, homes):
     assert {i.importer for i in imports() if top(i.target) == library and not under(i.importer, *homes)} == set()
 
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
-    allowed = ("stage.motion", "stage.calibration", "stage.mask_border", "stage.avif", "stage.camera_raw", "stage.importers.video",
-               "stage.scans.found_targets")
+    allowed = ("stage.motion", "service.calibrate.solvers", "stage.results.mask_border", "stage.formats.avif", "stage.formats.camera_raw",
+               "stage.importers", "service.scans.registration.found_targets")
     assert {i.importer for i in imports() if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 
 @pytest.mark.parametrize(("package", "forbidden"), [
     *((product, DOORS) for product in (*PRODUCTS, "service.requests", "service.reporting")),
     ("service.requests", (*PRODUCTS, *WRITERS, "service.reporting", "kernels")),
-    ("service.asset", (*DOORS, *PRODUCTS, "service.usd", "service.gltf", "kernels")),
-    ("service.usd", (*DOORS, *PRODUCTS, "service.gltf", "kernels")),
-    ("service.gltf", (*DOORS, *PRODUCTS, "service.usd", "kernels")),
+    ("service.asset", (*DOORS, *PRODUCTS, "kernels")),
+    ("service.asset.content", ("service.asset.usd", "service.asset.gltf")),
+    ("service.asset.usd", ("service.asset.gltf",)),
+    ("service.asset.gltf", ("service.asset.usd",)),
     ("service.server.jobs", ("service.cli", "service.client", "service.server.api")),
     ("service.server.database", ("service.server.jobs", "service.server.api", *PRODUCTS, "stage", "kernels")),
     ("service.server.storage", ("service.server.jobs", "service.server.api", *PRODUCTS, "kernels")),
@@ -122,7 +125,7 @@ def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured
     ("service.server.pages", ("service.cli", "service.client", "service.server.api", "service.server.database", "service.server.jobs",
                               "service.server.storage", *PRODUCTS, *WRITERS, "stage", "kernels")),
     ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, *WRITERS, "stage", "kernels")),
-    ("service.views", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
+    ("service.requests.views", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
     assert {i for i in imports() if under(i.importer, package) and under(i.target, *forbidden)} == set()
@@ -143,7 +146,7 @@ def test_the_command_line_knows_kernels_and_warp_lightly():
     may, when they are called."""
     knowing = {i for i in imports() if under(i.importer, "service.cli") and top(i.target) in ("kernels", "warp")}
     assert all(i.lazy for i in knowing)
-    assert {i.importer for i in knowing} <= {"service.cli.doctor", "service.cli.request_commands"}
+    assert {i.importer for i in knowing} <= {"service.cli.commands.doctor", "service.cli.request_commands"}
 
 
 def test_the_roof_outside_the_products_knows_no_warp():
@@ -170,6 +173,48 @@ def test_no_module_takes_a_private_name_of_another():
 
 def test_nothing_lies_loose_in_the_root_of_the_service():
     assert {path.name for path in (HOME / "service").glob("*.py")} == {"__init__.py", "errors.py"}
+
+
+def package_of(name: str) -> str:
+    """Return the package that a module lies in; a package that is imported by its name is itself."""
+    return name if FILES[name].name == "__init__.py" else name.rpartition(".")[0]
+
+
+def module_of(target: str) -> str | None:
+    """Return the module that an import loads, or None for another library's."""
+    return next((name for name in (target, target.rpartition(".")[0]) if name in FILES), None)
+
+
+@pytest.mark.parametrize("depth", [2, 3, 9])
+def test_packages_have_no_cycles(depth):
+    """Neither products (service.solve …) nor the rooms in them import each other in a circle, not even when a function is called."""
+    graph: dict[str, set[str]] = {}
+    for found in imports():
+        target = module_of(found.target)
+        if target is None:
+            continue
+        one, other = (".".join(package_of(name).split(".")[:depth]) for name in (found.importer, target))
+        if one != other:
+            graph.setdefault(one, set()).add(other)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_no_private_module_is_imported_from_another_package():
+    private = {(found.importer, target) for found in imports() if (target := module_of(found.target)) is not None
+               and target.rpartition(".")[2].startswith("_") and FILES[target].name != "__init__.py"
+               and package_of(target) != package_of(found.importer)}
+    assert private == set()
+
+
+def test_no_folder_holds_more_files_than_a_newcomer_can_scan():
+    files: dict[Path, int] = {}
+    for path in FILES.values():
+        if path.name != "__init__.py" and "migrations" not in path.parts:
+            files[path.parent] = files.get(path.parent, 0) + 1
+    assert {str(folder.relative_to(HOME)): count for folder, count in files.items() if count > 24} == {}
 
 
 def test_no_cycles():
@@ -206,7 +251,7 @@ def test_images_are_read_without_opencv():
 def test_the_client_starts_without_heavy_libraries():
     """A pipeline's interpreter loads no server, database, image library or device, even when it makes a client and a job."""
     heavy = ("fastapi", "starlette", "dbos", "uvicorn", "sqlalchemy", "numpy", "warp", "OpenEXR", "OpenImageIO", "cv2", "pxr", "typer",
-             "kernels", "service.server", "service.solve", "stage.images", "stage.capture")
+             "kernels", "service.server", "service.solve", "stage.formats.images", "stage.capture.capture")
     code = ("import sys; from service.client import Client; from service.requests.jobs import SolveJob; Client().close(); "
             f"print([name for name in {heavy!r} if name in sys.modules])")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
@@ -214,8 +259,9 @@ def test_the_client_starts_without_heavy_libraries():
 
 
 @pytest.mark.parametrize(("process", "heavy"), [
-    ("service.server.serve", ("numpy", "warp", "alembic", "service.solve")),
-    ("service.server.processes", ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
+    ("service.server.process.serve", ("numpy", "warp", "alembic", "service.solve")),
+    ("service.server.process.processes",
+     ("numpy", "warp", "alembic", "dbos", "fastapi", "service.server.jobs.worker", "service.requests.jobs")),
 ])
 def test_what_watches_workers_starts_without_what_they_need(process, heavy):
     code = f"import sys, {process}; print([name for name in {heavy!r} if name in sys.modules])"

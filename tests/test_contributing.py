@@ -14,7 +14,8 @@ MOST_FILES = 8
 
 
 def test_the_ways_are_read():
-    assert list(WAYS) == ["Solve", "Relight with maps", "Depth", "A job of the service", "Export"]
+    assert list(WAYS) == ["Solve", "Relight with maps", "Depth", "Register and fuse", "A job of the service", "Export",
+                          "A page of the browser"]
 
 
 @pytest.mark.parametrize("way", WAYS)

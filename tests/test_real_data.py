@@ -8,10 +8,10 @@ import pytest
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import images
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.formats import images
 from stage.importers import diligent
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees
 
 DATA = Path(os.environ.get("RELIT_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

@@ -10,7 +10,7 @@ import pytest
 from kernels.status import Status
 from kernels.structured.binary import decode_gray
 from kernels.structured.confirm import confirm_stripes
-from kernels.structured.frames import NoiseModel, upload
+from kernels.structured.pattern_frames import NoiseModel, upload
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 

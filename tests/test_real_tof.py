@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kernels.tof.pileup import place, without_pileup
-from kernels.tof.pulse_width import estimate_pulse
-from kernels.tof.returns import find_returns
+from kernels.tof.histogram.pileup import place, without_pileup
+from kernels.tof.histogram.pulse_width import estimate_pulse
+from kernels.tof.histogram.returns import find_returns
 from stage.tof.calibration import TofCalibration, fit_line
 from stage.tof.light_time import SPEED_OF_LIGHT
 

@@ -11,8 +11,8 @@ from benchmarks.clients import parts
 from benchmarks.clients.comparison import compare
 from benchmarks.clients.render import Client, Environment, Sun, render
 from benchmarks.relighting import rgb
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.formats import exr
 
 
 def main() -> None:

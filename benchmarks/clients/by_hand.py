@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
-from stage.images import write_png
-from stage.maps import SurfaceMaps
+from stage.formats.images import write_png
+from stage.results.maps import SurfaceMaps
 
 DIELECTRIC_F0 = 0.04
 BLEED_ROUNDS = 8

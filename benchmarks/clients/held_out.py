@@ -24,9 +24,9 @@ from service.export.export import export
 from service.requests.export import ExportRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage.capture import Capture
-from stage.correction import Correction
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.capture.capture import Capture
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.stack.correction import Correction
 
 HELD_OUT = 8
 PATHS = 64

@@ -17,13 +17,13 @@ from benchmarks.clients.comparison import Comparison, compare
 from benchmarks.clients.render import Client, Environment, render
 from benchmarks.relighting import rgb
 from service.export.export import export
-from service.light.sheet import display, write_sheet
+from service.relight.sheet import display, write_sheet
 from service.requests.export import ExportRequest
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
-from stage.capture import Capture
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 
 ENVIRONMENTS = {"A": "sky", "B": "patches"}
 """A: sun of 3° and sky; B: three soft patches."""

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.clients import installed, three, usd_arrays
-from stage import exr
-from stage.camera import Camera
+from stage.capture.camera import Camera
+from stage.formats import exr
 
 HERE = Path(__file__).parent
 TIME_LIMIT_S = 900

@@ -11,7 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 from pxr import Ar, Gf, Usd, UsdGeom, UsdShade
 
-from stage.colour import convert
+from stage.colour.colour import convert
 
 INPUTS = {"diffuseColor": (0.18, 0.18, 0.18), "metallic": 0.0, "roughness": 0.5, "normal": (0.0, 0.0, 1.0), "opacity": 1.0, "ior": 1.5}
 """The inputs that are read, and their values where the material says nothing."""

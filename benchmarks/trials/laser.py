@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.trials.trial import Trial
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
-from stage import exr
 from stage.errors import ManifestError
+from stage.formats import exr
 
 ROWS, COLS, ACROSS, DOWN, FOCAL_PX = 96, 160, 4, 2, 420.0
 LASER = np.array([0.35, 0.03, 0.02])

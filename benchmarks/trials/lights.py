@@ -18,7 +18,7 @@ from benchmarks.accuracy import angles_deg
 from benchmarks.trials.trial import Trial
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import SolveResult, solve
-from stage import exr
+from stage.formats import exr
 from stage.importers import diligent
 
 SIZE, LIGHTS, STEPS = 96, 20, 64

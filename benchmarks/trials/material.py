@@ -16,7 +16,7 @@ from benchmarks.accuracy import angles_deg
 from benchmarks.trials.trial import Trial
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
+from stage.formats import exr
 from stage.importers import diligent
 
 SIDE, PATHS, BOUNCES = 72, 64, 4

@@ -18,11 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.candidates import rings
-from kernels.photometric.certainty import assess
-from kernels.photometric.descent import WARM, descend
-from kernels.photometric.hypotheses import Diffuse, Prior
-from kernels.photometric.material import (
+from kernels.photometric.material.material import (
     MATT,
     Material,
     explains,
@@ -33,11 +29,15 @@ from kernels.photometric.material import (
     is_dielectric,
     outlying,
 )
-from kernels.photometric.metal_search import Metals, moved, search_metals
-from kernels.photometric.mixtures import NO_PAIRS, Mixture, mix_materials
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.refine import refine
-from kernels.photometric.samples import Samples, choose, to_host
+from kernels.photometric.material.metal_search import Metals, moved, search_metals
+from kernels.photometric.material.mixtures import NO_PAIRS, Mixture, mix_materials
+from kernels.photometric.model.candidates import rings
+from kernels.photometric.model.samples import Samples, choose, to_host
+from kernels.photometric.search.certainty import assess
+from kernels.photometric.search.descent import WARM, descend
+from kernels.photometric.search.hypotheses import Diffuse, Prior
+from kernels.photometric.search.normal_search import find_normals
+from kernels.photometric.search.refine import refine
 
 NEIGHBOURS = ((-0.15, 0.0), (0.15, 0.0), (0.0, -0.1), (0.0, 0.1))
 """Differences in roughness and slope of the shapes that are tried besides the shared one: a material varies by as much over an object. A

@@ -27,7 +27,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
-from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 SHADOW_SIGMAS = 5.0
 """Least contrast (white minus black, or the largest difference of a pair), in its standard deviations; a pixel with less is not reached by

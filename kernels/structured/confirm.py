@@ -18,7 +18,7 @@ from kernels.packs import Band, as_pixels
 from kernels.status import OK, Status
 from kernels.structured.binary import FINE_BITS
 from kernels.structured.decoded import STRIPE_DEVIATION, Decoded
-from kernels.structured.frames import NoiseModel, check_noise, check_stripes, require_frames
+from kernels.structured.pattern_frames import NoiseModel, check_noise, check_stripes, require_frames
 
 AROUND = 9
 """Distance in camera pixels up to which sure pixels count."""

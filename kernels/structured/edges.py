@@ -21,7 +21,7 @@ from kernels.packs import Band, as_packs, as_pixels, pack_type, unwritten
 from kernels.status import OK
 from kernels.structured.binary import gray_to_binary
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import NoiseModel, check_noise, check_stripes, require_frames
+from kernels.structured.pattern_frames import NoiseModel, check_noise, check_stripes, require_frames
 
 REACH = 48
 """Distance in camera pixels within which an edge is searched on either side; a wider stripe is not interpolated."""

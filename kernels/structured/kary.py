@@ -31,7 +31,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
-from kernels.structured.frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
 
 EMPTY_CHI2 = 1.0e30
 """Sentinel χ² where there is no carry."""

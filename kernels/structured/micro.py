@@ -21,7 +21,7 @@ from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded, unwritten_decoded
-from kernels.structured.frames import NoiseModel, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
 from kernels.structured.response import light_between, light_slope, light_table
 from kernels.structured.unwrap import EMPTY_CHI2, judge, keep_better, keeps_place

@@ -16,7 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
-from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import WrappedPhase, add_frame, weights, write_phases_in
 from kernels.structured.response import modulated_wave, phase_table, straighten
 

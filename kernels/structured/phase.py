@@ -21,7 +21,7 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
 from kernels.structured.angles import angle_of
-from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.response import bent_wave, phase_table, straighten
 
 SIGNAL_SIGMAS = 5.0

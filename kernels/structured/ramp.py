@@ -17,7 +17,7 @@ from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
 from kernels.structured.decoded import Decoded, unwritten_decoded
-from kernels.structured.frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.response import light_of
 
 SHADOW_SIGMAS = 5.0

@@ -25,7 +25,7 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
-from kernels.structured.frames import cut_in, require_frames, saturation_masks
+from kernels.structured.pattern_frames import cut_in, require_frames, saturation_masks
 from kernels.structured.phase import weights
 
 _SATURATED = int(Status.SATURATED)

@@ -11,17 +11,17 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.reporting.provenance import metadata
 from service.requests.basis import BasisKind, BasisRequest
-from stage.brackets import merge_brackets
-from stage.capture import Capture
-from stage.colour_spaces import linear_space
-from stage.ingest import open_stack
-from stage.light import PointLight
-from stage.light_basis import facts_path, numbers
-from stage.lighting import lights_from_centre
-from stage.manifest import FILE_NAME
+from stage.capture.capture import Capture
+from stage.capture.light import PointLight
+from stage.capture.lighting import lights_from_centre
+from stage.capture.manifest import FILE_NAME
+from stage.capture.point_lights import DistantLights
+from stage.colour.colour_spaces import linear_space
 from stage.motion.tracking import tracking_frames
-from stage.point_lights import DistantLights
-from stage.stack import Stack
+from stage.results.light_basis import facts_path, numbers
+from stage.stack.brackets import merge_brackets
+from stage.stack.ingest import open_stack
+from stage.stack.stack import Stack
 
 
 class BasisCapture(NamedTuple):

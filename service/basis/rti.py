@@ -3,7 +3,7 @@
 Coefficients are fitted twice, once for their ranges and once to be stored, so that only bytes are kept of the whole image.
 
 Source: Malzbender, Gelb and Wolters, "Polynomial texture maps", SIGGRAPH 2001, section 3; Gautron et al., "A novel hemispherical basis for
-accurate and efficient rendering", Eurographics Symposium on Rendering 2004 (kernels.relight.rti has the equations).
+accurate and efficient rendering", Eurographics Symposium on Rendering 2004 (kernels.relight.basis.rti has the equations).
 """
 
 from pathlib import Path
@@ -13,16 +13,16 @@ import numpy as np
 
 from kernels.errors import ArrayError
 from kernels.packs import Band
-from kernels.relight.basis import squared_residual
-from kernels.relight.combine import combine_batch
-from kernels.relight.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, encode, fit_weights, hemispherical_harmonics, separate
+from kernels.relight.basis.basis import squared_residual
+from kernels.relight.basis.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, encode, fit_weights, hemispherical_harmonics, separate
+from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
-from stage.colour import rgb_matrix
+from stage.colour.colour import rgb_matrix
 from stage.errors import ManifestError
-from stage.light_basis import numbers, write_facts
+from stage.results.light_basis import numbers, write_facts
 from stage.rti import hsh, ptm
 from stage.rti.quantization import Quantization, dequantize, quantization_of_range, quantize
 

@@ -1,21 +1,21 @@
 """The captured images reduced to K coefficient images by a singular value decomposition of each channel.
 
 Source: the first K singular vectors give the sum of K images with the least squared error, Eckart and Young, "The approximation of one
-matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis).
+matrix by another of lower rank", Psychometrika 1, 1936 (kernels.relight.basis.basis).
 """
 
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.relight.basis import Basis, gram, principal, projection, squared_residual
-from kernels.relight.combine import combine_batch
+from kernels.relight.basis.basis import Basis, gram, principal, projection, squared_residual
+from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
 from service.viewing.held_out import KEY_LIGHTS, key_weights
-from stage.ingest import TOP_EXPONENT
-from stage.light_basis import layer_name, layer_types, numbers, write_facts, write_layers
+from stage.results.light_basis import layer_name, layer_types, numbers, write_facts, write_layers
+from stage.stack.ingest import TOP_EXPONENT
 
 DEFAULT_COUNT = 16
 

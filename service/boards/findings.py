@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from stage.board.comparison import Deviation
-from stage.board.grid import BoardGrid
-from stage.board.regions import RegionResult
-from stage.board.significance import Scan, core_of, grown, mean_of, weighted_centre
+from service.boards.stitching.comparison import Deviation
+from service.boards.stitching.grid import BoardGrid
+from service.boards.stitching.regions import RegionResult
+from service.boards.stitching.significance import Scan, core_of, grown, mean_of, weighted_centre
 
 FINDINGS_FILE = "findings.csv"
 MOST_AREAS = 1000

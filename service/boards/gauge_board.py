@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.boards.stitching.gauge import GaugeStudy, gauge_study
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.inspect_board import GaugeBoardRequest
 from stage import inputs
-from stage.board.gauge import GaugeStudy, gauge_study
-from stage.board.records import STUDY_SCHEMA, GaugeRuns
 from stage.errors import BoardError, ManifestError
 from stage.files import write_text
-from stage.fingerprint import digest
 from stage.records import read_record
+from stage.sets.board import STUDY_SCHEMA, GaugeRuns
+from stage.stack.fingerprint import digest
 
 GAUGE_FILE = "gauge.csv"
 METHOD = "gauge R&R (ANOVA)"

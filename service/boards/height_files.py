@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage import exr
-from stage.board.grid import BoardGrid, HeightMap
-from stage.board.records import DESIGN_SCHEMA, REGIONS_SCHEMA, BoardDesign, BoardRegions, Region
+from service.boards.stitching.grid import BoardGrid, HeightMap
 from stage.errors import ManifestError, ResultError
+from stage.formats import exr
 from stage.records import read_record
-from stage.result_metadata import camera_and_provenance, result_metadata
+from stage.results.result_metadata import camera_and_provenance, result_metadata
+from stage.sets.board import DESIGN_SCHEMA, REGIONS_SCHEMA, BoardDesign, BoardRegions, Region
 
 BOARD_FILE = "board.exr"
 HEIGHT, SIGMA, NOISE, MASK = "height.Z", "sigma.Z", "noise.Z", "mask.Y"

@@ -1,8 +1,8 @@
 """Inspect a board and write board.exr, deviation.exr, findings.csv, inspection.png and report.json.
 
-The way of the data: tiles (depth results, or captures that the depth product decodes) → stage/board/stitching.py (where every tile lies,
-by all overlaps at once) → blended on the grid of the nominal heights → registered to them → deviation, less a plane → windows and
-regions judged by σ → the files.
+The way of the data: tiles (depth results, or captures that the depth product decodes) → service/boards/stitching/stitching.py (where every
+tile lies, by all overlaps at once) → blended on the grid of the nominal heights → registered to them → deviation, less a plane → windows
+and regions judged by σ → the files.
 """
 
 from pathlib import Path
@@ -13,24 +13,24 @@ import numpy as np
 from kernels import device as devices
 from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
 from service.boards.height_files import BOARD_FILE, Nominal, read_design, read_golden, write_board
+from service.boards.inspection_picture import PICTURE_FILE, write_picture
 from service.boards.matching import Match, check_size, match
-from service.boards.picture import PICTURE_FILE, write_picture
+from service.boards.stitching.comparison import Deviation, Form, bow_and_twist, compare, fit_form
+from service.boards.stitching.grid import HeightMap
+from service.boards.stitching.overlap import Evidence
+from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
+from service.boards.stitching.significance import Scan, scan_windows
+from service.boards.stitching.stitching import Stitched, blend, stitch
 from service.boards.tiles import BoardTiles, read_tiles
-from service.depth.solution import statistics
+from service.depth.results.solution import statistics
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.inspect_board import BoardForm, InspectBoardRequest
-from stage import exr
-from stage.board.comparison import Deviation, Form, bow_and_twist, compare, fit_form
-from stage.board.grid import HeightMap
-from stage.board.overlap import Evidence
-from stage.board.regions import RegionResult, Verdict, check_regions, tolerances_over
-from stage.board.significance import Scan, scan_windows
-from stage.board.stitching import Stitched, blend, stitch
 from stage.errors import BoardError
 from stage.files import write_text
-from stage.fingerprint import digest
-from stage.result_metadata import result_metadata
+from stage.formats import exr
+from stage.results.result_metadata import result_metadata
+from stage.stack.fingerprint import digest
 
 DEVIATION_FILE = "deviation.exr"
 METHOD = "board inspection"

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from service.boards.height_files import Nominal
-from stage.board.grid import HeightMap, HeightPatch
-from stage.board.overlap import Evidence, Overlap, measure_overlap
-from stage.board.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched, TilePoints
+from service.boards.stitching.grid import HeightMap, HeightPatch
+from service.boards.stitching.overlap import Evidence, Overlap, measure_overlap
+from service.boards.stitching.stitching import MILLI, SEARCH_SIGMA, SHIFT_SIGMA_PX, TURN_SIGMA_DEGREES, Stitched, TilePoints
 from stage.errors import BoardError
 
 LEAST_SHARE = 0.5

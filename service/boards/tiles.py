@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.boards.stitching.stitching import TilePoints
 from service.depth.depth import depth
 from service.reporting.progress import Progress
 from service.requests.depth import DepthRequest
-from stage.board.records import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
-from stage.board.stitching import TilePoints
-from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.capture.manifest import FILE_NAME
 from stage.errors import BoardError, ManifestError
-from stage.manifest import FILE_NAME
 from stage.records import read_record
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
 
 
 class BoardTiles(NamedTuple):

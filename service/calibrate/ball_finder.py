@@ -5,17 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.samples import evenly
+from kernels.photometric.model.samples import evenly
 from service.calibrate.results import LightCaptures
+from service.calibrate.solvers.apply import LitFrame, as_direction
+from service.calibrate.solvers.ball_search import find_outlines
+from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot
 from service.errors import RequestError
-from stage.calibration.apply import LitFrame, as_direction
-from stage.calibration.ball import Ball, BallView, project, view_ball
-from stage.calibration.ball_search import find_outlines
-from stage.calibration.grey_ball import fit_brightness, fit_direction
-from stage.calibration.mirror_ball import SpotOptions, find_spot
-from stage.camera import Camera
-from stage.correction import Correction
+from service.light_estimation.ball import Ball, BallView, project, view_ball
+from service.light_estimation.grey_ball import fit_brightness, fit_direction
+from stage.capture.camera import Camera
 from stage.errors import CalibrationError
+from stage.stack.correction import Correction
 
 FRAMES = 16
 """The most frames in which each outline is looked at."""

@@ -6,14 +6,14 @@ from typing import Any
 
 from service.calibrate.results import digits
 from service.errors import RequestError
+from service.light_estimation.ball import Ball, ball_from_circle
+from service.light_estimation.ball_outline import ball_from_mask
 from service.requests.calibrate import BallRequest
-from stage import images
-from stage.calibration.ball import Ball, ball_from_circle
-from stage.calibration.outline import ball_from_mask
-from stage.camera import Camera
-from stage.capture import Capture
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME
 from stage.errors import CalibrationError, ManifestError
-from stage.manifest import FILE_NAME
+from stage.formats import images
 
 RADIUS_TOLERANCE = 0.05
 """Relative difference of a ball's radius in metres from its radius in pixels × pixel_size_m, above which one of them must be wrong."""

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
-from stage.correction import Correction
+from stage.capture.capture import Capture
+from stage.colour.colour import GREY_WEIGHTS
 from stage.patterns.base import UniformPattern
+from stage.stack.correction import Correction
 
 
 def uniform(capture: Capture, correction: Correction, code: str) -> np.ndarray | None:

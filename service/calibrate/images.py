@@ -9,16 +9,16 @@ import numpy as np
 
 from service import __version__
 from service.calibrate.results import digits, manifest_to_write, write_results
+from service.calibrate.solvers.flat_field import make_flat, mean_image, recorded_values
+from service.calibrate.solvers.saturation import TopHistogram, capture_saturation
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest
-from stage import exr, images
-from stage.calibration.flat_field import make_flat, mean_image, recorded_values
-from stage.calibration.saturation import TopHistogram, capture_saturation
-from stage.camera_raw import path_is_raw
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.colour.radiance import RAW_STRAY, check_radiance
 from stage.errors import CalibrationError
-from stage.radiance import RAW_STRAY, check_radiance
+from stage.formats import exr, images
+from stage.formats.camera_raw import path_is_raw
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
 

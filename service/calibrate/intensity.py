@@ -11,14 +11,14 @@ from service.calibrate.results import (
     three_numbers,
     write_lights,
 )
+from service.calibrate.solvers.apply import with_brightness
+from service.light_estimation.semi_calibrated import check_directions, fit_intensities
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import IntensityRequest
-from stage.calibration.apply import with_brightness
-from stage.calibration.semi_calibrated import check_directions, fit_intensities
-from stage.correction import Correction
+from stage.capture.light import DistantLight
+from stage.capture.manifest import FILE_NAME
 from stage.errors import CalibrationError, ManifestError
-from stage.light import DistantLight
-from stage.manifest import FILE_NAME
+from stage.stack.correction import Correction
 
 BEHIND_Z = -0.2
 """A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""

@@ -12,17 +12,17 @@ from kernels.structured.stripe import find_stripe
 from service.calibrate.even_light import even_light, uniform
 from service.calibrate.laser_step import check_step, planes_on_step
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.depth.stripes import stripe_signal
+from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, inside_board
+from service.calibrate.solvers.procam import find_corners
+from service.depth.laser.stripes import stripe_signal
+from service.depth.patterns.triangulation_check import check_perspective
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
-from stage.calibration.laser_plane import board_plane, fit_light_plane, inside_board
-from stage.calibration.procam import find_corners
-from stage.capture import Capture
-from stage.correction import Correction
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.capture.ranging import LaserPlane
 from stage.errors import CalibrationError, ManifestError
-from stage.manifest import FILE_NAME, Frame
-from stage.ranging import LaserPlane
-from stage.triangulation_check import check_perspective
+from stage.stack.correction import Correction
 
 LEAST_BOARDS = 2
 """The fewest poses of a board: its stripe in one is a line, through which any plane goes."""

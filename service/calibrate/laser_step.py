@@ -7,15 +7,15 @@ import numpy as np
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
 from service.calibrate.even_light import even_light
-from service.depth.laser import ambient_light
-from service.depth.stripes import stripe_signal
+from service.calibrate.solvers.laser_step import StepFit, fit_step
+from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
+from service.depth.laser.laser import ambient_light
+from service.depth.laser.stripes import stripe_signal
 from service.reporting.progress import Timings
-from stage.calibration.laser_step import StepFit, fit_step
-from stage.calibration.step_stripe import StepStripe, split_stripe
-from stage.capture import Capture
-from stage.correction import Correction
+from stage.capture.capture import Capture
+from stage.capture.manifest import Frame
 from stage.errors import CalibrationError
-from stage.manifest import Frame
+from stage.stack.correction import Correction
 
 LEAST_EVEN = 0.02
 """Part of the brightest light of the room below which a pixel says nothing of its albedo."""

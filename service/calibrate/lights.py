@@ -19,18 +19,18 @@ from service.calibrate.results import (
     three_numbers,
     write_lights,
 )
+from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
+from service.calibrate.solvers.light_positions import MISSES, nearest_point
+from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot
 from service.errors import RequestError
+from service.light_estimation.ball import Ball, BallView, view_ball
+from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
-from stage.calibration.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
-from stage.calibration.ball import Ball, BallView, view_ball
-from stage.calibration.grey_ball import better_encoding, fit_brightness, fit_direction
-from stage.calibration.light_positions import MISSES, nearest_point
-from stage.calibration.mirror_ball import SpotOptions, find_spot
-from stage.correction import Correction
+from stage.capture.light import DistantLight, PointLight
+from stage.capture.manifest import FILE_NAME
 from stage.errors import CalibrationError, ManifestError
-from stage.light import DistantLight, PointLight
-from stage.manifest import FILE_NAME
+from stage.stack.correction import Correction
 
 ANALYSER_GAIN = 2.0
 """Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""

@@ -8,23 +8,23 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
-from kernels.structured.frames import NoiseModel
+from kernels.structured.pattern_frames import NoiseModel
 from service.calibrate.results import digits, manifests_to_replace, write_results
-from service.depth.decoders import PatternProjector
-from service.depth.patterns import decoded_bands, full_scale, read_codes, scene_colour
+from service.calibrate.solvers.procam import BoardView, Lens, ProCam, calibrate, find_corners, outliers, projector_corners
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.patterns import decoded_bands, full_scale, read_codes, scene_colour
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ProcamRequest
 from service.requests.depth import DepthRequest
-from stage.calibration.procam import BoardView, Lens, ProCam, calibrate, find_corners, outliers, projector_corners
-from stage.camera import Camera
-from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Manifest
+from stage.capture.projector import Projector
+from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError, ManifestError
-from stage.manifest import FILE_NAME, Manifest
 from stage.model import Resolution
-from stage.pattern_exposures import JoinedExposures, frames_shown
-from stage.planes import frame_planes
-from stage.projector import Projector
+from stage.stack.pattern_exposures import JoinedExposures, frames_shown
+from stage.stack.planes import frame_planes
 
 LEAST_CORNERS = 0.5
 """Part of the board's corners that must be found by camera and projector, for a view to count."""

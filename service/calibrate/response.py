@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from service.calibrate.results import digits, manifest_to_write, write_results
+from service.calibrate.solvers.response import fit_response
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import ResponseRequest
-from stage import images
-from stage.calibration.response import fit_response
-from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS, linearise
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME
+from stage.colour.colour import GREY_WEIGHTS, linearise
+from stage.colour.radiance import check_radiance
 from stage.errors import CalibrationError, ManifestError
-from stage.manifest import FILE_NAME
-from stage.radiance import check_radiance
+from stage.formats import images
 
 
 class ResponseResult(NamedTuple):

@@ -5,15 +5,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from service.calibrate.solvers.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from service.errors import RequestError
 from service.reporting.provenance import requested, versions, with_names
-from service.requests.base import Options
+from service.requests.base.base import Options
 from service.requests.calibrate import LightsRequest
-from stage.calibration.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Manifest, write_manifest
 from stage.errors import CalibrationError
 from stage.files import write_text
-from stage.manifest import FILE_NAME, Manifest, write_manifest
 
 CALIBRATION_FILE = "calibration.json"
 SCHEMA = "relit.calibration/1"

@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.calibrate.results import digits, manifests_to_replace, write_results
+from service.calibrate.solvers.procam import Lens, find_corners
+from service.calibrate.solvers.stereo import SharedView, StereoPose, alike_order, calibrate_lens, calibrate_pose
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
-from stage.calibration.procam import Lens, find_corners
-from stage.calibration.stereo import SharedView, StereoPose, alike_order, calibrate_lens, calibrate_pose
-from stage.camera import Camera
-from stage.capture import Capture
-from stage.colour import GREY_WEIGHTS, linearise
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Manifest
+from stage.capture.other_camera import OtherCamera
+from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.errors import ManifestError
-from stage.manifest import FILE_NAME, Manifest
-from stage.stereo.other_camera import OtherCamera
 
 MOST_ERROR_PX = 0.5
 """Error of a view, root mean square, from which it is remarked on."""

@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from kernels.tof.continuous import decode
-from service.depth.continuous_wave import estimate_noise
-from service.depth.tof import solve_tof, z_per_range
+from kernels.tof.continuous.continuous import decode
+from service.depth.tof.continuous_wave import estimate_noise
+from service.depth.tof.tof import solve_tof, z_per_range
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import TofCalibrationRequest
 from service.requests.depth import TofOptions
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.files import resolved
 from stage.tof.calibration import (
     Harmonics,
@@ -27,7 +27,7 @@ from stage.tof.calibration import (
     read_sweep,
     write_calibration,
 )
-from stage.tof.frames import is_pulsed, read_correlations, read_source
+from stage.tof.raw_frames import is_pulsed, read_correlations, read_source
 from stage.tof.source import SourcePath
 
 STEP_PIXELS = 400

@@ -6,18 +6,18 @@ from typing import NamedTuple
 import numpy as np
 
 from service.calibrate.results import digits, manifest_to_write, write_results
+from service.calibrate.solvers.flat_field import mean_image
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import WhiteBalanceRequest
-from stage import images
-from stage.calibration.flat_field import mean_image
-from stage.camera_raw import path_is_raw, rec709_from_camera
-from stage.capture import Capture
-from stage.colour import linearise, rgb_matrix
-from stage.colour_spaces import linear_space
-from stage.correction import FULL_SCALE
+from stage.capture.capture import Capture
+from stage.colour.colour import linearise, rgb_matrix
+from stage.colour.colour_spaces import linear_space
 from stage.errors import CalibrationError
+from stage.formats import images
+from stage.formats.camera_raw import path_is_raw, rec709_from_camera
 from stage.pixels import Crop
+from stage.stack.correction import FULL_SCALE
 
 
 class WhiteBalance(NamedTuple):

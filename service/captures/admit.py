@@ -3,20 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from service.light.time_steps import time_steps
+from service.relight.time_steps import time_steps
 from service.reporting.progress import Progress, Timings
-from stage import images, inputs, jxl
-from stage.arrays import array_shape
-from stage.board.records import SCAN_FILE as BOARD_FILE
-from stage.board.records import SCAN_SCHEMA, BoardScan
-from stage.capture import Capture
-from stage.depth_maps import DEPTH_FILE
-from stage.environment_maps import SUFFIXES
+from stage import inputs
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Manifest, read_manifest
+from stage.capture.sequence import SEQUENCE_FILE, is_sequence, read_sequence
+from stage.colour.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
-from stage.manifest import FILE_NAME, Manifest, read_manifest
+from stage.formats import images, jxl
+from stage.formats.npy import array_shape
 from stage.records import read_record
-from stage.sequence import SEQUENCE_FILE, is_sequence, read_sequence
+from stage.results.depth_maps import DEPTH_FILE
+from stage.sets.board import SCAN_FILE as BOARD_FILE
+from stage.sets.board import SCAN_SCHEMA, BoardScan
 from stage.tof.scan import FILE_NAME as SCAN_FILE
 from stage.tof.scan import read_scan
 

@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from service.captures.processes import bare_environment, limit
-from stage import images, inputs
+from stage import inputs
 from stage.errors import ImageError, StageError
-from stage.exif import Exposure
-from stage.images import ImageHeader
+from stage.formats import images
+from stage.formats.exif import Exposure
+from stage.formats.images import ImageHeader
 
 BASE_BYTES, PIXEL_BYTES = 2 << 30, 24
 """Bytes of data that a process may have, besides so many for each pixel that an image may have."""
@@ -72,7 +73,7 @@ class _Process:
 
 
 class Decoders:
-    """Decodes images in other processes, several at one time. Implements `stage.images.Decoder`."""
+    """Decodes images in other processes, several at one time. Implements `stage.formats.images.Decoder`."""
 
     def __init__(self, max_pixels: int) -> None:
         """Args: max_pixels: most pixels of an image."""
@@ -83,14 +84,14 @@ class Decoders:
         self._lock = threading.Lock()
 
     def header(self, path: Path) -> ImageHeader:
-        """Return the header of an image; errors are those of `stage.images.read_header`."""
+        """Return the header of an image; errors are those of `stage.formats.images.read_header`."""
         with self._headers:
             answer, _ = self._ask("header", path)
         header = ImageHeader(*answer["header"])
         return header._replace(exposure=Exposure(*header.exposure))
 
     def recorded(self, path: Path) -> np.ndarray:
-        """Return the pixels of an image; errors are those of `stage.images.read_recorded`."""
+        """Return the pixels of an image; errors are those of `stage.formats.images.read_recorded`."""
         answer, descriptors = self._ask("recorded", path)
         shape, kind = tuple(answer["shape"]), np.dtype(answer["kind"])
         count = int(np.prod(shape)) * kind.itemsize

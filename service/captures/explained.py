@@ -5,16 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.capture import Capture
-from stage.consistency.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest, grey_readings
-from stage.consistency.lambertian import Fit
-from stage.consistency.sentences import explanation_sentence
-from stage.consistency.suspects import Suspect, suspects
-from stage.correction import FULL_SCALE, Correction
+from service.light_estimation.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest, grey_readings
+from service.light_estimation.lambertian import Fit
+from service.light_estimation.sentences import explanation_sentence
+from service.light_estimation.suspects import Suspect, suspects
+from stage.capture.capture import Capture
+from stage.capture.light import DistantLight
+from stage.capture.lighting import has_placeholders
 from stage.errors import StageError
-from stage.images import read_header
-from stage.light import DistantLight
-from stage.lighting import has_placeholders
+from stage.formats.images import read_header
+from stage.stack.correction import FULL_SCALE, Correction
 
 MOST_NAMED = 6
 """The most lights that a sentence names."""

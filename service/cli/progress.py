@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Self, TypeVar
 
 import typer
 
-from service.requests.base import Choice
+from service.requests.base.base import Choice
 
 if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress

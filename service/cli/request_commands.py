@@ -12,7 +12,7 @@ service.requests becomes the options of that model, and the function gets the mo
 
     local_command(app, "solve", _solve)
 
-Names, defaults and help are those of the model's fields; service.requests.options tells the rule, and the model checks the limits. The
+Names, defaults and help are those of the model's fields; service.requests.base.options tells the rule, and the model checks the limits. The
 help of the command is the function's docstring, or the model's where the function has none. Every other parameter of the function is an
 option of the command alone, written for Typer in the usual way. A function that takes `Given[Model]` in place of the model gets what
 was typed, to change or look at it before the model is built; several models share the options that they have in common.
@@ -32,8 +32,8 @@ from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 import typer
 from pydantic import BeforeValidator, ValidationError
 
-from service.requests.base import Options, Role
-from service.requests.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
+from service.requests.base.base import Options, Role
+from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
 
 ORDER = (Role.INPUT, Role.OUTPUT, Role.CHOICE, Role.PART, Role.RUN, Role.MACHINE)
 """The order in which the help lists options."""

@@ -22,7 +22,7 @@ from service.client.errors import (
 )
 from service.client.intakes import Intakes
 from service.client.jobs import Jobs
-from service.requests.address import DEFAULT_SERVER
+from service.requests.base.address import DEFAULT_SERVER
 
 __all__ = ["Busy", "Client", "ClientError", "Conflict", "Faulty", "FileError", "IntakeRefused", "Invalid", "JobEnded", "NotAllowed",
            "NotFound", "Refused", "Unreachable"]

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import httpx2
 
-from service.views.intakes import IntakeView
-from service.views.jobs import JobView
+from service.requests.views.intakes import IntakeView
+from service.requests.views.jobs import JobView
 
 
 class ClientError(Exception):

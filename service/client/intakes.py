@@ -12,8 +12,8 @@ from service.client.local_files import files_of, hash_files, hash_of_all
 from service.client.transfer import TransferProgress, transfer_all
 from service.client.uploads import Upload
 from service.reporting.progress import Progress
-from service.views.intakes import IntakePage, IntakeView
-from service.views.states import CHECKING, READY, RECEIVING, REFUSED
+from service.requests.views.intakes import IntakePage, IntakeView
+from service.requests.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 """First and longest pause, in seconds, between two requests for the state of an intake that is being checked; each pause is 1.5 times the

@@ -11,9 +11,9 @@ from service.client.downloads import Download
 from service.client.errors import FileError, JobEnded
 from service.client.transfer import TransferProgress, transfer_all
 from service.reporting.progress import Progress
-from service.requests.base import JobRequest
-from service.views.jobs import JobPage, JobView, ResultPage, ResultView
-from service.views.states import ENDED, SUCCEEDED, JobState
+from service.requests.base.base import JobRequest
+from service.requests.views.jobs import JobPage, JobView, ResultPage, ResultView
+from service.requests.views.states import ENDED, SUCCEEDED, JobState
 
 PATH = "/v1/jobs"
 EVENT = "job"

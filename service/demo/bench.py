@@ -8,14 +8,14 @@ import warp as wp
 
 from kernels import device as devices
 from kernels import packs
-from kernels.photometric.albedo import fit_albedo
-from kernels.photometric.lambert import solve_lambert
-from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
-from kernels.photometric.robust import solve_robust
-from kernels.relight.combine import combine, combine_batch
+from kernels.photometric.lambertian.albedo import fit_albedo
+from kernels.photometric.lambertian.lambert import solve_lambert
+from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.lambertian.robust import solve_robust
+from kernels.relight.frames.combine import combine, combine_batch
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import BenchRequest
-from stage.colour import GREY_WEIGHTS
+from stage.colour.colour import GREY_WEIGHTS
 
 LIGHTS, SIDE, FRAMES = 64, 512, 24
 """64 lights of 512 x 512 half, as in docs/figures.md."""
@@ -92,7 +92,7 @@ def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
 
 def _one_channel(band: packs.Band, weights: np.ndarray, device: str) -> Callable[[], object]:
     """Return a launch of the combine kernel on a stack of one channel."""
-    from kernels.relight import combine as module
+    from kernels.relight.frames import combine as module
 
     pack = devices.pack_width(device)
     out = packs.zeros(band.pixel_count, wp.float32, device, rows=1)

@@ -10,20 +10,20 @@ import service
 from kernels import device as devices
 from service.errors import RequestError
 from service.export.export import export
-from service.light.relight import relight
-from service.light.sheet import BACKGROUND, display, read_frame, write_sheet
+from service.relight.relight import relight
+from service.relight.sheet import BACKGROUND, display, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import DemoRequest
 from service.requests.export import ExportRequest
 from service.requests.relight import RelightRequest
 from service.requests.solve import SolveRequest
 from service.solve.solve import SolveResult, solve
-from stage.capture import Capture
-from stage.colour import convert
-from stage.correction import Correction
-from stage.ingest import CACHE_FOLDER
-from stage.lighting import distant_lights
-from stage.maps import SurfaceMaps
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights
+from stage.colour.colour import convert
+from stage.results.maps import SurfaceMaps
+from stage.stack.correction import Correction
+from stage.stack.ingest import CACHE_FOLDER
 
 SAMPLE = "owl"
 FRAMES = "1-24"

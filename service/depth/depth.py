@@ -14,27 +14,27 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status, refuse_unsure
-from service.depth.coordinates import DecodedSolution
-from service.depth.laser import solve_laser
-from service.depth.patterns import solve_patterns
-from service.depth.solution import DepthSolution, point_cloud
-from service.depth.stereo import solve_stereo
-from service.depth.tof import solve_tof
-from service.depth.two_cameras import solve_two_cameras
+from service.depth.laser.laser import solve_laser
+from service.depth.patterns.coordinates import DecodedSolution
+from service.depth.patterns.patterns import solve_patterns
+from service.depth.results.solution import DepthSolution, point_cloud
+from service.depth.stereo.stereo import solve_stereo
+from service.depth.stereo.two_cameras import solve_two_cameras
+from service.depth.tof.tof import solve_tof
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import DepthRequest, Ranging
-from stage.capture import Capture
-from stage.depth_maps import DEPTH_FILE, CoordinateMaps, DepthMaps
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.colour.radiance import clipping_sentences
 from stage.errors import ManifestError, storage
 from stage.files import write_text
-from stage.fingerprint import Fingerprints, digest
-from stage.ingest import CACHE_FOLDER
-from stage.manifest import FILE_NAME, Frame
+from stage.formats.ply import POINTS_FILE, write_ply
 from stage.patterns.base import UniformPattern
-from stage.ply import POINTS_FILE, write_ply
-from stage.radiance import clipping_sentences
+from stage.results.depth_maps import DEPTH_FILE, CoordinateMaps, DepthMaps
+from stage.stack.fingerprint import Fingerprints, digest
+from stage.stack.ingest import CACHE_FOLDER
 
 PLAUSIBLE_M = 0.005, 500.0
 """Median depths that are plausible for a projector or a laser; beyond them the units of the calibration are wrong."""

@@ -7,22 +7,22 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import SOLVED
-from kernels.tof.pileup import correct_pileup, place, without_pileup
-from kernels.tof.pulse_width import estimate_pulse
-from kernels.tof.returns import find_returns
-from kernels.tof.undeclared_pileup import estimate_pulses
-from service.depth.count_scale import estimate_count_scale
-from service.depth.histograms import pile_up_warning, scale_warnings
-from service.depth.solution import srgb_bytes, white_of
+from kernels.tof.histogram.pileup import correct_pileup, place, without_pileup
+from kernels.tof.histogram.pulse_width import estimate_pulse
+from kernels.tof.histogram.returns import find_returns
+from kernels.tof.histogram.undeclared_pileup import estimate_pulses
+from service.asset.usd.points import write_points
+from service.depth.results.solution import srgb_bytes, white_of
+from service.depth.tof.count_scale import estimate_count_scale
+from service.depth.tof.histograms import pile_up_warning, scale_warnings
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import ScanRequest
-from service.usd.points import write_points
 from stage.files import write_text
-from stage.fingerprint import Fingerprints
-from stage.las import LAS_FILE, las_is_installed, write_las
-from stage.ply import POINTS_FILE, PointCloud, write_ply
+from stage.formats.las import LAS_FILE, las_is_installed, write_las
+from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
+from stage.stack.fingerprint import Fingerprints
 from stage.tof.light_time import range_of_delay_m
 from stage.tof.scan import FILE_NAME, Shots, read_scan, world_points
 

@@ -12,29 +12,29 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import OK, Status
-from kernels.structured.frames import saturated_bits, upload
+from kernels.structured.pattern_frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
 from service.depth.depth import content_of
-from service.depth.solution import statistics
+from service.depth.results.solution import statistics
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.depth import SeparateRequest
-from stage import exr
-from stage.capture import Capture
-from stage.colour_spaces import linear_space
-from stage.correction import Correction, Radiance
+from stage.capture.capture import Capture
+from stage.capture.light import OffLight
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.colour.colour_spaces import linear_space
+from stage.colour.radiance import clipping_sentences
 from stage.errors import ManifestError
 from stage.files import write_text
-from stage.light import OffLight
-from stage.manifest import FILE_NAME, Frame
-from stage.pattern_exposures import JoinedExposures, frames_shown
+from stage.formats import exr
 from stage.patterns.base import Axis
 from stage.patterns.codes import Collected, collect
 from stage.patterns.phase import FULL_STEPS, PhaseCode
-from stage.planes import frame_planes
-from stage.radiance import clipping_sentences
-from stage.result_metadata import result_metadata
+from stage.results.result_metadata import result_metadata
+from stage.stack.correction import Correction, Radiance
+from stage.stack.pattern_exposures import JoinedExposures, frames_shown
+from stage.stack.planes import frame_planes
 
 SEPARATION_FILE = "separation.exr"
 METHOD = "separation"

@@ -6,26 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, get_args
 
-from service.asset.card import find_frames
-from service.asset.errors import AssetError
-from service.asset.repair import repair_heights
-from service.errors import RequestError
+from service.asset.content.card import find_frames
+from service.asset.content.repair import repair_heights
+from service.asset.usd.surroundings import Surroundings
+from service.errors import AssetError, RequestError
 from service.export.sequence import export_sequence, is_result_sequence
 from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import AssetFormat, ExportRequest, Geometry
-from service.usd.surroundings import Surroundings
-from stage.camera import Camera
-from stage.capture import Capture
-from stage.depth_maps import DEPTH_FILE, DepthMaps
-from stage.environment_maps import check_environment
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME
+from stage.colour.environment_maps import check_environment
+from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError
-from stage.fingerprint import combined, digest
-from stage.manifest import FILE_NAME
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.ply import POINTS_FILE, PointCloud, read_ply
-from stage.radiance import clipping_sentences
+from stage.formats.ply import POINTS_FILE, PointCloud, read_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.stack.fingerprint import combined, digest
 
 OPTIONS = ("rig", "environment", "card")
 """Options of what an asset brings along."""

@@ -5,26 +5,25 @@ from pathlib import Path
 
 import numpy as np
 
-from service.asset.camera import unit_in_metres
-from service.asset.depth import GREY, colour_image, depth_mesh, measured_points
-from service.asset.errors import AssetError
-from service.asset.mesh import height_mesh
-from service.asset.metallic import metallic_look
-from service.asset.repair import repair_heights
-from service.errors import RequestError
+from service.asset.content.camera import unit_in_metres
+from service.asset.content.depth import GREY, colour_image, depth_mesh, measured_points
+from service.asset.content.mesh import height_mesh
+from service.asset.content.metallic import metallic_look
+from service.asset.content.repair import repair_heights
+from service.asset.usd.layers import Description
+from service.asset.usd.sequence_asset import Faces, Moment, SequenceSizes, write_sequence_asset
+from service.errors import AssetError, RequestError
 from service.reporting.progress import Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import ExportRequest, Geometry, TextureFormat
-from service.usd.layers import Description
-from service.usd.sequence_asset import Faces, Moment, SequenceSizes, write_sequence_asset
-from stage.camera import Camera
-from stage.colour import convert
-from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.capture.camera import Camera
+from stage.capture.sequence import SEQUENCE_FILE, Sequence, TimeStep, read_sequence
+from stage.colour.colour import convert
 from stage.errors import ResultError
-from stage.fingerprint import combined, digest
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.ply import POINTS_FILE, read_ply
-from stage.sequence import SEQUENCE_FILE, Sequence, TimeStep, read_sequence
+from stage.formats.ply import POINTS_FILE, read_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.stack.fingerprint import combined, digest
 
 LINEAR = "lin_rec709_scene"
 OF_ONE_STEP = ("relit:capture", "relit:inputs")

@@ -7,13 +7,13 @@ writes it, its suffix into AssetFormat of service/requests/export.py.
 from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn
 
-from service.asset.errors import AssetError
-from service.asset.surface import AssetReport
-from service.gltf import asset as gltf
-from service.usd import asset as usd
-from service.usd.depth_asset import write_depth
-from service.usd.fused_asset import write_fused
-from stage.meshes.mesh import write_mesh_ply
+from service.asset.content.surface import AssetReport
+from service.asset.gltf import asset as gltf
+from service.asset.usd import asset as usd
+from service.asset.usd.depth_asset import write_depth
+from service.asset.usd.fused_asset import write_fused
+from service.errors import AssetError
+from stage.results.mesh import write_mesh_ply
 
 
 def _refuse(*given: Any, **options: Any) -> NoReturn:

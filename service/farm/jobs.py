@@ -12,8 +12,8 @@ import yaml
 
 from service.errors import RequestError
 from service.farm.parameters import Parameters
-from service.requests.base import Request
-from service.requests.frame_range import numbered
+from service.requests.base.base import Request
+from service.requests.light.frame_range import numbered
 from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
 from stage.files import write_text

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import RequestError
-from service.requests.base import Request, Role
-from service.requests.options import Option, help_text, typed, values_of
+from service.requests.base.base import Request, Role
+from service.requests.base.options import Option, help_text, typed, values_of
 
 LONGEST = 1024
 """The specification's limit on the characters of a value."""

@@ -14,14 +14,14 @@ from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.solve import JoinRequest
-from service.solve.parts import numbered
-from stage.camera import Camera
-from stage.depth_maps import DEPTH_FILE, DepthMaps
+from service.solve.height.parts import numbered
+from stage.capture.camera import Camera
 from stage.errors import ResultError
 from stage.files import write_text
-from stage.fingerprint import digest
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.result_metadata import result_file
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.result_metadata import result_file
+from stage.stack.fingerprint import digest
 
 CAMERA_TOLERANCE = 1e-3
 """Largest difference of a number of the two cameras, pixels or parts of it: both results have them from manifests."""

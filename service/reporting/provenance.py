@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from service import __version__
-from service.requests.base import Options, Role
-from service.requests.options import role_of
+from service.requests.base.base import Options, Role
+from service.requests.base.options import role_of
 from stage.errors import ResultError
-from stage.ingest import LAYOUT
+from stage.stack.ingest import LAYOUT
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Choice, Request, Role, StackOptions
+from service.requests.base.base import CAPTURE, Choice, Request, Role, StackOptions
 
 
 class BasisKind(Choice):

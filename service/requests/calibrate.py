@@ -6,7 +6,7 @@ from typing import Annotated, Any, NoReturn, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from service.requests.base import CAPTURE, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
+from service.requests.base.base import CAPTURE, Commas, CropBox, DeviceRequest, Options, Request, Role, Spelling, WidthHeight
 from stage.model import Count, Finite, Positive
 
 

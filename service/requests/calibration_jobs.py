@@ -4,7 +4,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, JobRequest, Role, Spelling
+from service.requests.base.base import CAPTURE, JobRequest, Role, Spelling
+from service.requests.base.identifiers import CaptureId
 from service.requests.calibrate import (
     IMAGES,
     LEAST_GREYS,
@@ -19,7 +20,6 @@ from service.requests.calibrate import (
     ResponseOptions,
     WhiteBalanceOptions,
 )
-from service.requests.identifiers import CaptureId
 from stage.model import Line
 
 MOST_CAPTURES = 100

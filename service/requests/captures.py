@@ -5,9 +5,9 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from service.requests.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, Spelling, WidthHeight
+from service.requests.base.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, Spelling, WidthHeight
 from service.requests.patterns import PatternAxis
-from stage.colour_spaces import ColorSpaceName
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.model import Count, Finite, Line, Positive, Resolution
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import DeviceRequest, Role
+from service.requests.base.base import DeviceRequest, Role
 
 
 class DemoRequest(DeviceRequest):

@@ -5,7 +5,18 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from service.requests.base import CAPTURE, Choice, Commas, DeviceRequest, Options, PixelOptions, Request, Role, SequenceRequest, Spelling
+from service.requests.base.base import (
+    CAPTURE,
+    Choice,
+    Commas,
+    DeviceRequest,
+    Options,
+    PixelOptions,
+    Request,
+    Role,
+    SequenceRequest,
+    Spelling,
+)
 from stage.model import Finite, Fraction, NotNegative, Positive
 
 

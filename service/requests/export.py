@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.requests.base import Choice, Options, PixelOptions, Role, Spelling
+from service.requests.base.base import Choice, Options, PixelOptions, Role, Spelling
 from stage.model import Line
 
 AssetFormat = Literal["usdz", "usda", "usdc", "glb"]

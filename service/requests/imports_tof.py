@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from service.requests.base import Choice, Commas, Role, Spelling, WidthHeight
+from service.requests.base.base import Choice, Commas, Role, Spelling, WidthHeight
 from service.requests.captures import CameraOptions, ImportRequest
 from stage.model import Count, Finite, Line, Positive, Resolution
 

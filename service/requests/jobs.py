@@ -5,22 +5,22 @@ from typing import Annotated, Literal, Self, get_args
 
 from pydantic import Field, TypeAdapter, model_validator
 
-from service.requests.base import CAPTURE, JobRequest, Role, SequenceOptions, Spelling
+from service.requests.base.base import CAPTURE, JobRequest, Role, SequenceOptions, Spelling
+from service.requests.base.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
 from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
 from service.requests.export import AssetFormat, ExportOptions
-from service.requests.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
 from service.requests.inspect_board import InspectBoardOptions
-from service.requests.light_keys import LightKeys
+from service.requests.light.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions
 from service.requests.register import FuseOptions, RegisterOptions
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
 from service.requests.view import ViewOptions
-from stage.board.records import BoardRegions, GaugeRuns
 from stage.model import Count, Line
+from stage.sets.board import BoardRegions, GaugeRuns
 
 MAPS = Spelling(argument=True, metavar="JOB")
 KEYS = Spelling(metavar="FILE")

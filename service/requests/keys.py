@@ -4,8 +4,8 @@ from typing import Annotated
 
 from pydantic import Field, StringConstraints
 
-from service.requests.base import Choice, Options
-from service.requests.identifiers import Project
+from service.requests.base.base import Choice, Options
+from service.requests.base.identifiers import Project
 
 
 class Scope(Choice):

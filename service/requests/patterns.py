@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from service.requests.base.base import Choice, Commas, Options, Role, Spelling, WidthHeight
 from stage.model import Positive
 
 MAX_SIDE = 16384

@@ -5,7 +5,7 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from service.requests.base import Choice, DeviceRequest, Options, Role, Spelling
+from service.requests.base.base import Choice, DeviceRequest, Options, Role, Spelling
 from service.requests.calibrate import Corners, board_corners
 from stage.model import Fraction, Line, Positive
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-from service.requests.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
-from service.requests.picture import FrameRate, PictureOptions
+from service.requests.base.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
+from service.requests.light.picture_options import FrameRate, PictureOptions
 from stage.model import Finite, Line
 
 CHUNK_FRAMES = 32

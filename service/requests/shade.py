@@ -5,8 +5,8 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from service.requests.base import PixelOptions, Request, Role, Spelling
-from service.requests.picture import PictureOptions
+from service.requests.base.base import PixelOptions, Request, Role, Spelling
+from service.requests.light.picture_options import PictureOptions
 from stage.model import Finite, FirstFault
 
 Vector = tuple[float, float, float]

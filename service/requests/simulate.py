@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import Commas, Options, Role, Spelling
+from service.requests.base.base import Commas, Options, Role, Spelling
 from stage.model import Count, NotNegative, Positive, Vector
 
 

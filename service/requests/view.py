@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base import CAPTURE, Request, Role, Spelling, StackOptions
+from service.requests.base.base import CAPTURE, Request, Role, Spelling, StackOptions
 
 MOST_TERMS = 256
 """Layers that a texture of any browser with WebGL2 can have (OpenGL ES 3.0, table 6.29)."""

@@ -6,14 +6,14 @@ import warp as wp
 from kernels.fusion.gather import gather
 from kernels.fusion.rasterise import rasterise
 from kernels.fusion.views import upload_views
-from service.asset.mesh import SurfaceMesh
-from service.asset.tangent import vertex_tangents
-from service.asset.textures import BakedImages, TangentNormals
+from service.asset.content.mesh import SurfaceMesh
+from service.asset.content.tangent import vertex_tangents
+from service.asset.content.textures import BakedImages, TangentNormals
 from service.scans.boxes import boxes
+from service.scans.fused_surface import upload_layers
 from service.scans.range_images import ALBEDO, COLOUR, NORMAL, ROUGHNESS, SPECULAR, PreparedScan, channels
-from service.scans.surface import upload_layers
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 
 SLACK_VOXELS = 3.0
 """Distance, in voxels, by which the simplified mesh may lie off the surface that a view measured and still show it."""

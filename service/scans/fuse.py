@@ -8,7 +8,7 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.fusion.bricks import MEMORY_BOUND
-from service.asset.unwrap import textured_mesh, unwrapper
+from service.asset.content.uv_unwrap import textured_mesh, unwrapper
 from service.errors import RequestError
 from service.export.writers import WRITERS
 from service.reporting.progress import Progress, Timings
@@ -17,14 +17,14 @@ from service.requests.register import FuseRequest
 from service.scans.bake import bake
 from service.scans.fused_bricks import FusedBricks, fused_bricks
 from service.scans.fused_mesh import SEEN_BY, scan_facts, short, triangle_mesh
+from service.scans.fused_surface import Surface, joined_surface
+from service.scans.mesh.holes import Holes, find_holes
+from service.scans.mesh.joined_normals import join_normals
 from service.scans.pieces import SharedPieces
-from service.scans.surface import Surface, joined_surface
 from service.scans.tiles import write_tiles
 from stage.files import write_text
-from stage.fingerprint import digest
-from stage.meshes.holes import Holes, find_holes
-from stage.meshes.joined_normals import join_normals
-from stage.scans.records import ScanSet, read_scan_set
+from stage.sets.scan_set import ScanSet, read_scan_set
+from stage.stack.fingerprint import digest
 
 MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
 LISTED_HOLES = 50

@@ -18,14 +18,14 @@ from kernels.fusion.bricks import BRICK_VOXELS
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
+from service.scans.fused_surface import VERTEX, BrickSurface, fuse_brick, origin_of, places_near
 from service.scans.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
+from service.scans.points.packed_arrays import packed, unpacked
 from service.scans.prepared_scans import PreparedScans, ScanSummary
 from service.scans.range_images import WIDTHS, PreparedScan
-from service.scans.surface import VERTEX, BrickSurface, fuse_brick, origin_of, places_near
-from service.solve.sharing import digest, kind_of_worker
-from stage.packed_arrays import packed, unpacked
-from stage.scans.records import read_scan_set
+from service.solve.sharing.sharing import digest, kind_of_worker
+from stage.sets.scan_set import read_scan_set
 
 
 class FusedBricks(NamedTuple):

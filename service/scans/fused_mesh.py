@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from service.scans.fused_bricks import FusedBricks
+from service.scans.fused_surface import BrickSurface, Surface, Tally
 from service.scans.range_images import COLOUR, channels
-from service.scans.surface import BrickSurface, Surface, Tally
-from stage.colour import convert
-from stage.meshes.mesh import TriangleMesh
+from stage.colour.colour import convert
+from stage.results.mesh import TriangleMesh
 
 SEEN_BY = (1, 2, 3, 5)
 """Numbers of scans for which reports say what share of the area so many see."""

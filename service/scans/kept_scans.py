@@ -12,20 +12,20 @@ import numpy as np
 
 from service.requests.register import RegisterOptions
 from service.scans.pieces import SharedPieces
+from service.scans.points.scan import Scan, Target
 from service.scans.read import read_scan
-from stage.colour import convert
+from service.scans.registration.candidates import Outline, outline_of
+from service.scans.registration.extent import extent_of
+from service.scans.registration.fine import Rows
+from service.scans.registration.found_targets import board_in, markers_in, placed
+from service.scans.registration.pair_tasks import PairTask, register_pair
+from service.scans.registration.pairs import Pair, Prepared, prepare
+from service.scans.registration.stored import packed_pair, packed_scan, unpacked_pair, unpacked_rows, unpacked_scan
+from stage.colour.colour import convert
 from stage.errors import ManifestError
-from stage.fingerprint import digest
-from stage.images import check_resolution, read_pixels
-from stage.scans.candidates import Outline, outline_of
-from stage.scans.extent import extent_of
-from stage.scans.fine import Rows
-from stage.scans.found_targets import board_in, markers_in, placed
-from stage.scans.pair_tasks import PairTask, register_pair
-from stage.scans.pairs import Pair, Prepared, prepare
-from stage.scans.records import ScanEntry, ScanSet
-from stage.scans.scan import Scan, Target
-from stage.scans.stored import packed_pair, packed_scan, unpacked_pair, unpacked_rows, unpacked_scan
+from stage.formats.images import check_resolution, read_pixels
+from stage.sets.scan_set import ScanEntry, ScanSet
+from stage.stack.fingerprint import digest
 
 POINT_BYTES = 250
 """Bytes of memory that a point of a prepared scan takes, with the tree of all."""
@@ -59,7 +59,7 @@ def facts_of(scan: Scan, file: Path, listed: ScanSet, number: int, options: Regi
 
 
 class KeptScans:
-    """The scans of a set; `stage.scans.registration.ScanWork`."""
+    """The scans of a set; `service.scans.registration.registration.ScanWork`."""
 
     def __init__(self, file: Path, listed: ScanSet, pieces: SharedPieces, *, memory_bytes: float, threads: int) -> None:
         """Create the scans, of which none is read yet.

@@ -6,8 +6,8 @@ import numpy as np
 
 from kernels.fusion.residuals import compare_views
 from kernels.fusion.views import upload_views
+from service.scans.fused_surface import world_points
 from service.scans.range_images import PreparedScan
-from service.scans.surface import world_points
 
 SAMPLES = 3000
 """Pixels of a scan that are compared with the others."""

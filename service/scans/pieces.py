@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from service.solve.piece_store import LOOK_S, PieceStore, agree, opened, sealed
-from service.solve.sharing import digest
-from stage.depth_maps import DEPTH_FILE
+from service.solve.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
+from service.solve.sharing.sharing import digest
 from stage.errors import storage
 from stage.files import replacing
+from stage.results.depth_maps import DEPTH_FILE
 
 DONE, CLAIM = ".done", ".claim"
 """Suffixes of the names under which it is kept that a piece is done, and who does it."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from kernels.fusion.resample import STEEPEST, STEP_SIGMAS, resample
 from service.errors import RequestError
+from service.scans.points.scan import Scan
 from service.scans.range_images import SQUARE_VOXELS
 from service.scans.read import FLOAT_STEP
-from stage.camera import Camera
-from stage.scans.scan import Scan
+from stage.capture.camera import Camera
 
 MOST_OFF_AXIS_DEGREES = 55.0
 """Largest angle of a line of sight beside the middle of a scan. The pixels of a flat image see too little beyond."""

@@ -10,14 +10,14 @@ import numpy as np
 
 from kernels.fusion.views import RangeImage
 from service.errors import RequestError
+from service.scans.fused_surface import centre_of
 from service.scans.misplaced import Sample, sample_of
 from service.scans.point_sets import as_range_image
+from service.scans.points.packed_arrays import packed, unpacked
 from service.scans.range_images import PreparedScan, focal_of, prepare_scan, with_layers
 from service.scans.read import read_scan
-from service.scans.surface import centre_of
-from stage.camera import Camera
-from stage.packed_arrays import packed, unpacked
-from stage.scans.records import ScanSet
+from stage.capture.camera import Camera
+from stage.sets.scan_set import ScanSet
 
 T = TypeVar("T")
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from kernels.fusion.resample import STEEPEST, STEP_SIGMAS
 from kernels.fusion.views import RangeImage
-from stage.camera import Camera
-from stage.colour import convert
-from stage.depth_breaks import connected
-from stage.depth_normals import depth_normals
-from stage.maps import SurfaceMaps
-from stage.mask_border import distance
-from stage.scans.scan import Scan
-from stage.scans.squares import coarser
+from service.scans.points.scan import Scan
+from service.scans.points.squares import coarser
+from stage.capture.camera import Camera
+from stage.colour.colour import convert
+from stage.results.depth_breaks import connected
+from stage.results.depth_normals import depth_normals
+from stage.results.maps import SurfaceMaps
+from stage.results.mask_border import distance
 
 CLEAR_PIXELS = 2
 """Pixels around a pixel that must all lie behind a point before the point counts as seen to be empty: edges are blurred that far."""

@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.depth_maps import DEPTH_FILE, DepthMaps
-from stage.depth_normals import depth_normals
+from service.scans.points.planes import LocalPlanes, local_planes, robust_scatter
+from service.scans.points.ply_points import PlyPoints, read_ply_points
+from service.scans.points.rigid import nearest_rigid
+from service.scans.points.scan import Scan, Target
 from stage.errors import ManifestError, ResultError
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.ply import POINTS_FILE, read_ply
-from stage.result_metadata import result_file
-from stage.scans.planes import LocalPlanes, local_planes, robust_scatter
-from stage.scans.ply_points import PlyPoints, read_ply_points
-from stage.scans.records import MOST_M, UNITS_M, ScanEntry, ScanSet
-from stage.scans.rigid import nearest_rigid
-from stage.scans.scan import Scan, Target
+from stage.formats.ply import POINTS_FILE, read_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.depth_normals import depth_normals
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.result_metadata import result_file
+from stage.sets.scan_set import MOST_M, UNITS_M, ScanEntry, ScanSet
 
 NORMAL_RADIUS_PX = 2
 """Radius of the neighbourhood that a normal of a range image is fitted to: 25 pixels."""

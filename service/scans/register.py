@@ -15,7 +15,14 @@ from service.reporting.provenance import REPORT_FILE, report, versions
 from service.requests.register import GivenPoses, RegisterRequest, TableUse
 from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
+from service.scans.points.neighbours import neighbours_are_installed
+from service.scans.points.rigid import about, applied
 from service.scans.read import read_scans
+from service.scans.registration.fixed_poses import check_fixed
+from service.scans.registration.pairs import Evidence, Pair, PairState
+from service.scans.registration.registration import RegistrationOptions, register_by
+from service.scans.registration.target_pairs import target_places
+from service.scans.registration.turntable import turned_pose
 from service.scans.registration_words import (
     fixed_facts,
     fixed_warnings,
@@ -28,14 +35,7 @@ from service.scans.registration_words import (
 )
 from stage.errors import ScanError
 from stage.files import write_text
-from stage.scans.fixed_poses import check_fixed
-from stage.scans.neighbours import neighbours_are_installed
-from stage.scans.pairs import Evidence, Pair, PairState
-from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
-from stage.scans.registration import RegistrationOptions, register_by
-from stage.scans.rigid import about, applied
-from stage.scans.target_pairs import target_places
-from stage.scans.turntable import turned_pose
+from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 
 
 class RegisterResult(NamedTuple):

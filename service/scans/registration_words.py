@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from service.scans.kept_scans import ScanFacts
-from stage.scans.fixed_poses import FixedPoses
-from stage.scans.pairs import Evidence, Pair, PairState
-from stage.scans.pose_graph import REFUSED
-from stage.scans.registration import Registration
-from stage.scans.target_pairs import TargetPlace
+from service.scans.registration.fixed_poses import FixedPoses
+from service.scans.registration.pairs import Evidence, Pair, PairState
+from service.scans.registration.pose_graph import REFUSED
+from service.scans.registration.registration import Registration
+from service.scans.registration.target_pairs import TargetPlace
 
 LOOSE = 2.0
 """What loops leave, in units of what the pairs say, from which it is said."""

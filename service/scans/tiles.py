@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.fusion.bricks import BRICK_VOXELS, MEMORY_BOUND
+from service.asset.usd.fused_asset import SITE_FILE, Tile, remove_other_tiles, write_site, write_tile
 from service.scans.fused_bricks import FusedBricks
 from service.scans.fused_mesh import SEEN_BY, short, triangle_mesh
-from service.scans.surface import VERTEX, BrickSurface, Tally
-from service.usd.fused_asset import SITE_FILE, Tile, remove_other_tiles, write_site, write_tile
-from stage.meshes.holes import area_vectors
-from stage.meshes.mesh import write_mesh_ply
+from service.scans.fused_surface import VERTEX, BrickSurface, Tally
+from service.scans.mesh.holes import area_vectors
+from stage.results.mesh import write_mesh_ply
 
 TILES = "tiles"
 LATTICE = 1 << 19

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from stage.depth_maps import DepthMaps
-from stage.ply import PointCloud
-from stage.temporal.agreement import Track, advance, agree, begin, noise_share
+from service.sequences.agreement import Track, advance, agree, begin, noise_share
+from stage.formats.ply import PointCloud
+from stage.results.depth_maps import DepthMaps
 
 
 @dataclass

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from stage.maps import SurfaceMaps
+from service.sequences.agreement import Track, advance, agree, begin, noise_share
+from stage.results.maps import SurfaceMaps
 from stage.spread import MAD_TO_SIGMA
-from stage.temporal.agreement import Track, advance, agree, begin, noise_share
 
 LEAST_ALBEDO = 0.02
 """Reflectance below which the noise of albedo is that of this reflectance."""

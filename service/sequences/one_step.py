@@ -9,11 +9,11 @@ from service.reporting.progress import Progress
 from service.requests.depth import DepthRequest
 from service.requests.solve import Intensities, LightsKnown, SolveRequest
 from service.sequences.steps import ALONE, StepProgress, capture_digest, check_outputs, do_step, left_by
-from service.solve.intensities import LightsOverTime
-from service.solve.sharing import SharedSolve
+from service.solve.lights.intensities import LightsOverTime
+from service.solve.sharing.sharing import SharedSolve
 from service.solve.solve import help_solve, solve
-from stage.capture import Capture
-from stage.sequence import Sequence, TimeStep, check_alike, read_sequence
+from stage.capture.capture import Capture
+from stage.capture.sequence import Sequence, TimeStep, check_alike, read_sequence
 
 AnyRequest = TypeVar("AnyRequest", SolveRequest, DepthRequest)
 

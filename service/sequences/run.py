@@ -15,13 +15,13 @@ from service.sequences.joined_depth import DepthJoiner, moved_points
 from service.sequences.joined_maps import MapsJoiner
 from service.sequences.one_step import depth_alone, shared_lights, solve_alone
 from service.sequences.steps import ALONE, StepProgress, check_outputs, step_report
-from stage.depth_maps import DEPTH_FILE, DepthMaps
+from stage.capture.light import PointLight
+from stage.capture.sequence import SEQUENCE_FILE, Sequence, TimeStep, check_alike, is_sequence, read_sequence, write_sequence
 from stage.errors import ResultError
 from stage.files import write_text
-from stage.light import PointLight
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.ply import POINTS_FILE, read_ply, write_ply
-from stage.sequence import SEQUENCE_FILE, Sequence, TimeStep, check_alike, is_sequence, read_sequence, write_sequence
+from stage.formats.ply import POINTS_FILE, read_ply, write_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 
 FIGURES = re.compile(r"\d[\d.]*")
 """What differs between sentences of steps that say the same."""

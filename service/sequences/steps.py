@@ -9,14 +9,14 @@ from typing import Any
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import REPORT_FILE, requested, versions, with_names
-from service.requests.base import Request
-from stage.capture import Capture
+from service.requests.base.base import Request
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME
+from stage.capture.sequence import Sequence
 from stage.errors import ResultError
 from stage.files import write_text
-from stage.fingerprint import Fingerprints, digest
-from stage.ingest import CACHE_FOLDER
-from stage.manifest import FILE_NAME
-from stage.sequence import Sequence
+from stage.stack.fingerprint import Fingerprints, digest
+from stage.stack.ingest import CACHE_FOLDER
 
 ALONE = "alone"
 """The folder, in that of a step, of what was found from the step alone."""

@@ -6,23 +6,23 @@ from kernels import device as devices
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
-from service.solve.distance import Distance, find_distance
-from service.solve.intensities import LightsOverTime, choose_intensities
-from service.solve.methods import METHODS, Solver
-from service.solve.sharing import SharedSolve
-from service.solve.solution import SolveInput
-from stage.brackets import merge_brackets, one_frame_a_light
-from stage.capture import Capture
+from service.solve.height.distance import Distance, find_distance
+from service.solve.lights.intensities import LightsOverTime, choose_intensities
+from service.solve.methods.methods import METHODS, Solver
+from service.solve.sharing.sharing import SharedSolve
+from service.solve.sharing.solution import SolveInput
+from stage.capture.capture import Capture
+from stage.capture.lighting import check_surface, distant_lights
+from stage.capture.manifest import FILE_NAME
+from stage.capture.point_lights import DistantLights, PlacedLights, distance_is_missing
 from stage.errors import ManifestError
-from stage.ingest import open_stack
-from stage.lighting import check_surface, distant_lights
-from stage.manifest import FILE_NAME
 from stage.motion.tracking import tracking_frames
-from stage.point_lights import DistantLights, PlacedLights, distance_is_missing
+from stage.stack.brackets import merge_brackets, one_frame_a_light
+from stage.stack.ingest import open_stack
 
 if TYPE_CHECKING:
-    from service.solve.refined_lights import RefinedLights
-    from service.solve.unknown_lights import UnknownLights
+    from service.solve.lights.refined_lights import RefinedLights
+    from service.solve.lights.unknown_lights import UnknownLights
 
 
 class Opened(NamedTuple):
@@ -91,7 +91,7 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
     if isinstance(lights, DistantLights | PlacedLights) and not unknown:  # placeholders say nothing of which frames have one light
         if capture.is_polarised:
-            from service.solve.polarised import separate_pairs
+            from service.solve.methods.polarised import separate_pairs
 
             stack, lights, pairs = separate_pairs(stack, capture, lights, mask)
         else:
@@ -123,11 +123,11 @@ def _default_method(capture: Capture, *, unknown: bool) -> Method:
 def _find_lights(known: LightsKnown, given: SolveInput, lights: Any, capture: Capture) -> "UnknownLights | RefinedLights":
     """Return the lights that the images ask for; their kernels and methods are imported for captures that need them."""
     if known is LightsKnown.UNKNOWN:
-        from service.solve.unknown_lights import find_lights
+        from service.solve.lights.unknown_lights import find_lights
 
         return find_lights(given)
     if not isinstance(lights, DistantLights):
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].light: --lights refined is for distant lights alone")
-    from service.solve.refined_lights import refine_lights
+    from service.solve.lights.refined_lights import refine_lights
 
     return refine_lights(given, lights)

@@ -12,22 +12,22 @@ from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, Method, SolveRequest
-from service.solve import integrability
-from service.solve.diagnosis import diagnose, raise_error
-from service.solve.intensities import LightsOverTime
-from service.solve.methods import METHODS
+from service.solve.height import integrability
+from service.solve.height.height import guessed_part, height_warnings, integrate
+from service.solve.height.parts import Placement, numbered, place_solution
+from service.solve.lights.diagnosis import diagnose, raise_error
+from service.solve.lights.intensities import LightsOverTime
+from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
-from service.solve.parts import Placement, numbered, place_solution
-from service.solve.sharing import SharedSolve
-from service.solve.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
-from service.solve.surface import guessed_part, height_warnings, integrate
-from stage.capture import Capture
-from stage.colour_spaces import linear_space
+from service.solve.sharing.sharing import SharedSolve
+from service.solve.sharing.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
+from stage.capture.capture import Capture
+from stage.capture.point_lights import DistantLights
+from stage.colour.colour_spaces import linear_space
+from stage.colour.radiance import clipping_sentences
 from stage.files import write_text
-from stage.ingest import LAYOUT
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.point_lights import DistantLights
-from stage.radiance import clipping_sentences
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.stack.ingest import LAYOUT
 
 
 class SolveResult(NamedTuple):
@@ -168,7 +168,7 @@ def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None
     assert given.pairs is not None
     solution.warnings += given.pairs.warnings
     if method is not Method.SVBRDF:
-        from service.solve.polarised import doubt_metals
+        from service.solve.methods.polarised import doubt_metals
 
         doubt_metals(given, solution)
 

@@ -12,16 +12,16 @@ import OpenImageIO as oiio
 
 from service.reporting.progress import Timings
 from service.viewing.reduction import block_sums, step_within
-from stage.capture import Capture
-from stage.colour import convert, pixels_of
-from stage.correction import Correction
+from stage.capture.capture import Capture
+from stage.capture.light import DistantLight, PointLight
+from stage.capture.lighting import lights_from_centre
+from stage.capture.manifest import LIT_BY, Frame
+from stage.colour.colour import convert, pixels_of
 from stage.errors import ImageError, StageError, storage
 from stage.files import replacing
-from stage.ingest import BYTES_PER_PIXEL, DECODE_BYTES
-from stage.light import DistantLight, PointLight
-from stage.light_basis import numbers
-from stage.lighting import lights_from_centre
-from stage.manifest import LIT_BY, Frame
+from stage.results.light_basis import numbers
+from stage.stack.correction import Correction
+from stage.stack.ingest import BYTES_PER_PIXEL, DECODE_BYTES
 
 PREVIEW_PIXELS = 144 * 144
 """Most pixels of the reduced image of a frame, from which its thumbnail and the exposure are taken."""

@@ -3,9 +3,9 @@
 import json
 from typing import get_args
 
-from stage import exr
-from stage.colour import rgb_matrix
-from stage.colour_spaces import ColorSpaceName, is_linear, linear_space
+from stage.colour.colour import rgb_matrix
+from stage.colour.colour_spaces import ColorSpaceName, is_linear, linear_space
+from stage.formats import exr
 
 DIGITS = 6
 """Decimals of the numbers: those that float32 surely has."""

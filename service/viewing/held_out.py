@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from kernels.relight.beyond import share_beyond
+from kernels.relight.model.beyond import share_beyond
 from service.viewing.transfer import FULL, Transfer, weights_of
-from stage.colour import convert
-from stage.light_basis import numbers
-from stage.point_lights import DistantLights
-from stage.stack import Stack
+from stage.capture.point_lights import DistantLights
+from stage.colour.colour import convert
+from stage.results.light_basis import numbers
+from stage.stack.stack import Stack
 
 KEY_LIGHTS = 32
 """Number of key lights, spread evenly over the captured lights."""

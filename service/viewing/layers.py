@@ -10,7 +10,7 @@ from service.reporting.progress import Timings
 from service.viewing import pyramid
 from service.viewing.block_file import BlockFile
 from service.viewing.result_layers import CODES, MASK, VECTOR, ResultLayers
-from stage.light_basis import numbers
+from stage.results.light_basis import numbers
 
 BINS = 64
 RANGE_PERCENTILES = (1, 99)

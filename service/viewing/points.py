@@ -7,9 +7,9 @@ import numpy as np
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import step_within
 from service.viewing.result_layers import ResultLayers
-from stage.camera import Camera
-from stage.colour import convert
-from stage.ply import POINTS_FILE, read_ply
+from stage.capture.camera import Camera
+from stage.colour.colour import convert
+from stage.formats.ply import POINTS_FILE, read_ply
 
 MOST_POINTS = 1_000_000
 """Most points of a view; of more, every second, third … pixel is taken in both directions."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.stack import PIXEL_PAD, Stack, padded
+from stage.stack.stack import PIXEL_PAD, Stack, padded
 
 
 class RowBand(NamedTuple):

@@ -1,7 +1,7 @@
 """What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
 
 The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
-captured images together do (kernels.relight.basis has the method and its sources).
+captured images together do (kernels.relight.basis.basis has the method and its sources).
 """
 
 import math
@@ -11,22 +11,22 @@ import numpy as np
 
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.basis import gram, light_factor, tile_bases
-from kernels.relight.beyond import reach, share_beyond
-from kernels.relight.latlong import first_of_equals
-from service.light.quadrature import quadrature_of
-from service.light.triangulation import share_smooth
+from kernels.relight.basis.basis import gram, light_factor, tile_bases
+from kernels.relight.directions.latlong import first_of_equals
+from kernels.relight.model.beyond import reach, share_beyond
+from service.relight.weights.quadrature import quadrature_of
+from service.relight.weights.triangulation import share_smooth
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
 from service.viewing.held_out import HeldOutLights
 from service.viewing.reduction import plane_means, step_within
 from service.viewing.tiling import Tiling, put_together, tile_rows, tiling_of
 from service.viewing.transfer import COLS, FULL, ROWS, grid_directions, transfer_of
-from stage.ingest import TOP_EXPONENT
-from stage.light_basis import numbers
-from stage.matte import Matte
-from stage.point_lights import DistantLights
-from stage.stack import Stack
+from stage.capture.point_lights import DistantLights
+from stage.results.light_basis import numbers
+from stage.results.matte import Matte
+from stage.stack.ingest import TOP_EXPONENT
+from stage.stack.stack import Stack
 
 LEAST_LIGHTS = 4
 """With fewer lights there is nothing to relight with: they do not surround any direction."""
@@ -157,8 +157,8 @@ def write_quadrature(lights: DistantLights, file: BlockFile) -> dict[str, Any]:
     """Write what a page needs to share light out as `relit relight --weights kernel` does, and return what view.json says of it.
 
     Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with
-    them gives the energies of the lights, none below 0 (service.light.quadrature). Light from beyond them is shared by a table
-    over the grid of directions, since its parts add up (service.light.triangulation).
+    them gives the energies of the lights, none below 0 (service.relight.weights.quadrature). Light from beyond them is shared by a table
+    over the grid of directions, since its parts add up (service.relight.weights.triangulation).
 
     Args:
         lights: of the captured images.

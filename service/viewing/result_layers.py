@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.status import Status
-from stage import depth_maps, exr, maps
-from stage.capture import Capture, check_same_pixels
+from stage.capture.capture import Capture, check_same_pixels
 from stage.errors import ResultError
-from stage.result_metadata import camera_and_provenance
+from stage.formats import exr
+from stage.results import depth_maps, maps
+from stage.results.result_metadata import camera_and_provenance
 
 VECTOR, COLOUR, SCALAR, CODES, MASK = "vector", "colour", "scalar", "codes", "mask"
 """Kinds of layers: unit vectors, scene-linear colours, quantities, whole numbers that stand for something, and the mask."""

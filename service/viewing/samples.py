@@ -1,25 +1,25 @@
 """Measured readings of single pixels, and what the maps say that they should be: a plot of each pixel by light.
 
 The model is Relit's BRDF under the lights of the capture, with the shadows that the solved surface casts, and without light that the object
-throws on itself: what `relit shade` and guided frames are made with (service.light.surface_model).
+throws on itself: what `relit shade` and guided frames are made with (service.relight.surface_model).
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.relight.shading import shade
-from kernels.relight.sources import NEVER, Sources
-from service.light.surface_model import ModelBatch, SurfaceModel
+from kernels.relight.model.shading import shade
+from kernels.relight.model.sources import NEVER, Sources
+from service.relight.surface_model import ModelBatch, SurfaceModel
 from service.reporting.progress import Timings
 from service.reporting.provenance import other_inputs
 from service.viewing.block_file import BlockFile
 from service.viewing.reduction import row_bands, step_within
 from service.viewing.result_layers import ResultLayers
-from stage.ingest import TOP_EXPONENT
-from stage.maps import LOBES, SurfaceMaps
-from stage.point_lights import DistantLights, PlacedLights
-from stage.stack import Stack
+from stage.capture.point_lights import DistantLights, PlacedLights
+from stage.results.maps import LOBES, SurfaceMaps
+from stage.stack.ingest import TOP_EXPONENT
+from stage.stack.stack import Stack
 
 MOST_BYTES = 64_000_000
 """Most bytes of all samples; of larger images every second, third … pixel is taken in both directions."""

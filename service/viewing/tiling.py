@@ -8,7 +8,7 @@ import numpy as np
 
 from service.reporting.progress import Timings
 from service.viewing.reduction import block_sums, plane_means, row_bands
-from stage.stack import Stack
+from stage.stack.stack import Stack
 
 LEAST_SIDE = 8
 """Least side of a tile: with smaller ones, the matrices of a hundred lights would take twice the memory of the coefficient images."""

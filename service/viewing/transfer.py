@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.relight.beyond import share_beyond
-from service.light.weighting import Weighting, light_weights, share_samples
-from stage.point_lights import DistantLights
+from kernels.relight.model.beyond import share_beyond
+from service.relight.weights.weighting import Weighting, light_weights, share_samples
+from stage.capture.point_lights import DistantLights
 
 COLS, ROWS = 64, 32
 """Directions around and from +y to −y: 5.6 degrees apart, a third of the distance between the lights of a stage of a hundred."""

@@ -7,9 +7,9 @@ scale is unknown.
 
 from pathlib import Path
 
+from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
 from stage.importers.layout import image_resolution, read_table, write_capture
-from stage.manifest import SCHEMA
 
 
 def import_folder(source: Path, destination: Path) -> Path:

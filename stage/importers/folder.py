@@ -9,11 +9,11 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from stage.calibration.opencv_file import read_matrices
+from stage.capture.manifest import FILE_NAME
 from stage.errors import StageError, storage
+from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import color_space_of
-from stage.manifest import FILE_NAME
-from stage.mat_file import read_mat_arrays
+from stage.importers.opencv_file import read_matrices
 
 T = TypeVar("T")
 

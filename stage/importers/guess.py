@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stage import images
+from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
+from stage.formats import images
 from stage.importers import kinect
+from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, made, spelling, tried
 from stage.importers.laser import OFF_WORDS
 from stage.importers.layout import image_names, image_resolution, natural_order
@@ -23,9 +25,7 @@ from stage.importers.plane_table import read_planes
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.sequences import GrayStack
 from stage.importers.video import is_video
-from stage.importers.view import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
-from stage.manifest import FILE_NAME
-from stage.tof.frames import read_array
+from stage.tof.raw_frames import read_array
 
 PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
               (3840, 2160))

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from stage import inputs
+from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
+from stage.importers.camera_options import View
 from stage.importers.layout import Imported, natural_order, write_capture
-from stage.importers.view import View
-from stage.manifest import SCHEMA
 
 WIDTH, HEIGHT = 512, 424
 BITS, IMAGES, USED = 11, 10, 9

@@ -5,12 +5,22 @@ from typing import Any
 
 import numpy as np
 
-from stage.colour_spaces import ColorSpaceName
+from stage.capture.manifest import SCHEMA
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
+from stage.importers.camera_options import (
+    AMBIENT_WORDS,
+    Axes,
+    Selection,
+    View,
+    camera_from_table,
+    describe,
+    only_image,
+    select,
+    view_of_file,
+)
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_names, image_resolution, write_capture
 from stage.importers.plane_table import PlaneTable, read_planes
-from stage.importers.view import AMBIENT_WORDS, Axes, Selection, View, camera_from_table, describe, only_image, select, view_of_file
-from stage.manifest import SCHEMA
 
 OFF_WORDS = AMBIENT_WORDS | {"background", "off", "nolaser"}
 """Words in the name of the image without the laser."""

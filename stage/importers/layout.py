@@ -13,12 +13,13 @@ import numpy as np
 import OpenImageIO as oiio
 from pydantic import ValidationError
 
-from stage import images, inputs
-from stage.camera_raw import path_is_raw
-from stage.colour_spaces import ColorSpaceName
+from stage import inputs
+from stage.capture.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.files import replacing
-from stage.manifest import FILE_NAME, Manifest, manifest_text, write_manifest
+from stage.formats import images
+from stage.formats.camera_raw import path_is_raw
 from stage.records import describe
 
 PREVIOUS_NAME = "capture.previous.json"

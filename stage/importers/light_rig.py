@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.calibration.opencv_file import lens, read_matrices
-from stage.camera import Distortion
+from stage.capture.camera import Distortion
 from stage.errors import ManifestError
+from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import read_json
-from stage.mat_file import read_mat_arrays
+from stage.importers.opencv_file import lens, read_matrices
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
 AXES = ("dir", "directions", "direction", "orientations", "orientation", "axes", "axis", "ns")

@@ -9,10 +9,10 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ManifestError
+from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import read_json
-from stage.mat_file import read_mat_arrays
 from stage.text import name_fault
-from stage.tof.frames import read_array
+from stage.tof.raw_frames import read_array
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".mat", ".npy", ".json", ".lp", ".dat")
 NAME_KEYS = ("image", "file", "filename", "name", "img")

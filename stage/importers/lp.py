@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
 from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, write_capture
-from stage.manifest import SCHEMA
 from stage.text import name_fault
 
 

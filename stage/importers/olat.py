@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from stage.colour_spaces import ColorSpaceName
+from stage.capture.light import PLACEHOLDER
+from stage.capture.lighting import MEASURED_BY
+from stage.capture.manifest import FILE_NAME, SCHEMA
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
+from stage.importers.camera_options import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, natural_order, write_capture
 from stage.importers.light_rig import LightRig, read_rig
 from stage.importers.light_table import SUFFIXES, LightTable, Run, read_light_table, read_strengths
-from stage.importers.view import Axes, Selected, Selection, View, camera_from_table, describe, select, view_of_file
-from stage.light import PLACEHOLDER
-from stage.lighting import MEASURED_BY
-from stage.manifest import FILE_NAME, SCHEMA
 
 LEAST = 3
 """The fewest images from which a normal can be solved, whoever measures the lights."""

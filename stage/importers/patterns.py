@@ -6,15 +6,15 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from stage.calibration.opencv_file import camera_from_projector, lens, pick, read_matrices
-from stage.camera import Distortion
-from stage.colour_spaces import ColorSpaceName
+from stage.capture.camera import Distortion
+from stage.capture.manifest import SCHEMA
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
+from stage.importers.camera_options import MASK_WORDS, only_image
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
+from stage.importers.opencv_file import camera_from_projector, lens, pick, read_matrices
 from stage.importers.sequences import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
-from stage.importers.view import MASK_WORDS, only_image
-from stage.manifest import SCHEMA
 
 CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc")
 CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc")

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.calibration.opencv_file import read_matrices
 from stage.errors import ManifestError, storage
-from stage.images import SUFFIXES as IMAGE_SUFFIXES
+from stage.formats.images import SUFFIXES as IMAGE_SUFFIXES
+from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import read_json
-from stage.mat_file import read_mat_arrays
-from stage.tof.frames import read_array
+from stage.importers.opencv_file import read_matrices
+from stage.tof.raw_frames import read_array
 
 NAMES = ("laser_planes", "planes", "laser_plane", "laserPlane", "plane", "plane_coefficients", "plane_params", "laser", "coefficients")
 """Names of the planes in calibration files, in order of preference."""

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
+from stage.importers.camera_options import Selection, select
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, read_json, write_capture
-from stage.importers.view import Selection, select
-from stage.manifest import SCHEMA
 from stage.text import name_fault
 
 SUFFIXES = (".relight", ".dome")

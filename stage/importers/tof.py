@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import images
+from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError
+from stage.formats import images
+from stage.importers.camera_options import View
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
 from stage.importers.raw_arrays import ArrayFiles
-from stage.importers.view import View
-from stage.manifest import SCHEMA
 from stage.model import Vector
 from stage.tof.light_time import range_of_delay_m, range_of_phase_m
 

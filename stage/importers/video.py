@@ -10,7 +10,7 @@ import numpy as np
 
 from stage.errors import ManifestError, storage
 from stage.files import replacing
-from stage.images import write_png
+from stage.formats.images import write_png
 
 SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mxf", ".webm", ".wmv"}
 LOSSLESS = {"FFV1", "FFVH", "HFYU", "ULRG", "ULRA"}

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from stage.colour import GREY_WEIGHTS
+from stage.colour.colour import GREY_WEIGHTS
 from stage.motion.resample import bicubic, lookup, positions
 
 DISAGREEMENT_PX = 0.5

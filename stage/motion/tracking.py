@@ -5,10 +5,10 @@ The frames of a manifest are taken to be in order of time, at equal time steps.
 
 from typing import NamedTuple
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.capture.light import FullLight
+from stage.capture.manifest import FILE_NAME, Frame
 from stage.errors import ManifestError
-from stage.light import FullLight
-from stage.manifest import FILE_NAME, Frame
 
 SIDE_MIN_PX, SIDE_MAX_PX = 16, 32766
 """The least side of an image, two patches of the flow search, and the largest side, which OpenCV can address."""

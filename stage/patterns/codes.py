@@ -3,7 +3,7 @@
 A code is one module of this package, which holds: its manifest entry (`...Pattern`: what one frame shows, and its level at each place), its
 frames put together (`...Code`, collected from a capture), and the frames to project (`..._patterns`). `CODES` names them; the unions
 `Pattern` and `Code` repeat its two columns for pydantic and the type checker. How a code is decoded, asked for with `relit patterns` and
-planned stands in service/depth/codes.py.
+planned stands in service/depth/patterns/codes.py.
 """
 
 from collections.abc import Callable, Sequence

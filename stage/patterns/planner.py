@@ -2,7 +2,7 @@
 
 The minimum counts are those of Nayar's lecture 3-5, in which code 0 (no light) is not used: N stripes need ⌈log2(N + 1)⌉ binary images.
 What is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given. The line of each code stands
-in service/depth/codes.py.
+in service/depth/patterns/codes.py.
 
 Depth: a projector column is a plane; a camera beside it at baseline b, both of focal length f projector pixels, sees depth
 Z = f b / d at disparity d, so a standard deviation σ_u of the column gives σ_Z = Z² σ_u / (f b). Deviations of the column:

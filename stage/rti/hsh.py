@@ -7,7 +7,7 @@ Four ASCII lines, each ended by carriage return and line feed (some readers coun
 The lines give file type 3 (hemispherical harmonics), three colour channels, and 4, 9 or 16 terms; each channel has its own
 coefficients (basis type 2), one byte each. `terms` scales and `terms` biases follow, little-endian float32, then the bytes, rows from
 the top of the image to the bottom: at each pixel all terms of red, then green, then blue. A coefficient is byte/255 · scale + bias;
-the sum is a display value with white at 1. The terms are those of kernels/relight/rti.py.
+the sum is a display value with white at 1. The terms are those of kernels/relight/basis/rti.py.
 
 Source: the file format of RTIBuilder and RTIViewer (Cultural Heritage Imaging, ISTI-CNR). The draft specification was not available: the
     layout is that of several independent readers and writers, which agree. The basis: Gautron et al., "A novel hemispherical basis

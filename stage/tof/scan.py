@@ -8,10 +8,10 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from stage.errors import CalibrationError, ImageError, ManifestError, storage
-from stage.frames import Transform
 from stage.model import Count, Positive, Strict, Text
 from stage.records import read_record
-from stage.tof.frames import read_array
+from stage.tof.raw_frames import read_array
+from stage.transforms import Transform
 
 FILE_NAME = "scan.json"
 SCHEMA = "relit.scan/1"

@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stage.camera import Camera
+from stage.capture.camera import Camera
+from stage.capture.manifest import FILE_NAME, SCHEMA, Frame, Manifest, write_manifest
+from stage.capture.ranging import ContinuousWave, Pulsed
 from stage.errors import CalibrationError
 from stage.files import replacing
-from stage.manifest import FILE_NAME, SCHEMA, Frame, Manifest, write_manifest
 from stage.model import Vector
-from stage.ranging import ContinuousWave, Pulsed
 from stage.tof.light_time import SPEED_OF_LIGHT
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stage.camera import Camera
+from stage.capture.camera import Camera
 
 
 @dataclass(frozen=True)

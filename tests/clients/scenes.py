@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import binary_erosion
 
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 
 PATCHES = (((0.7, 0.2, 0.7), (4, 1, 0)), ((-0.3, 0.8, 0.5), (0, 2, 4)), ((0.2, -0.8, 0.3), (1, 4, 1)), ((-1, 0, 0), (3, 0, 3)))
 """Direction and peak radiance."""

@@ -7,8 +7,8 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from benchmarks.clients.by_hand import write_by_hand
 from benchmarks.clients.comparison import compare
 from benchmarks.clients.render import Environment, Sun
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 from tests.clients.scenes import directions, uneven
 
 pytestmark = pytest.mark.long

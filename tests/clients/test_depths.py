@@ -6,9 +6,9 @@ import pytest
 from benchmarks.clients.render import Client, Environment
 from service.export.export import export
 from service.requests.export import ExportRequest
-from stage.camera import Camera
-from stage.depth_maps import DEPTH_FILE, DepthMaps
-from stage.ply import POINTS_FILE, PointCloud, write_ply
+from stage.capture.camera import Camera
+from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from tests.clients.programs import require
 
 pytestmark = pytest.mark.long

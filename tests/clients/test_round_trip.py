@@ -13,9 +13,9 @@ from benchmarks.clients.comparison import Comparison, compare
 from benchmarks.clients.render import Client, Environment, Programs
 from service.export.export import export
 from service.requests.export import ExportRequest, TextureFormat
-from stage.camera import Camera
-from stage.colour import convert
-from stage.maps import MAPS_FILE
+from stage.capture.camera import Camera
+from stage.colour.colour import convert
+from stage.results.maps import MAPS_FILE
 from tests.clients.programs import require
 from tests.clients.scenes import DIELECTRIC_F0, GOLD, PAINT, ball_arrays, ball_maps, seen_in_perspective, uneven, without_scale
 

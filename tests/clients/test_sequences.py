@@ -9,9 +9,9 @@ from pxr import Usd, UsdGeom
 
 from benchmarks.clients import installed
 from benchmarks.clients.render import Client
-from service.usd.layers import Description
-from service.usd.sequence_asset import Faces, Moment, write_sequence_asset
-from stage.camera import Camera
+from service.asset.usd.layers import Description
+from service.asset.usd.sequence_asset import Faces, Moment, write_sequence_asset
+from stage.capture.camera import Camera
 from tests.clients.programs import require
 
 pytestmark = pytest.mark.long

@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks.clients import installed
 from benchmarks.clients.render import TIME_LIMIT_S, Client
-from service.usd.asset import write_asset
-from service.usd.surroundings import Surroundings
+from service.asset.usd.asset import write_asset
+from service.asset.usd.surroundings import Surroundings
 from tests.clients.programs import require
 from tests.scenes.surfaces import make_wave
 from tests.scenes.surroundings import capture_of

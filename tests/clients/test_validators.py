@@ -9,16 +9,16 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils
 
 from service.export.export import export
 from service.requests.export import ExportRequest, Geometry, TextureFormat
-from stage import exr
-from stage.camera import Camera
-from stage.colour import convert
-from stage.depth_maps import DEPTH_FILE, DepthMaps
-from stage.maps import MAPS_FILE, SurfaceMaps
-from stage.ply import POINTS_FILE, PointCloud, write_ply
+from stage.capture.camera import Camera
+from stage.colour.colour import convert
+from stage.formats import exr
+from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
+from stage.results.depth_maps import DEPTH_FILE, DepthMaps
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 from tests.clients.scenes import GOLD, PAINT, ball_maps, seen_in_perspective, without_scale
 from tests.clients.validators import findings
 from tests.scenes.surroundings import capture_of, write_frames
-from tests.service.gltf import khronos
+from tests.service.asset.gltf import khronos
 
 SIDE = 40
 pytestmark = pytest.mark.long

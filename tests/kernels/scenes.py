@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import packs
-from kernels.photometric.albedo import fit_albedo
-from kernels.photometric.misfit import Misfit, Uncertainty, uncertainty_of
-from kernels.photometric.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.lambertian.albedo import fit_albedo
+from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.model.misfit import Misfit, Uncertainty, uncertainty_of
 
 GREY = (0.2126, 0.7152, 0.0722)
 HALF_ROUNDING = 2.0**-11

@@ -18,8 +18,8 @@ import warp as wp
 import kernels
 from kernels import device as devices
 from kernels.device import PACK_CUDA
-from kernels.photometric.lobes import Lobes, Reflectance
-from kernels.photometric.samples import LANES_CUDA
+from kernels.photometric.model.lobes import Lobes, Reflectance
+from kernels.photometric.model.samples import LANES_CUDA
 
 pytestmark = pytest.mark.long
 

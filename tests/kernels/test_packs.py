@@ -9,7 +9,7 @@ import warp as wp
 from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.relight.combine import combine
+from kernels.relight.frames.combine import combine
 
 
 def fetch(band):

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.ply import PointCloud, write_ply
-from stage.scans.rigid import exponential, inverse
+from service.scans.points.rigid import exponential, inverse
+from stage.formats.ply import PointCloud, write_ply
 from tests.scenes.statue import SIGMA, colour_of, distance, place, trace
 
 MM = 1e3

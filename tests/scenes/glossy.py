@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.maps import MAPS_FILE, SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import MAPS_FILE, SurfaceMaps
 from tests.reference import microfacet
 from tests.scenes.captures import write_exr, write_image
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
-from stage.scans.rigid import exponential
+from service.scans.points.rigid import exponential
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 from tests.scenes.statue import Shot, place, shoot
 
 WAVE, DEEP = 90.0, 6e-4

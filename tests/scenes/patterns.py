@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kernels.structured.frames import NoiseModel, upload
+from kernels.structured.pattern_frames import NoiseModel, upload
 from stage.patterns.modulated import ModulatedPattern
 
 NOISE = NoiseModel(0.004, 1.0e-4)

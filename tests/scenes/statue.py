@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
-from stage.maps import SurfaceMaps
-from stage.ply import PointCloud, write_ply
+from stage.capture.camera import Camera
+from stage.formats.ply import PointCloud, write_ply
+from stage.results.depth_maps import DepthMaps
+from stage.results.maps import SurfaceMaps
 from tests.reference.projector import look_at
 
 SIGMA = 2.5e-4

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 
 RADIUS_M = 0.08
 

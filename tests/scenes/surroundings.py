@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.formats import exr
 from tests.scenes.captures import write_image, write_manifest
 
 COVERAGE = np.array([0.0, 0.25, 1.0])

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.camera import Camera
-from stage.frames import rotation_about_y
+from stage.capture.camera import Camera
+from stage.transforms import rotation_about_y
 
 MM = 1e-3
 DISTANCE_M = 2.0

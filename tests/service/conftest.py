@@ -8,7 +8,7 @@ import pytest
 
 from service.cli.main import main
 from service.cli.progress import ProgressBar
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes.surfaces import make_ball
 from tests.service.postgres import binaries, postgres
 from tests.service.recording import Recording

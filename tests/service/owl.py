@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 import service
-from stage import exr, images
-from stage.maps import SurfaceMaps
+from stage.formats import exr, images
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, write_exr, write_image, write_manifest
 
 OWL = Path(service.__file__).parents[1] / "samples" / "owl"

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from stage.camera import Camera
-from stage.capture import Capture
-from stage.correction import Correction
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError
-from stage.ingest import open_stack
 from stage.pixels import Crop, PixelChoices
-from stage.tof.frames import read_correlations, read_histograms
+from stage.stack.correction import Correction
+from stage.stack.ingest import open_stack
+from stage.tof.raw_frames import read_correlations, read_histograms
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 
 SCENE = make_scene(size=16, lights=4)

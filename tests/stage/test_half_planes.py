@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from stage.correction import CodedRadiance, Radiance
-from stage.ingest import half_planes
+from stage.stack.correction import CodedRadiance, Radiance
+from stage.stack.ingest import half_planes
 
 
 def stored(radiance):

@@ -10,10 +10,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from stage import exr, jxl
+from stage.capture.manifest import read_manifest
 from stage.errors import ImageError, ManifestError, StageError
-from stage.manifest import read_manifest
-from stage.tof.frames import read_array
+from stage.formats import exr, jxl
+from stage.tof.raw_frames import read_array
 from tests.service.server.api.captures import lying_exr, lying_jxl, lying_npy, manifest
 
 MIB = 1 << 20

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stage import exr, images, inputs
-from stage.capture import Capture
+from stage import inputs
+from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError, StageError, StorageError
-from stage.ingest import open_stack
-from stage.tof.frames import read_array
+from stage.formats import exr, images
+from stage.stack.ingest import open_stack
+from stage.tof.raw_frames import read_array
 from tests.scenes.captures import make_scene, write_capture, write_image
 from tests.service.server.api.captures import lying_exr, lying_png
 

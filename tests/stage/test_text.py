@@ -10,12 +10,12 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 import service.requests
 import stage
-from service.requests.base import Options, Role
+from service.requests.base.base import Options, Role
 from service.requests.jobs import UserJob
-from stage.calibration.opencv_file import read_matrices
+from stage.capture.manifest import read_manifest
 from stage.errors import ManifestError
 from stage.importers import lp
-from stage.manifest import read_manifest
+from stage.importers.opencv_file import read_matrices
 from stage.model import Line, Strict
 from stage.text import name_fault
 from tests.service.server.api.captures import manifest

@@ -13,10 +13,10 @@ from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
 from service.server.api.tokens import TokenReader
 from service.server.api.watch import MAX_STREAMS, Watcher
+from service.server.base.settings import Settings
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
 from service.server.pages import routes as pages
-from service.server.settings import Settings
 from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts
 

@@ -12,17 +12,17 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fastapi.security.utils import get_authorization_scheme_param
 from starlette.concurrency import run_in_threadpool
 
-from service.requests.identifiers import KEY
+from service.requests.base.identifiers import KEY
 from service.requests.keys import Scope
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.problems import ApiError
 from service.server.api.tokens import PROJECT_HEADER, TokenReader
 from service.server.api.watch import Watcher
+from service.server.base.settings import Settings, is_loopback
 from service.server.database import keys
 from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT, Caller
 from service.server.jobs.queue import JobQueue
-from service.server.settings import Settings, is_loopback
 from service.server.storage.objects import Storage
 from service.server.storage.upload_parts import UploadParts
 

@@ -9,13 +9,13 @@ from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from starlette.types import Receive, Scope, Send
 
+from service.requests.views.jobs import JobView
+from service.requests.views.states import ENDED
 from service.server.api.context import Reader, Service, ServiceDep
 from service.server.api.jobs import get_job
 from service.server.api.problems import responses
 from service.server.api.watch import Change, Listener
 from service.server.database.keys import Caller
-from service.views.jobs import JobView
-from service.views.states import ENDED
 
 router = APIRouter(tags=["events"], responses=responses(401, 403, 429, 503))
 

@@ -8,21 +8,21 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Body, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
+from service.requests.views import states
+from service.requests.views.intakes import IntakePage, IntakeView
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_view
+from service.server.base.safe_names import shown
 from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
-from service.server.safe_names import shown
 from service.server.storage import layout
-from service.views import states
-from service.views.intakes import IntakePage, IntakeView
 from stage.files import resolved
 from stage.model import Line
 

@@ -10,9 +10,11 @@ from fastapi.openapi.models import Example
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
 from pydantic_core import CoreSchema, core_schema
 
-from service.requests.base import JobRequest
-from service.requests.identifiers import JobId
+from service.requests.base.base import JobRequest
+from service.requests.base.identifiers import JobId
 from service.requests.jobs import CheckJob, UserJob
+from service.requests.views import states
+from service.requests.views.jobs import JobLog, JobPage, JobView
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
@@ -21,8 +23,6 @@ from service.server.api.views import job_view, log_view
 from service.server.database import audit, idempotency, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
-from service.views import states
-from service.views.jobs import JobLog, JobPage, JobView
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 

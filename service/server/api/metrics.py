@@ -15,10 +15,10 @@ from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from service import __version__
+from service.requests.views.states import ACTIVE, ENDED
+from service.server.base.settings import Settings
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database
-from service.server.settings import Settings
-from service.views.states import ACTIVE, ENDED
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})

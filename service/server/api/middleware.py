@@ -10,7 +10,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.server.api.metrics import Metrics
 from service.server.api.problems import answer
-from service.server.log import logger
+from service.server.base.log import logger
 
 REQUEST_ID = b"x-request-id"
 QUIET = ("/healthz", "/readyz", "/metrics")

@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict
 from starlette.exceptions import HTTPException
 
 from service.errors import RequestError, sentence
+from service.server.base.log import logger
 from service.server.database.engine import UNANSWERED, message_of
 from service.server.database.quotas import BYTES, QuotaExceeded
-from service.server.log import logger
 from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"

@@ -19,16 +19,16 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.requests.identifiers import EnvironmentId
+from service.requests.base.identifiers import EnvironmentId
+from service.requests.views.jobs import ResultPage
+from service.requests.views.states import READY
 from service.server.api.context import Reader, ServiceDep
 from service.server.api.intakes import row_of
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
 from service.server.api.views import result_view
-from service.server.safe_names import NameFault, check_path
+from service.server.base.safe_names import NameFault, check_path
 from service.server.storage import layout
-from service.views.jobs import ResultPage
-from service.views.states import READY
 from stage import inputs
 from stage.errors import StageError
 

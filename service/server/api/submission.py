@@ -4,10 +4,9 @@ from collections.abc import Sequence
 
 import sqlalchemy as sa
 
-from service.requests.base import JobRequest, SequenceOptions
+from service.requests.base.base import JobRequest, SequenceOptions
 from service.requests.calibration_jobs import TofCalibrationJob
 from service.requests.export import AssetFormat
-from service.requests.frame_range import frame_numbers
 from service.requests.jobs import (
     CheckJob,
     DepthJob,
@@ -23,14 +22,15 @@ from service.requests.jobs import (
     SolveJob,
     ViewJob,
 )
+from service.requests.light.frame_range import frame_numbers
 from service.requests.relight import RelightOptions
-from service.server import telemetry
+from service.requests.views import states
 from service.server.api.context import Service
 from service.server.api.problems import ApiError
+from service.server.base import telemetry
 from service.server.database import audit, intakes, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.jobs.context import SEQUENCE
-from service.views import states
 
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")

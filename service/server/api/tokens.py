@@ -17,9 +17,9 @@ import httpx2
 from service.errors import RequestError
 from service.requests.keys import Scope
 from service.server.api.problems import RETRY_S, ApiError
+from service.server.base.log import logger
+from service.server.base.settings import Settings
 from service.server.database.keys import ORDER, Caller
-from service.server.log import logger
-from service.server.settings import Settings
 
 ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512", "Ed25519", "EdDSA")
 """Signatures with a private key; never `none`, and none with a secret that the service would have to share."""

@@ -9,11 +9,11 @@ from service.server.api.context import FOR_UPLOAD, Service, require_space, requi
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
 from service.server.api.upload_body import PartFileWriter
+from service.server.base.log import logger
+from service.server.base.safe_names import shown
 from service.server.database import intakes, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
-from service.server.log import logger
-from service.server.safe_names import shown
 from service.server.storage import layout
 from service.server.storage.part_files import PartFile, PartFileLocked
 

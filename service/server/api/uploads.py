@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import sqlalchemy as sa
 from fastapi import APIRouter, Header, Query, Request, Response
 
-from service.requests.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
+from service.requests.base.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
+from service.requests.views.intakes import FilePage, FileView
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
@@ -28,13 +29,12 @@ from service.server.api.tus import (
 )
 from service.server.api.upload_body import BodyBroken, TooLong, write_body
 from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
+from service.server.base.safe_names import check_path, shown
 from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.database.uploads import Row
-from service.server.safe_names import check_path, shown
 from service.server.storage import layout
 from service.server.storage.part_files import PartFileLocked
-from service.views.intakes import FilePage, FileView
 
 router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))

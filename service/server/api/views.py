@@ -1,4 +1,4 @@
-"""Views made from rows of the database and files of the storage; service.views declares their fields."""
+"""Views made from rows of the database and files of the storage; service.requests.views declares their fields."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -6,9 +6,9 @@ from urllib.parse import quote
 
 import sqlalchemy as sa
 
+from service.requests.views.intakes import IntakeView
+from service.requests.views.jobs import JobLog, JobView, LogEntry, ProgressView, ResultView
 from service.server.storage.folder import StoredFile
-from service.views.intakes import IntakeView
-from service.views.jobs import JobLog, JobView, LogEntry, ProgressView, ResultView
 
 
 def job_view(row: sa.RowMapping) -> JobView:

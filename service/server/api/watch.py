@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
-from service.requests.identifiers import JOB, KEY
+from service.requests.base.identifiers import JOB, KEY
+from service.requests.views.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.api.views import job_view
+from service.server.base.log import logger
 from service.server.database import jobs, keys
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.keys import Caller
-from service.server.log import logger
-from service.views.states import ENDED
 
 TICK_S = 0.25
 """Seconds between two queries; of several changes between them, the last is sent."""

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import sqlalchemy as sa
 
+from service.server.base.log import logger
 from service.server.database.engine import Database
 from service.server.database.tables import clock
-from service.server.log import logger
 
 WAIT_S = 86_400.0
 """Seconds after a jump for which nothing is removed for its age: an operator reads the log and sets the clock meanwhile."""

@@ -10,7 +10,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, Operationa
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.errors import RequestError
-from service.server.settings import Settings
+from service.server.base.settings import Settings
 
 T = TypeVar("T")
 BUSY_MS = 30_000

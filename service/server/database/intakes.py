@@ -9,10 +9,10 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.requests.views.states import CHECKING, READY, RECEIVING, REFUSED
 from service.server.database.engine import Database, storable
 from service.server.database.jobs import PATIENCE_S
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first, uploads
-from service.views.states import CHECKING, READY, RECEIVING, REFUSED
 
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, kind: str, name: str, folder: str | None) -> None:

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from service import __version__
-from service.requests.base import JobRequest
-from service.requests.identifiers import JOB, new_id
+from service.requests.base.base import JobRequest
+from service.requests.base.identifiers import JOB, new_id
+from service.requests.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 from service.server.database.engine import Database, lock_project, storable
 from service.server.database.tables import intakes, job_inputs, job_log, jobs, newest_first
-from service.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 
 FRAMES = "frames"
 """The stage that counts frames."""

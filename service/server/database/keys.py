@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
-from service.requests.identifiers import KEY, new_id
+from service.requests.base.identifiers import KEY, new_id
 from service.requests.keys import NewKey, Scope
 from service.server.database.engine import Database
 from service.server.database.tables import keys

@@ -10,10 +10,10 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.errors import RequestError
+from service.requests.views.states import ACTIVE, READY
+from service.server.base.settings import Settings
 from service.server.database.engine import lock_project
 from service.server.database.tables import intakes, jobs, uploads
-from service.server.settings import Settings
-from service.views.states import ACTIVE, READY
 
 BYTES, CAPTURES, JOBS, PIXELS = "max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels"
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.server.base.safe_names import folded, folders_of, shown
 from service.server.database.engine import Database
 from service.server.database.tables import uploads
-from service.server.safe_names import folded, folders_of, shown
 
 Row = Mapping[str, Any]
 """A row of the uploads table."""

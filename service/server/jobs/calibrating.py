@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from service.requests.base import JobRequest
+from service.requests.base.base import JobRequest
 from service.requests.calibration_jobs import (
     BallJob,
     CalibrationJob,
@@ -23,7 +23,7 @@ from service.requests.calibration_jobs import (
     WhiteBalanceJob,
 )
 from service.server.jobs.places import StepFiles, file_within, files_within
-from stage.manifest import FILE_NAME
+from stage.capture.manifest import FILE_NAME
 
 TOF_FILE = "tof.json"
 """Name of the calibration of a time-of-flight camera."""
@@ -100,7 +100,7 @@ def _laser_planes(request: LaserPlanesJob, files: StepFiles) -> None:
 
 def _tof(request: TofCalibrationJob, files: StepFiles) -> None:
     from service.calibrate.tof import calibrate_tof
-    from service.light.time_steps import time_steps
+    from service.relight.time_steps import time_steps
     from service.requests.calibrate import TofCalibrationRequest
 
     folder = files.intake(request.capture)

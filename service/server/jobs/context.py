@@ -10,11 +10,11 @@ import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.requests.base import JobRequest
+from service.requests.base.base import JobRequest
 from service.requests.jobs import ANY_JOB
+from service.server.base.settings import Settings
 from service.server.database.engine import Database
 from service.server.jobs.queue import JobQueue
-from service.server.settings import Settings
 from service.server.storage.objects import Storage
 
 

@@ -4,13 +4,13 @@ import time
 from collections.abc import Callable
 
 from service.reporting.progress import Progress
+from service.server.base.log import logger
 from service.server.database import jobs
 from service.server.database.engine import UNANSWERED
 from service.server.jobs.context import Job, JobStep, WorkerContext
 from service.server.jobs.pieces import JobPieces, is_running
 from service.server.jobs.progress import EVERY_S, UNANSWERED_S, Stopped
 from service.server.jobs.steps import steps_of
-from service.server.log import logger
 from service.server.storage import layout
 
 

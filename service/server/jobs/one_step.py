@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from service.reporting.provenance import name_place
-from service.requests.base import JobRequest
+from service.requests.base.base import JobRequest
 from service.requests.basis import BasisKind
 from service.requests.jobs import (
     BasisJob,
@@ -23,8 +23,8 @@ from service.requests.jobs import (
 from service.server.jobs.calibrating import CALIBRATIONS
 from service.server.jobs.places import StepFiles
 from service.server.storage import layout
+from stage.capture.sequence import read_sequence
 from stage.files import write_text
-from stage.sequence import read_sequence
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""
@@ -51,7 +51,7 @@ def _join(request: JoinJob, files: StepFiles) -> None:
 
 
 def _shade(request: ShadeJob, files: StepFiles) -> None:
-    from service.light.shade import shade
+    from service.relight.shade import shade
     from service.requests.shade import ShadeRequest
 
     capture = request.capture
@@ -63,7 +63,7 @@ def _shade(request: ShadeJob, files: StepFiles) -> None:
 
 def _view(request: ViewJob, files: StepFiles) -> None:
     from service.requests.view import ViewRequest
-    from service.viewing.view import view
+    from service.viewing.view_files import view
 
     capture, cache = files.intake(request.capture, request.step), files.cache(request.capture)
     maps = None if request.maps is None else files.maps(request.maps)
@@ -99,7 +99,7 @@ def _scan(request: ScanJob, files: StepFiles) -> None:
 
 
 def _patterns(request: PatternsJob, files: StepFiles) -> None:
-    from service.depth.projection import make_patterns
+    from service.depth.patterns.projection import make_patterns
     from service.requests.patterns import PatternsRequest
 
     options = request.options.model_dump(exclude_defaults=True)  # options of other codes are refused if they are given

@@ -7,13 +7,13 @@ from typing import NamedTuple
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
-from service.requests.identifiers import CAPTURE
+from service.requests.base.identifiers import CAPTURE
 from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
 from service.server.storage import layout
 from stage import inputs
+from stage.capture.sequence import SEQUENCE_FILE, read_sequence
 from stage.files import resolved
-from stage.sequence import SEQUENCE_FILE, read_sequence
 
 
 class StepFiles(NamedTuple):

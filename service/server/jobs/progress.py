@@ -4,10 +4,10 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
+from service.server.base.log import logger
 from service.server.database import jobs
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import FRAMES, Claim
-from service.server.log import logger
 
 BEGIN = "begin"
 """The stage of a step before its product begins one."""

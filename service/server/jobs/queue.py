@@ -10,14 +10,14 @@ import time
 import sqlalchemy as sa
 from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer
 
-from service.requests.base import JobRequest
+from service.requests.base.base import JobRequest
 from service.requests.jobs import CheckJob
+from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
 from service.server.jobs.queue_order import set_order
-from service.server.settings import Settings
 
 WORK, CHECKS = "work", "checks"
 """The queues: jobs that need a device, and quick checks of captures and environments."""

@@ -18,7 +18,9 @@ from service import __version__
 from service.errors import USER_ERRORS, DivergedError, sentence
 from service.reporting.provenance import places_named
 from service.requests.jobs import CheckJob
-from service.server import telemetry
+from service.requests.views.states import ENDED, FAILED, SUCCEEDED
+from service.server.base import telemetry
+from service.server.base.log import logger
 from service.server.database import intakes, jobs
 from service.server.database.engine import FIRST_PAUSE_S, LONGEST_PAUSE_S, UNANSWERED, message_of
 from service.server.database.jobs import Claim
@@ -29,9 +31,7 @@ from service.server.jobs.places import without_places
 from service.server.jobs.progress import JobProgress, Stopped
 from service.server.jobs.queue import HELP, WORKFLOW, job_and_attempt, workflow_id
 from service.server.jobs.steps import steps_of
-from service.server.log import logger
 from service.server.storage import layout
-from service.views.states import ENDED, FAILED, SUCCEEDED
 from stage.errors import StorageError
 
 T = TypeVar("T")

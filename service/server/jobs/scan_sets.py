@@ -14,7 +14,7 @@ from service.requests.jobs import FuseJob, RegisterJob
 from service.server.jobs.context import Job, JobStep, WorkerContext
 from service.server.jobs.pieces import JobPieces
 from service.server.jobs.places import StepFiles
-from stage.scans.records import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
+from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
 
 if TYPE_CHECKING:
     from service.scans.pieces import SharedPieces

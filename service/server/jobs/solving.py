@@ -39,7 +39,7 @@ def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> lis
 
 def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
     from service.sequences.one_step import solve_number
-    from service.solve.sharing import SharedSolve
+    from service.solve.sharing.sharing import SharedSolve
     from service.solve.solve import solve
 
     pieces = JobPieces(files.context, files.job)
@@ -55,7 +55,7 @@ def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
 
 def _help_solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
     from service.sequences.one_step import help_solve_number
-    from service.solve.sharing import SharedSolve
+    from service.solve.sharing.sharing import SharedSolve
     from service.solve.solve import help_solve
 
     sharing = SharedSolve(JobPieces(files.context, files.job), leads=False)
@@ -96,7 +96,7 @@ def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tupl
     """Put onto this machine what the time steps that are done have left for others, and some of their files."""
     from service.sequences.one_step import result_folder
     from service.sequences.steps import DONE_FILE
-    from stage.sequence import read_sequence
+    from stage.capture.sequence import read_sequence
 
     folders = [result_folder(request, step).relative_to(request.out) for step in read_sequence(request.capture).steps]
     files.context.storage.local(layout.results(files.job.project, files.job.id),

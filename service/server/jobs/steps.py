@@ -6,8 +6,7 @@ from pathlib import Path
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.requests.frame_range import frame_numbers, numbered
-from service.requests.identifiers import CAPTURE
+from service.requests.base.identifiers import CAPTURE
 from service.requests.jobs import (
     CheckJob,
     DepthJob,
@@ -18,6 +17,7 @@ from service.requests.jobs import (
     RelightJob,
     SolveJob,
 )
+from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
 from service.server.jobs import scan_sets, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
@@ -32,7 +32,7 @@ KEYS_FILE = "keys.json"
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     """Return the steps of a job, which are always the same for the same job."""
     from service.captures.decoders import Decoders
-    from stage import images
+    from stage.formats import images
 
     held = ExitStack()
 
@@ -103,7 +103,7 @@ def _check(request: CheckJob, files: StepFiles) -> None:
 
 
 def _relight(request: RelightJob, chunk: list[int], files: StepFiles) -> None:
-    from service.light.relight import relight
+    from service.relight.relight import relight
     from service.requests.relight import RelightRequest
     from stage.files import write_text
 

@@ -12,8 +12,8 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
 
-from service.server.log import logger
-from service.server.settings import Settings
+from service.server.base.log import logger
+from service.server.base.settings import Settings
 
 LOOK_S = 0.5
 PAUSES_S = (0.0, 1.0, 5.0, 15.0, 60.0)

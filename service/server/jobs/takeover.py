@@ -9,13 +9,13 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
+from service.requests.views.states import QUEUED
+from service.server.base.log import logger
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.jobs import Claim
 from service.server.jobs.queue import JobQueue, is_help, job_and_attempt
 from service.server.jobs.worker_lock import LockState, WorkerLock
-from service.server.log import logger
-from service.views.states import QUEUED
 
 GRACE_ROUNDS = 2
 """Rounds without a takeover after this worker had to take its lock again: a restart of the database released the locks of all other workers

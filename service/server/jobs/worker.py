@@ -10,7 +10,9 @@ from multiprocessing import parent_process
 from dbos import DBOS, DBOSConfig
 from dbos import error as dbos_error
 
-from service.server import log, telemetry
+from service.server.base import log, telemetry
+from service.server.base.log import logger
+from service.server.base.settings import Settings
 from service.server.database import workers
 from service.server.database.engine import LONGEST_PAUSE_S, UNANSWERED, Database, connect, message_of
 from service.server.jobs.context import WorkerContext
@@ -19,8 +21,6 @@ from service.server.jobs.runner import JobRunner
 from service.server.jobs.supervisor import Heartbeat
 from service.server.jobs.takeover import Takeover
 from service.server.jobs.worker_lock import LockState, open_worker_lock
-from service.server.log import logger
-from service.server.settings import Settings
 from service.server.storage.objects import open_storage
 
 POLL_S = 0.5

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
-from service.server import file_lock
+from service.server.base import file_lock
 from service.server.database.engine import Database
 
 SPACE = 7

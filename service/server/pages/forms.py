@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 
-from service.requests.base import Choice, Commas, JobRequest, Role
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.base.base import Choice, Commas, JobRequest, Role
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.base.options import Option, help_text, is_document, places_of, typed
 from service.requests.jobs import JOBS
-from service.requests.options import Option, help_text, is_document, places_of, typed
 
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",

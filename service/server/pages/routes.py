@@ -15,7 +15,7 @@ from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from service import __version__
-from service.requests.identifiers import CaptureId, JobId
+from service.requests.base.identifiers import CaptureId, JobId
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of
 
 HOME = Path(str(files("service.server.pages")))

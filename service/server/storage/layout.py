@@ -9,7 +9,7 @@ uploads/ID/…                          in an object store: pieces of incomplete
 
 from collections.abc import Container
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 
 MAPS = "maps.exr"
 SOLVED = (MAPS, "depth.exr", "points.ply", "report.json", "sequence.json", "scan-set.json", "board.exr")

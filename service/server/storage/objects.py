@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from service.reporting.progress import Progress
-from service.server.settings import Settings
+from service.server.base.settings import Settings
 from service.server.storage.bucket import Bucket, Object
 from service.server.storage.folder import REMOVED, FolderStorage, OpenFile, StoredFile, is_shown, stored_below, sweep
 from service.server.storage.scratch import Entry, Scratch

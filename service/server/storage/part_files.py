@@ -7,8 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from service.server import file_lock
-from service.server.settings import Settings
+from service.server.base import file_lock
+from service.server.base.settings import Settings
 from stage.errors import storage
 
 SUFFIX = ".part"

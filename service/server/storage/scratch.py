@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.server import file_lock
+from service.server.base import file_lock
 from service.server.storage.folder import drop_folder, drop_hidden
 from stage.errors import storage
 from stage.files import write_text

@@ -14,11 +14,11 @@ import time
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from service.server.base.log import logger
+from service.server.base.settings import Settings
 from service.server.database import uploads
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.uploads import Row
-from service.server.log import logger
-from service.server.settings import Settings
 from service.server.storage import layout
 from service.server.storage.objects import Storage
 from service.server.storage.part_files import READ, PartFile, PartFileLocked, leftovers, part_files_folder, stored_bytes

@@ -7,9 +7,9 @@ from kernels.fusion.bricks import BLOCK, BRICK, find_blocks
 from kernels.fusion.extract import extract
 from kernels.fusion.integrate import integrate
 from kernels.fusion.views import RangeImage, upload_views
-from stage.camera import Camera
-from stage.depth_breaks import connected
-from stage.depth_normals import depth_normals
+from stage.capture.camera import Camera
+from stage.results.depth_breaks import connected
+from stage.results.depth_normals import depth_normals
 from tests.scenes.statue import Shot
 
 

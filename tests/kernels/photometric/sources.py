@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from kernels import packs
-from kernels.photometric.readings import grey_factors, pad_lights
-from kernels.photometric.response_table import response_table
-from kernels.photometric.samples import Samples, gather
+from kernels.photometric.lambertian.readings import grey_factors, pad_lights
+from kernels.photometric.model.response_table import response_table
+from kernels.photometric.model.samples import Samples, gather
 from tests.kernels.scenes import GREY, store
 from tests.reference import sampling as twin
 

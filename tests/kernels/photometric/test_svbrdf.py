@@ -7,14 +7,14 @@ import warp as wp
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.microfacet import diffuse, ggx, schlick
-from kernels.photometric.candidates import rings
-from kernels.photometric.diffuse_shape import choose_diffuse
-from kernels.photometric.hypotheses import Diffuse, RingOptions, search_normals
-from kernels.photometric.material import fit_material
-from kernels.photometric.normal_search import find_normals
-from kernels.photometric.readings import grey_factors, pad_lights
-from kernels.photometric.samples import gather, to_host
-from kernels.photometric.survey import CLOSE
+from kernels.photometric.lambertian.readings import grey_factors, pad_lights
+from kernels.photometric.material.material import fit_material
+from kernels.photometric.model.candidates import rings
+from kernels.photometric.model.samples import gather, to_host
+from kernels.photometric.search.diffuse_shape import choose_diffuse
+from kernels.photometric.search.hypotheses import Diffuse, RingOptions, search_normals
+from kernels.photometric.search.normal_search import find_normals
+from kernels.photometric.search.survey import CLOSE
 from kernels.photometric.svbrdf import average_normals, nearby_shapes, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, cap, store
 from tests.reference import hypotheses

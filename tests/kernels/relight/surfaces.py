@@ -5,7 +5,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.packs import pack_type
-from kernels.relight import shading
+from kernels.relight.model import shading
 from tests.kernels.scenes import store
 from tests.reference.shading import Pixels
 

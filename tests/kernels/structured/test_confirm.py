@@ -8,7 +8,7 @@ from kernels.status import Status
 from kernels.structured.binary import decode_gray
 from kernels.structured.confirm import AROUND, LARGEST_RMS, LEAST_SIDE, SLACK, SLACK_RMS, confirm_stripes
 from kernels.structured.decoded import Decoded
-from kernels.structured.frames import NoiseModel
+from kernels.structured.pattern_frames import NoiseModel
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 from tests.scenes.patterns import frames_of, result, view

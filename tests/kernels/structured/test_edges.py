@@ -7,7 +7,7 @@ from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_gray
 from kernels.structured.edges import refine_edges
-from kernels.structured.frames import NoiseModel, upload
+from kernels.structured.pattern_frames import NoiseModel, upload
 from stage.patterns.binary import binary_patterns
 from stage.patterns.codes import collect
 from tests.scenes.patterns import NOISE, frames_of, result, view

@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.structured.decoded import Decoded, cropped
-from kernels.structured.frames import NoiseModel, upload
+from kernels.structured.pattern_frames import NoiseModel, upload
 from kernels.structured.phase import decode_phase, join_periods
 
 EIGHT_BIT = NoiseModel(0.003, 1.0e-4)

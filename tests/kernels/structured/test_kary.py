@@ -5,8 +5,8 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.kary import decode_kary, expected_levels
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from stage.patterns.codes import collect
 from stage.patterns.kary import kary_patterns, palette
 from tests.reference import structured as reference

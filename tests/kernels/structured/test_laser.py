@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe, plane_depths
-from service.depth.spot import find_spot, nearest_points
+from service.depth.laser.spot import find_spot, nearest_points
 
 
 def spot(u, v, width, shape=(60, 80)):

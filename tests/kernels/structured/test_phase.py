@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_gray
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_by_code, unwrap_jointly, unwrap_range
 from stage.patterns.base import uniform_patterns

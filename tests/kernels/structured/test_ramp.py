@@ -5,7 +5,7 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from kernels.structured.ramp import decode_ramp
 from stage.patterns.ramp import ramp_patterns
 from tests.reference import structured as reference

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.structured.frames import NoiseModel
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
+from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import decode_phase, weights
 from kernels.structured.response import light_of, wave_error
 from kernels.structured.unwrap import unwrap_jointly

@@ -5,9 +5,9 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.structured.frames import NoiseModel, saturated_bits, upload
 from kernels.structured.micro import decode_micro
 from kernels.structured.modulated import decode_modulated
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from kernels.structured.phase import decode_phase
 from kernels.structured.unwrap import unwrap_jointly
 from stage.patterns.codes import collect

@@ -5,7 +5,7 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.structured.frames import saturated_bits, upload
+from kernels.structured.pattern_frames import saturated_bits, upload
 from kernels.structured.separation import separate
 from stage.patterns.phase import phase_patterns
 from tests.scenes.patterns import frames_of, places, view

@@ -6,7 +6,7 @@ import pytest
 from kernels.errors import ArrayError
 from kernels.status import Status
 from kernels.structured.binary import decode_binary, decode_gray, decode_xor
-from kernels.structured.frames import NoiseModel, saturated_bits, stack, upload
+from kernels.structured.pattern_frames import NoiseModel, saturated_bits, stack, upload
 from stage.patterns.binary import binary_patterns, xor_patterns
 from stage.patterns.codes import collect
 from tests.reference import structured as reference

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kernels.structured.surface import check_surface
+from kernels.structured.opaque_surface import check_surface
 
 ROWS, COLS, FOCAL = 60, 80, 100.0
 X, Y = np.meshgrid((np.arange(COLS) + 0.5 - COLS / 2) / FOCAL, -(np.arange(ROWS) + 0.5 - ROWS / 2) / FOCAL)

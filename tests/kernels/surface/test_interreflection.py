@@ -5,11 +5,11 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.photometric.bounce import bounce_albedo, subtract_bounce
-from kernels.photometric.hypotheses import Diffuse
-from kernels.photometric.material import fit_tinted
-from kernels.photometric.near import NearField, pad_places
-from kernels.photometric.samples import readings_of, to_host
+from kernels.photometric.lambertian.near import NearField, pad_places
+from kernels.photometric.material.material import fit_tinted
+from kernels.photometric.model.samples import readings_of, to_host
+from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.shadows.bounce import bounce_albedo, subtract_bounce
 from kernels.surface.interreflection import gather_light
 from kernels.surface.shadows import Projection
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted

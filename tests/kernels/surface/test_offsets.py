@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.photometric.shadow_evidence import LARGEST_ODDS, shadow_odds
+from kernels.photometric.shadows.shadow_evidence import LARGEST_ODDS, shadow_odds
 from kernels.surface.offsets import GROUPS, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection
 

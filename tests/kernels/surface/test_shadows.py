@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.photometric.shadowing import exclude_shadows
+from kernels.photometric.shadows.shadowing import exclude_shadows
 from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, NO_REACH, Projection, extent_of, in_shadow_within
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
 

@@ -6,11 +6,11 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.status import Status
-from kernels.tof import bilateral
-from kernels.tof.bilateral import smooth
-from kernels.tof.continuous import Noise, decode, sample_harmonics, straighten
-from kernels.tof.flying import mark_flying
-from service.depth.continuous_wave import estimate_noise
+from kernels.tof.continuous import bilateral
+from kernels.tof.continuous.bilateral import smooth
+from kernels.tof.continuous.continuous import Noise, decode, sample_harmonics, straighten
+from kernels.tof.continuous.flying import mark_flying
+from service.depth.tof.continuous_wave import estimate_noise
 from tests.reference import tof
 
 

@@ -11,7 +11,7 @@ import OpenImageIO as oiio
 import pytest
 
 import service
-from stage import exr
+from stage.formats import exr
 from tests.reference.light_basis import relative_rms, render_ptm, render_rti, srgb, truncation
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, render, write_capture, write_exr
 

@@ -4,7 +4,7 @@ import json
 import re
 from pathlib import Path
 
-from stage.board.records import BoardDesign, BoardRegions, BoardScan, GaugeRuns
+from stage.sets.board import BoardDesign, BoardRegions, BoardScan, GaugeRuns
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "inspection.md").read_text(encoding="utf-8")
 

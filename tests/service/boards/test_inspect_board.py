@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stage import exr
+from stage.formats import exr
 from tests.scenes.board import PIXEL, SIGMA, domes, scan, write_scan
 from tests.scenes.captures import write_exr
 from tests.scenes.depth import BLACK_WHITE, CAMERA, gray_patterns, make_scene, phase_patterns, write_patterns

@@ -10,7 +10,7 @@ from service.errors import RequestError
 from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
 from tests.reference.balls import lambertian, render
 from tests.scenes.captures import angles_degrees, files_in, write_exr, write_manifest
-from tests.stage.calibration.balls import spread
+from tests.service.calibrate.solvers.balls import spread
 
 WIDTH, HEIGHT = 320, 240
 PLACEHOLDER = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}

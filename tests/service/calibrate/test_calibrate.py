@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.correction import Correction
-from stage.light import DistantLight, PointLight
+from stage.capture.capture import Capture
+from stage.capture.light import DistantLight, PointLight
+from stage.stack.correction import Correction
 from tests.reference.balls import lambertian, lambertian_near, mirror_of_far, mirror_of_near, render
 from tests.scenes.captures import (
     angles_degrees,

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.stereo.rectification import rectify
+from service.depth.stereo.rectification import rectify
+from stage.capture.capture import Capture
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_image, write_manifest
 from tests.scenes.depth import entry_of
-from tests.stage.calibration import test_procam as boards
+from tests.service.calibrate.solvers import test_procam as boards
 
 CAMERA = boards.CAMERA
 OTHER = reference.Device(420, 300, 520.0, (-0.08, 0.02, 0.0), (-0.0005, 0.001))

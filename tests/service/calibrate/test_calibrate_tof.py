@@ -7,7 +7,7 @@ import pytest
 
 from service.calibrate.tof import calibrate_tof
 from service.requests.calibrate import TofCalibrationRequest
-from stage.camera import Camera
+from stage.capture.camera import Camera
 from stage.errors import StageError
 from stage.tof.calibration import read_calibration
 from tests.reference import tof

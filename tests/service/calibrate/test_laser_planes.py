@@ -6,12 +6,12 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
+from stage.capture.capture import Capture
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_exr, write_manifest
 from tests.scenes.depth import entry_of
-from tests.stage.calibration.test_procam import BOARD, CAMERA, SQUARE, board_image, poses
+from tests.service.calibrate.solvers.test_procam import BOARD, CAMERA, SQUARE, board_image, poses
 
 PLANES = [(np.array((0.25, 0.0, 0.0)), np.array((np.cos(angle), 0.05, np.sin(angle)))) for angle in np.radians((-13, -15.5, -18))]
 WIDTH = 0.0025
@@ -98,7 +98,7 @@ def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
 def test_a_plane_from_points(tilt):
     """Boards whose poses are off by half a millimetre, and a tenth of the points of another light."""
-    from stage.calibration.laser_plane import fit_light_plane
+    from service.calibrate.solvers.laser_plane import fit_light_plane
 
     random = np.random.default_rng(2)
     normal = unit(np.array((1.0, tilt, 0.4)))

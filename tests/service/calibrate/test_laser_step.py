@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
+from stage.capture.capture import Capture
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.step import CAMERA, HEIGHT, LASER, Step, laser_planes, photograph

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
-from stage.images import read_pixels
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.formats.images import read_pixels
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, write_image, write_manifest
 from tests.scenes.depth import BLACK_WHITE
-from tests.stage.calibration import test_procam as boards
+from tests.service.calibrate.solvers import test_procam as boards
 
 CAMERA = boards.CAMERA
 PROJECTOR = reference.Device(256, 192, 360.0, (-0.05, 0.01, 0.0), (-0.0005, 0.001))

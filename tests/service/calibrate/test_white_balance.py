@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.correction import Correction
+from stage.capture.capture import Capture
+from stage.stack.correction import Correction
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr
 from tests.scenes.dng import RGGB, XYZ_TO_CAMERA, write_dng
 

@@ -14,9 +14,10 @@ import pytest
 
 from service.captures import decoders
 from service.captures.decoders import Decoders
-from stage import images, inputs
+from stage import inputs
 from stage.errors import ImageError, ManifestError, StageError, StorageError
-from stage.ingest import open_stack
+from stage.formats import images
+from stage.stack.ingest import open_stack
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_image
 from tests.service.server.api.captures import lying_png
 
@@ -150,7 +151,7 @@ def test_several_threads_are_served_and_nothing_is_left(folder, tmp_path_factory
 
 
 def test_a_stack_is_the_same(tmp_path, made):
-    from stage.capture import Capture
+    from stage.capture.capture import Capture
 
     write_capture(tmp_path / "cap", make_scene(size=16, lights=5))
     here = open_stack(Capture.open(tmp_path / "cap"), cache=tmp_path / "here")

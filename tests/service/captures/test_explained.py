@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.captures.inspect import inspect
+from service.captures.info import inspect
 from service.requests.captures import InfoRequest
 from tests.scenes.captures import manifest_of, write_exr, write_image, write_manifest
 from tests.scenes.ellipsoid import ellipsoid

@@ -6,7 +6,7 @@ import shlex
 import numpy as np
 import pytest
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from tests.scenes import near_lights
 from tests.scenes.captures import files_in, make_scene, write_image
 from tests.service.captures.test_import_laser import as_text, write_camera, write_scan

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
+from stage.capture.capture import Capture
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import write_image
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.depth_maps import DepthMaps
 from tests.reference.projector import FLIP
 from tests.scenes.captures import files_in, write_image
 from tests.scenes.depth import AMBIENT, CAMERA, POSE, PROJECTOR, make_scene

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stage.capture import Capture
-from stage.depth_maps import DepthMaps
-from stage.tof.frames import read_correlations, read_histograms
+from stage.capture.capture import Capture
+from stage.results.depth_maps import DepthMaps
+from stage.tof.raw_frames import read_correlations, read_histograms
 from tests.scenes.captures import files_in
 
 C = 299792458.0

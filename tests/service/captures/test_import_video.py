@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.capture import Capture
-from stage.images import read_recorded
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.formats.images import read_recorded
 from stage.patterns.binary import binary_patterns
 from tests.scenes.captures import files_in
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stage.capture import Capture
-from stage.maps import SurfaceMaps
+from stage.capture.capture import Capture
+from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
 from tests.scenes.captures import make_scene, write_exr, write_image
 

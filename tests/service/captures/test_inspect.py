@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.captures.inspect import inspect
+from service.captures.info import inspect
 from service.requests.captures import InfoRequest
-from stage import exr
-from stage.capture import Capture
+from stage.capture.capture import Capture
+from stage.capture.lighting import check_solvable
 from stage.errors import ManifestError
-from stage.lighting import check_solvable
+from stage.formats import exr
 from tests.scenes import near_lights
 from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.near_lights import lamps

@@ -4,9 +4,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from service.captures.inspect import inspect
-from service.captures.picture import BINS, REACH, RED, SIZE, TILE
-from service.light.sheet import GAP, MARGIN, TITLE
+from service.captures.capture_picture import BINS, REACH, RED, SIZE, TILE
+from service.captures.info import inspect
+from service.relight.sheet import GAP, MARGIN, TITLE
 from service.requests.captures import InfoRequest
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.service.recording import Recording

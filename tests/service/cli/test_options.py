@@ -29,8 +29,8 @@ from service.requests import (
     solve,
     view,
 )
-from service.requests.base import Choice, Options, Role
-from service.requests.options import build, help_text, options_of, typed, values_of
+from service.requests.base.base import Choice, Options, Role
+from service.requests.base.options import build, help_text, options_of, typed, values_of
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
@@ -148,7 +148,7 @@ def test_a_command_has_the_options_of_its_models_and_its_own(name):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_choice_is_the_same_here_there_and_in_the_schema(kind):
-    """Compared without service.requests.options: names, flags, defaults and words."""
+    """Compared without service.requests.base.options: names, flags, defaults and words."""
     here, there, schema = shown(kind), shown(f"submit {kind}"), in_schema(KINDS[kind])
     names = {option.field.alias or option.name for option in options_of(COMMANDS[kind][0]) if option.role is Role.CHOICE}
     assert names and names <= there.keys()

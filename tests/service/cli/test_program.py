@@ -12,7 +12,7 @@ from typer.main import get_command
 
 import service
 from service.cli.main import BLAS_THREADS, COMMANDS, program
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
 SHOWN = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "inspect-board", "join", "register", "fuse", "relight",
@@ -151,12 +151,12 @@ def test_an_unknown_device_is_named(relit, tmp_path):
 
 
 def test_an_interruption_ends_with_130_and_a_sentence(relit, tmp_path, monkeypatch):
-    from service.solve import solve
+    from service.solve import opening
 
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(solve, "open_stack", interrupt)
+    monkeypatch.setattr(opening, "open_stack", interrupt)
     write_capture(tmp_path / "cap", make_scene(size=4, lights=4))
     outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
     assert outcome.code == 130
@@ -164,13 +164,13 @@ def test_an_interruption_ends_with_130_and_a_sentence(relit, tmp_path, monkeypat
 
 
 def test_a_defect_of_ours_keeps_its_traceback(monkeypatch, tmp_path):
-    from service.captures import inspect
+    from service.captures import info
     from service.cli.main import main
 
     def fail(*arguments, **options):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(inspect.Capture, "open", fail)
+    monkeypatch.setattr(info.Capture, "open", fail)
     monkeypatch.setattr(sys, "argv", ["relit", "info", str(tmp_path)])
     with pytest.raises(ZeroDivisionError):
         main()

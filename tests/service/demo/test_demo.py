@@ -8,8 +8,8 @@ import OpenImageIO as oiio
 import pytest
 
 import service.demo.demo
-from stage import exr
-from stage.maps import SurfaceMaps
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import files_in
 from tests.service.owl import OWL, owl_errors, write_small_owl
 

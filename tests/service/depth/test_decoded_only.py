@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.depth_maps import DepthMaps
+from stage.formats import exr
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest, files_in, write_exr
 from tests.scenes.depth import BLACK_WHITE, PROJECTOR, gray_patterns, make_scene, phase_patterns, write_patterns

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.depth_maps import DepthMaps
-from stage.ply import read_ply
+from stage.formats import exr
+from stage.formats.ply import read_ply
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
 from tests.scenes.depth import (
@@ -227,8 +227,8 @@ def test_saturated_readings_are_refused(relit, tmp_path):
 def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     write_patterns(tmp_path, SCENE, [*patterns, *BLACK_WHITE], noise=0.01)
     whole, _ = solve(relit, tmp_path)
-    monkeypatch.setattr("stage.planes.BAND_BYTES", 100_000)
-    monkeypatch.setattr("stage.planes.MEMORY_BYTES", 0)
+    monkeypatch.setattr("stage.stack.planes.BAND_BYTES", 100_000)
+    monkeypatch.setattr("stage.stack.planes.MEMORY_BYTES", 0)
     parts, _ = solve(relit, tmp_path)
     assert (whole.depth == parts.depth).all() and (whole.status == parts.status).all()
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from stage.depth_maps import DepthMaps
-from stage.ply import read_ply
+from stage.formats.ply import read_ply
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_frame, files_in
 from tests.scenes.depth import CENTRE, NORMAL, PLANE, RADIUS, make_scene, write_lasers

@@ -7,7 +7,7 @@ import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
-from stage import exr
+from stage.formats import exr
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"
 

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from kernels.status import Status
-from stage.manifest import read_manifest
+from stage.capture.manifest import read_manifest
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "active_stereo.md").read_text(encoding="utf-8")
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from stage import exr
+from stage.formats import exr
 from stage.patterns.binary import binary_patterns
 from stage.patterns.phase import phase_patterns
 from tests.scenes.captures import write_exr, write_image

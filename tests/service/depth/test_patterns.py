@@ -6,10 +6,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from service.depth.codes import CODES
-from service.depth.projection import make_patterns, make_plan
+from service.depth.patterns.codes import CODES
+from service.depth.patterns.projection import make_patterns, make_plan
 from service.requests.patterns import PatternCode, PatternsRequest, PlanRequest
-from stage.manifest import Frame
+from stage.capture.manifest import Frame
 from stage.patterns.codes import collect, draw
 from tests.service.recording import Recording
 

@@ -12,7 +12,7 @@ from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 from service.depth.scan import scan
 from service.errors import RequestError
 from service.requests.depth import ScanRequest
-from stage.ply import read_ply
+from stage.formats.ply import read_ply
 from tests.reference.tof import View, histogram
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from service.depth.separate import separate
 from service.requests.depth import SeparateRequest
-from stage import exr
-from stage.capture import Capture
-from stage.depth_normals import depth_normals
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.depth_normals import depth_normals
 from tests.scenes.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
 
@@ -142,7 +142,7 @@ def test_mask_saturation_and_provenance(relit, tmp_path):
 def test_bands_do_not_show(relit, tmp_path, monkeypatch):
     write(tmp_path, [*phases(), BLACK])
     whole = solve(relit, tmp_path)[:2]
-    monkeypatch.setattr("stage.planes.BAND_BYTES", 5 * COLS * (4 * 5 * 3 + 80))  # five rows
+    monkeypatch.setattr("stage.stack.planes.BAND_BYTES", 5 * COLS * (4 * 5 * 3 + 80))  # five rows
     for one, other in zip(whole, solve(relit, tmp_path)[:2], strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
+from stage.capture.camera import Camera
+from stage.results.depth_maps import DepthMaps
 
 
 def scene(folder):

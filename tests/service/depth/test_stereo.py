@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from stage.depth_maps import DepthMaps
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
-from stage.maps import SurfaceMaps
-from stage.stereo.other_camera import OtherCamera
-from stage.stereo.rectification import rectify
+from service.depth.stereo.rectification import rectify
+from stage.capture.camera import Camera
+from stage.capture.other_camera import OtherCamera
+from stage.results.depth_maps import DepthMaps
+from stage.results.maps import SurfaceMaps
 from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest, write_exr
@@ -173,7 +173,7 @@ def test_bands_of_rows_agree_with_the_whole_image(relit, tmp_path, monkeypatch):
     left, right = pair((WALL, BALL))
     folder = scenes.write_pair(tmp_path, recorded(left, 14), recorded(right, 15))
     whole, _ = solve(relit, folder)
-    monkeypatch.setattr("service.depth.stereo_pair.VOLUME_BYTES", 1 << 20)  # the fewest rows at a time
+    monkeypatch.setattr("service.depth.stereo.stereo_pair.VOLUME_BYTES", 1 << 20)  # the fewest rows at a time
     banded, _ = solve(relit, folder)
     # paths that begin 24 rows above a band choose what those that begin at the top choose, but for single pixels at edges
     assert (whole.mask != banded.mask).mean() < 0.01

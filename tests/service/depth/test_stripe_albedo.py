@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.depth.stripes import SweepEnergy
+from service.depth.laser.stripes import SweepEnergy
 
 RNG = np.random.default_rng(0)
 ALBEDO = np.exp(RNG.normal(0, 0.4, (40, 120)))

@@ -3,8 +3,8 @@
 import numpy as np
 
 from kernels.status import Status
-from service.depth.stripe_map import StripeSamples, contradicted
-from stage.camera import Camera
+from service.depth.laser.stripe_map import StripeSamples, contradicted
+from stage.capture.camera import Camera
 
 CAMERA = Camera(projection="perspective", resolution=(200, 40), focal_px=(300.0, 300.0))
 LINES = np.arange(40)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from service.depth.stripe_curves import choose_curves, link
+from service.depth.laser.stripe_curves import choose_curves, link
 
 LINES = 60
 OK, NONE = int(Status.OK), int(Status.LOW_MODULATION)

@@ -8,10 +8,10 @@ import pytest
 from kernels.status import Status
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest, TofOptions
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
-from stage.fingerprint import digest
-from stage.ply import read_ply
+from stage.capture.camera import Camera
+from stage.formats.ply import read_ply
+from stage.results.depth_maps import DepthMaps
+from stage.stack.fingerprint import digest
 from stage.tof.calibration import Temperature, TofCalibration, fit_harmonics, write_calibration
 from tests.reference import tof
 

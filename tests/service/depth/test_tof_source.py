@@ -8,8 +8,8 @@ import pytest
 from kernels.status import Status
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
+from stage.capture.camera import Camera
+from stage.results.depth_maps import DepthMaps
 from tests.reference import tof
 
 ROWS, COLS = 30, 40

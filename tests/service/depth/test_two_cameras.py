@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from stage.depth_maps import DepthMaps
+from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
 from tests.scenes.depth import (

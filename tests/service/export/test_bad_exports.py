@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pxr import Usd
 
-from service.usd.asset import write_asset
-from service.usd.inspect import inspect_asset
+from service.asset.usd.asset import write_asset
+from service.asset.usd.inspect import inspect_asset
 from tests.scenes.captures import write_exr
 from tests.scenes.surfaces import make_ball
 

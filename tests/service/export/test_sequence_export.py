@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade
 
-from service.asset.errors import AssetError
-from service.errors import RequestError
+from service.errors import AssetError, RequestError
 from service.export.export import export
 from service.requests.depth import DepthRequest
 from service.requests.export import ExportRequest, Geometry, TextureFormat
 from service.requests.solve import Method, SolveRequest
 from service.sequences.run import depth_sequence, solve_sequence
 from stage.errors import ResultError
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.clients.validators import findings
 from tests.scenes import depth as depths
 from tests.scenes.captures import write_image
@@ -130,9 +129,9 @@ SCRIPT = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from service.usd.layers import Description
-from service.usd.sequence_asset import Faces, Moment, write_sequence_asset
-from stage.camera import Camera
+from service.asset.usd.layers import Description
+from service.asset.usd.sequence_asset import Faces, Moment, write_sequence_asset
+from stage.capture.camera import Camera
 rows, cols = np.indices((300, 300))
 corner = (rows[:-1, :-1] * 300 + cols[:-1, :-1]).ravel()
 faces = Faces(np.full(len(corner), 4), np.stack([corner, corner + 300, corner + 301, corner + 1], axis=1).ravel())

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from service.farm.jobs import Job, write_job
-from service.requests.base import Role
-from service.requests.options import options_of
+from service.requests.base.base import Role
+from service.requests.base.options import options_of
 from service.requests.relight import RelightRequest
 from service.requests.shade import ShadeRequest
-from stage import exr
+from stage.formats import exr
 from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
 from tests.scenes.glossy import dome, write_dome, write_maps
 

@@ -9,9 +9,9 @@ import pytest
 from pxr import Usd, UsdGeom
 
 from kernels.status import Status
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.results.depth_maps import DepthMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes.joined import MM, degrees_between, drifting, see
 
 SIGMA, NOISE = 0.4 * MM, 0.5

@@ -11,11 +11,11 @@ import pytest
 import service
 import service.requests
 from service.reporting.provenance import UNREPORTED, choices, requested
-from service.requests.base import DeviceRequest, Options, Role
+from service.requests.base.base import DeviceRequest, Options, Role
+from service.requests.base.options import role_of
 from service.requests.calibrate import LightsRequest
 from service.requests.depth import DepthRequest, TofOptions
 from service.requests.export import ExportRequest
-from service.requests.options import role_of
 
 
 def requests() -> dict[str, type[Options]]:

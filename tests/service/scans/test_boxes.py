@@ -10,10 +10,10 @@ from service.requests.register import FuseRequest
 from service.scans import boxes
 from service.scans.fuse import fuse
 from service.scans.fused_bricks import fused_bricks
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import exponential
 from service.scans.range_images import PreparedScan, focal_of
-from stage.camera import Camera, Distortion
-from stage.scans.ply_points import read_ply_points
-from stage.scans.rigid import exponential
+from stage.capture.camera import Camera, Distortion
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 

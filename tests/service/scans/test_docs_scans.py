@@ -4,9 +4,9 @@ import json
 import re
 from pathlib import Path
 
-from service.requests.options import options_of
+from service.requests.base.options import options_of
 from service.requests.register import FuseRequest, RegisterRequest
-from stage.scans.records import ScanSet
+from stage.sets.scan_set import ScanSet
 
 DOCS = (Path(__file__).resolve().parents[3] / "docs" / "scans.md").read_text(encoding="utf-8")
 

@@ -6,15 +6,14 @@ import sys
 import numpy as np
 import pytest
 
-from service.asset.errors import AssetError
-from service.errors import RequestError
+from service.errors import AssetError, RequestError
 from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
-from stage.depth_normals import depth_normals
-from stage.maps import SurfaceMaps
-from stage.scans.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_points
+from stage.capture.camera import Camera
+from stage.results.depth_maps import DepthMaps
+from stage.results.depth_normals import depth_normals
+from stage.results.maps import SurfaceMaps
 from tests.scenes.statue import SIGMA, colour_of, distance, shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 

@@ -6,7 +6,7 @@ import pytest
 from service.requests.register import FuseRequest
 from service.scans import range_images
 from service.scans.fuse import FuseResult, fuse
-from stage.scans.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_points
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
 VOXEL = 26e-3

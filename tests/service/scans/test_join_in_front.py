@@ -6,8 +6,8 @@ import pytest
 from service.errors import RequestError
 from service.requests.register import FuseRequest
 from service.scans.fuse import FuseResult, fuse
-from stage.maps import SurfaceMaps
-from stage.scans.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_points
+from stage.results.maps import SurfaceMaps
 from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit, with_dead_pixels
 from tests.scenes.statue import Shot, write_scans
 from tests.service.scans.mesh_files import read_faces

@@ -9,10 +9,10 @@ import pytest
 from service.errors import RequestError
 from service.requests.register import FuseRequest
 from service.scans.fuse import FuseResult, fuse
-from stage.camera import Camera
-from stage.maps import SurfaceMaps
-from stage.scans.ply_points import read_ply_points
-from stage.scans.rigid import exponential
+from service.scans.points.ply_points import read_ply_points
+from service.scans.points.rigid import exponential
+from stage.capture.camera import Camera
+from stage.results.maps import SurfaceMaps
 from tests.scenes.statue import Shot, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 

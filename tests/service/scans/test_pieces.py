@@ -10,7 +10,7 @@ from service.requests.register import RegisterRequest
 from service.scans import kept_scans
 from service.scans.pieces import FolderPieces, SharedPieces
 from service.scans.register import register_scans
-from stage.scans.records import read_scan_set
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import figure
 from tests.service.scans.test_register import views, write
 

@@ -9,13 +9,13 @@ from service.errors import RequestError
 from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.point_sets import as_range_image
+from service.scans.points.planes import local_planes
+from service.scans.points.ply_points import read_ply_points
 from service.scans.read import read_scan
 from service.scans.register import register_scans
 from stage.errors import ManifestError
-from stage.ply import PointCloud, write_ply
-from stage.scans.planes import local_planes
-from stage.scans.ply_points import read_ply_points
-from stage.scans.records import read_scan_set
+from stage.formats.ply import PointCloud, write_ply
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.clouds import MM, Cloud, all_around, entry, scatter
 from tests.scenes.statue import SIGMA, colour_of, distance, place, turntable, write_scans, write_set
 

@@ -7,7 +7,7 @@ import pytest
 
 from service.scans.range_images import prepare_scan
 from service.scans.read import read_scan
-from stage.scans.records import read_scan_set
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.statue import turntable, write_scans
 
 STATUS = Path("/proc/self/status")

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.scans.points.scan import Scan
 from service.scans.read import read_scan, read_scans
-from stage.camera import Camera
-from stage.depth_maps import DepthMaps
+from stage.capture.camera import Camera
 from stage.errors import ManifestError, StageError
-from stage.maps import SurfaceMaps
-from stage.ply import PointCloud, write_ply
-from stage.scans.records import read_scan_set
-from stage.scans.scan import Scan
+from stage.formats.ply import PointCloud, write_ply
+from stage.results.depth_maps import DepthMaps
+from stage.results.maps import SurfaceMaps
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.joined import degrees_between
 
 SIZE, RADIUS, SIGMA = 96, 0.25, 2e-4

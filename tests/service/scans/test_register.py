@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stage.depth_maps import DepthMaps
-from stage.ply import PointCloud, write_ply
-from stage.scans.records import read_scan_set
-from stage.scans.rigid import inverse, step_between
+from service.scans.points.rigid import inverse, step_between
+from stage.formats.ply import PointCloud, write_ply
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import MM, Distance, View, figure, pose, turntable, urn, vase
 
 ROWS = 120

@@ -6,14 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from stage.depth_maps import DepthMaps
-from stage.images import write_png
-from stage.scans.records import read_scan_set
-from stage.scans.rigid import applied, inverse, step_between
-from stage.scans.scan import Scan
+from service.scans.points.rigid import applied, inverse, step_between
+from service.scans.points.scan import Scan
+from stage.formats.images import write_png
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import read_scan_set
 from tests.scenes.turntable import MM, View, turntable, vase
+from tests.service.scans.registration.test_found_targets import CAMERA, POSES, look
 from tests.service.scans.test_register import off, write
-from tests.stage.scans.test_found_targets import CAMERA, POSES, look
 
 PLACES = {f"T{k}": np.array(place) for k, place in enumerate(
     [(0.4, -0.4, 0), (0.2, 0.3, 0.4), (-0.2, -0.4, 0.4), (-0.4, 0.2, -0.1), (0, 0.4, -0.4)])}

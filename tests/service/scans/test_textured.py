@@ -6,9 +6,9 @@ from pxr import Usd, UsdGeom
 
 from service.requests.register import FuseRequest
 from service.scans.fuse import fuse
-from stage.camera import Camera
-from stage.images import read_pixels
-from stage.maps import SurfaceMaps
+from stage.capture.camera import Camera
+from stage.formats.images import read_pixels
+from stage.results.maps import SurfaceMaps
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
 pytest.importorskip("xatlas", reason="xatlas is not installed")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
+from service.asset.usd.fused_asset import Tile, write_site
 from service.requests.register import FuseRequest
 from service.scans import fused_bricks
 from service.scans.fuse import FuseResult, fuse
-from service.usd.fused_asset import Tile, write_site
-from stage.scans.ply_points import read_ply_points
+from service.scans.points.ply_points import read_ply_points
 from tests.scenes.statue import turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 

@@ -10,10 +10,10 @@ from service.requests.depth import DepthRequest
 from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.sequences import one_step
 from service.sequences.run import depth_sequence, solve_sequence
-from stage.depth_maps import DepthMaps
 from stage.errors import ManifestError
-from stage.maps import SurfaceMaps
-from stage.ply import read_ply
+from stage.formats.ply import read_ply
+from stage.results.depth_maps import DepthMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes import depth as depths
 from tests.scenes.captures import angles_degrees, edit_manifest, files_in
 from tests.scenes.sequence import LIGHTS, SIZE, moment, write_sequence, write_step

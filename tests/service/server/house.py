@@ -5,13 +5,13 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import SolveJob
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, tables
 from service.server.database.engine import connect
-from service.server.housekeeping import Housekeeper
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.settings import Settings
+from service.server.process.housekeeping import Housekeeper
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
 

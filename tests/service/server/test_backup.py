@@ -5,10 +5,10 @@ import shutil
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
-from service.server.backup import CONTENTS, backup, restore
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
+from service.server.base.settings import Settings
 from service.server.database import jobs
-from service.server.settings import Settings
+from service.server.process.backup import CONTENTS, backup, restore
 from tests.service.server.jobs.conftest import database_url, undisturbed  # noqa: F401  (fixtures)
 from tests.service.server.jobs.harness import digests, harness
 from tests.service.server_process import SABOTAGE

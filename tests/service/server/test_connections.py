@@ -15,12 +15,12 @@ import uvicorn
 from anyio import to_thread
 
 from service.requests.keys import NewKey, Scope
-from service.server import connections
-from service.server.connections import ConnectionLimits, limits_of, raise_descriptors
+from service.server.base.settings import Settings
 from service.server.database import keys
 from service.server.database.engine import connect
-from service.server.serve import THREADS, http_server
-from service.server.settings import Settings
+from service.server.process import connections
+from service.server.process.connections import ConnectionLimits, limits_of, raise_descriptors
+from service.server.process.serve import THREADS, http_server
 from tests.service.server_process import serving
 
 WAIT_S = 20.0

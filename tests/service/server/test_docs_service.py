@@ -17,12 +17,12 @@ import pytest
 
 from service.demo.demo import sample_folder
 from service.requests.keys import Scope
-from service.server.connections import AT_ONCE, MAX_CONNECTIONS, OWN_DESCRIPTORS
+from service.server.base.settings import Settings
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.processes import PRIVATE
-from service.server.sample import show_sample
-from service.server.settings import Settings
+from service.server.process.connections import AT_ONCE, MAX_CONNECTIONS, OWN_DESCRIPTORS
+from service.server.process.processes import PRIVATE
+from service.server.process.sample import show_sample
 from service.server.storage.objects import open_storage
 
 HOME = Path(__file__).parents[3]
@@ -78,7 +78,8 @@ def test_every_scope_is_described():
 def test_the_service_of_the_demo_says_what_to_try_and_that_works(tmp_path):
     """`relit demo --serve`, without the demo itself."""
     assert "relit demo --serve" in (HOME / "Makefile").read_text() and "make serve" in TEXT
-    code = "import sys; from pathlib import Path; from service.cli.demo import open_service; open_service(Path(sys.argv[1]), 'cpu')"
+    code = ("import sys; from pathlib import Path; from service.cli.commands.demo import open_service\n"
+            "open_service(Path(sys.argv[1]), 'cpu')")
     with open(tmp_path / "log", "w") as log:
         process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "data")], cwd=HOME, text=True, stdout=subprocess.PIPE,
                                    stderr=log, env=os.environ | {"RELIT_PORT": "0", "RELIT_DRAIN_S": "1", "RELIT_MIN_FREE_BYTES": "0"})

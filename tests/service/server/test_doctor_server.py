@@ -3,14 +3,14 @@
 import pytest
 import sqlalchemy as sa
 
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import keys, workers
 from service.server.database.engine import connect
 from service.server.database.schema import REVISIONS
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.settings import Settings
 
 
 @pytest.fixture

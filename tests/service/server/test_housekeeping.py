@@ -5,10 +5,10 @@ import time
 
 import sqlalchemy as sa
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, new_id
 from service.requests.jobs import ExportJob
 from service.server.database import audit, idempotency, intakes, jobs, tables, uploads, workers
-from service.server.housekeeping import DAY_S, HOUR_S, UNFINISHED_S
+from service.server.process.housekeeping import DAY_S, HOUR_S, UNFINISHED_S
 from service.server.storage import layout
 from service.server.storage.part_files import PartFile, part_files_folder
 from tests.service.server.house import DAYS, PROJECT, House

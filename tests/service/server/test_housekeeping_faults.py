@@ -2,10 +2,10 @@
 
 
 
-from service.requests.identifiers import CAPTURE, new_id
-from service.server import housekeeping
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.server.database import jobs
-from service.server.housekeeping import DAY_S, HOUR_S, Housekeeper
+from service.server.process import housekeeping
+from service.server.process.housekeeping import DAY_S, HOUR_S, Housekeeper
 from tests.service.server.house import DAYS
 
 

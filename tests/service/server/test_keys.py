@@ -7,9 +7,9 @@ import time
 import pytest
 
 from service.requests.keys import Scope
+from service.server.base.settings import Settings
 from service.server.database import engine, keys, tables
 from service.server.database.engine import connect
-from service.server.settings import Settings
 
 
 @pytest.fixture

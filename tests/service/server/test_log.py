@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from service.server import log
+from service.server.base import log
 
 
 @pytest.fixture(autouse=True)

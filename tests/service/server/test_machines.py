@@ -15,9 +15,9 @@ from service.client import Client
 from service.requests.jobs import RelightJob
 from service.requests.keys import NewKey, Scope
 from service.requests.relight import RelightOptions
+from service.server.base.settings import Settings
 from service.server.database import keys
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import digests, relit_relight
 from tests.service.server.storage.conftest import s3, s3_server  # noqa: F401  (fixtures)

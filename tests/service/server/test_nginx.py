@@ -27,9 +27,9 @@ from service.client import Client
 from service.requests.jobs import RelightJob
 from service.requests.keys import NewKey, Scope
 from service.requests.relight import RelightOptions
+from service.server.base.settings import Settings
 from service.server.database import keys
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.scenes.captures import write_capture, write_exr
 from tests.service.server_process import Server, serving
 

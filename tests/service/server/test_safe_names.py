@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.server.safe_names import DEVICES, MAX_DEPTH, MAX_PART_BYTES, NameFault, check_path, folded, folders_of, shown
+from service.server.base.safe_names import DEVICES, MAX_DEPTH, MAX_PART_BYTES, NameFault, check_path, folded, folders_of, shown
 
 PLAIN = st.characters(categories=("L", "N"), include_characters="-_+,;=@#$%&'()[]{}~! .")
 

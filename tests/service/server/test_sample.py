@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.database.engine import connect
 from service.server.database.keys import DEFAULT_PROJECT
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.sample import SampleResults, show_sample
-from service.server.settings import Settings
+from service.server.process.sample import SampleResults, show_sample
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
 

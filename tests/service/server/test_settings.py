@@ -9,9 +9,9 @@ import pytest
 from pydantic import ValidationError
 
 from service.errors import RequestError, sentence
+from service.server.base.settings import Settings, unknown_variables
 from service.server.database.engine import open_database
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings, unknown_variables
 
 DOCS = Path(__file__).parents[3] / "docs" / "service.md"
 

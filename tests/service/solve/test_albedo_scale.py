@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.solve.settling import fit_albedo_scale
+from service.solve.methods.settling import fit_albedo_scale
 from tests.kernels.scenes import cap
 from tests.reference.groove import Groove
 

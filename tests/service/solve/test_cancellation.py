@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.solve.gradient import PART, neighbours_doubt
+from service.solve.methods.gradient import PART, neighbours_doubt
 
 
 def test_a_pixel_between_doubtful_ones_is_as_doubtful():

@@ -8,8 +8,8 @@ import pytest
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage import images
-from stage.maps import SurfaceMaps
+from stage.formats import images
+from stage.results.maps import SurfaceMaps
 from tests.scenes import captures
 
 

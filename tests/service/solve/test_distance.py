@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees
 from tests.scenes.near_lights import lamps

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.maps import SurfaceMaps
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.reference import gradient as reference
 from tests.scenes.captures import angles_degrees, make_scene, write_exr, write_image, write_manifest
 

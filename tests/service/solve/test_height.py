@@ -7,7 +7,7 @@ import numpy as np
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes import captures
 
 SHARPNESS = 12

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from service.solve.integrability import doubt, misfit
-from stage.camera import Camera
+from service.solve.height.integrability import doubt, misfit
+from stage.capture.camera import Camera
 
 SIDE = 64
 
@@ -40,5 +40,5 @@ def test_the_size_of_bands_changes_nothing(monkeypatch):
     normal, height, mask, camera = ball()
     spoiled = normal + np.random.default_rng(0).normal(0, 0.1, normal.shape)
     whole = misfit(spoiled, height, mask, camera)
-    monkeypatch.setattr("service.solve.integrability.BAND_PIXELS", 5 * SIDE)
+    monkeypatch.setattr("service.solve.height.integrability.BAND_PIXELS", 5 * SIDE)
     np.testing.assert_array_equal(misfit(spoiled, height, mask, camera), whole)

@@ -56,7 +56,7 @@ def test_a_gross_error_still_alarms(wrong):
 
 def test_what_the_first_estimate_leaves_is_refined_with_lobes(tmp_path, monkeypatch):
     """The first estimate is held to a gain that nothing has, so that the refinement of `svbrdf` has the errors to itself."""
-    monkeypatch.setattr("service.solve.intensities.LEAST_GAIN", 2.0)
+    monkeypatch.setattr("service.solve.lights.intensities.LEAST_GAIN", 2.0)
     factor = np.exp(np.random.default_rng(2).normal(0, 0.06, LIGHTS))
     factor[GROSS] = 0.4
     error, report = solved(tmp_path, factor)

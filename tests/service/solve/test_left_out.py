@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.solve.support import leave_out
+from service.solve.methods.support import leave_out
 from tests.kernels.photometric.test_svbrdf import render, sample, tilted
 from tests.kernels.scenes import cap
 from tests.reference import microfacet as twin

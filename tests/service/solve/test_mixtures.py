@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from stage import exr
+from stage.formats import exr
 from tests.reference import microfacet
 from tests.scenes.captures import write_exr, write_image
 from tests.scenes.glossy import PIXEL_M, VIEW, dome, sphere_directions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kernels import device as devices
-from stage import exr
-from stage.maps import SurfaceMaps
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.scenes import bowl, near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr
 from tests.scenes.near_lights import Lamp, far, lamps

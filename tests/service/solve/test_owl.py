@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.service.owl import owl_errors, write_small_owl
 
 SIDE = 4

@@ -7,7 +7,7 @@ import pytest
 
 from service.requests.solve import Method, SolveRequest
 from service.solve.solve import solve
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees
 from tests.scenes.parts import Part, ball_before_body, disc_over_plane, shoot, sphere_lights, write_shot
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.light.relight import relight
+from service.relight.relight import relight
 from service.requests.relight import RelightRequest
 from service.requests.solve import LightsKnown, Method, SolveRequest
 from service.solve.solve import solve
-from stage import exr
 from stage.errors import ManifestError
+from stage.formats import exr
 from tests.reference import microfacet
 from tests.scenes import near_lights
 from tests.scenes.captures import angles_degrees, edit_manifest, write_exr, write_image, write_manifest

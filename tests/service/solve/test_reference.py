@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from stage import exr
-from stage.maps import SurfaceMaps
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
 
 LIGHTS, SIDE = 24, 40

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from service.requests.solve import Method
-from service.solve.methods import METHODS
-from stage import exr
-from stage.maps import SurfaceMaps
+from service.solve.methods.methods import METHODS
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees, files_in, make_scene, write_capture
 
 SCENE = make_scene(size=16, lights=7)

@@ -10,10 +10,11 @@ import pytest
 from kernels import device as devices
 from kernels.errors import DeviceError
 from service.requests.solve import SolveRequest
-from service.solve import batches, material
-from service.solve.sharing import deal
+from service.solve.methods import material
+from service.solve.sharing import batches
+from service.solve.sharing.sharing import deal
 from service.solve.solve import solve
-from stage import stack
+from stage.stack import stack
 from tests.reference.gradient import ggx, lambert
 from tests.scenes import horn, near_lights
 from tests.scenes.captures import make_scene, write_capture

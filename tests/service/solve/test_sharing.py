@@ -9,10 +9,10 @@ import pytest
 
 from service.errors import DivergedError
 from service.requests.solve import SolveRequest
-from service.solve import batches, sharing
-from service.solve.sharing import Results, SharedSolve, digest
+from service.solve.sharing import batches, sharing
+from service.solve.sharing.sharing import Results, SharedSolve, digest
 from service.solve.solve import help_solve, solve
-from stage import stack
+from stage.stack import stack
 from tests.service.owl import write_small_owl
 from tests.service.solve.test_several_devices import (
     BAND_BYTES,

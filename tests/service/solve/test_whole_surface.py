@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.solve.surface import whole_surface
+from service.solve.height.height import whole_surface
 
 ROWS, COLS = 20, 30
 V, U = np.mgrid[:ROWS, :COLS]

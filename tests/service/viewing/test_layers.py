@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
-from stage import exr
-from stage.capture import Capture
-from stage.maps import SurfaceMaps
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.maps import SurfaceMaps
 from tests.reference.view import View
 from tests.scenes.captures import write_exr, write_image, write_manifest
 
@@ -27,7 +27,7 @@ class Shown(NamedTuple):
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> Shown:
     from service.requests.view import ViewRequest
-    from service.viewing.view import view
+    from service.viewing.view_files import view
 
     folder = tmp_path_factory.mktemp("view")
     mask = np.ones((ROWS, COLS), dtype=bool)

@@ -9,9 +9,9 @@ from service.depth.depth import depth
 from service.requests.depth import DepthRequest
 from service.requests.view import ViewRequest
 from service.viewing import points
-from service.viewing.view import view
-from stage.depth_maps import DepthMaps
-from stage.ply import read_ply
+from service.viewing.view_files import view
+from stage.formats.ply import read_ply
+from stage.results.depth_maps import DepthMaps
 from tests.reference.view import View
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from service.light.relight import relight
+from service.relight.relight import relight
 from service.requests.relight import RelightRequest
 from service.requests.view import ViewRequest
 from service.viewing import relighting
-from service.viewing.view import view
-from stage import exr
+from service.viewing.view_files import view
+from stage.formats import exr
 from tests.reference.relight import texel_directions, texel_solid_angles
 from tests.reference.view import View
 from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr

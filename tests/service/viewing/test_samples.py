@@ -8,11 +8,11 @@ import pytest
 from service.reporting.provenance import HASHING
 from service.requests.view import ViewRequest
 from service.viewing import samples
-from service.viewing.view import view
-from stage.camera import Camera
-from stage.capture import Capture
-from stage.ingest import LAYOUT
-from stage.maps import SurfaceMaps
+from service.viewing.view_files import view
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.results.maps import SurfaceMaps
+from stage.stack.ingest import LAYOUT
 from tests.reference import shading
 from tests.reference.view import View
 from tests.scenes import near_lights

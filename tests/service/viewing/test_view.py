@@ -8,9 +8,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-import service.viewing.view as viewing
+import service.viewing.view_files as viewing
 from service.requests.view import ViewRequest
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.reference.view import View
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.scenes.glossy import dome, write_dome, write_maps

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError, StorageError
 from stage.importers import diligent, lp
 from tests.scenes.captures import files_in, write_exr, write_image

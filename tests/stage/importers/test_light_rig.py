@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.errors import ManifestError
 from stage.importers import olat, relightlab
+from stage.importers.camera_options import View
 from stage.importers.light_rig import read_camera_matrix
-from stage.importers.view import View
 from tests.scenes.captures import files_in, write_image
 
 S = np.array([(-100.0, -80, 0), (100, -80, 10), (100, 80, 0), (-100, 80, 20.0)])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.errors import ManifestError
+from stage.importers.camera_options import WAYS, Selection
 from stage.importers.olat import import_folder
-from stage.importers.view import WAYS, Selection
 from tests.scenes.captures import files_in, write_image
 
 DIRECTIONS = np.array([(0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.48, -0.36, 0.8)])

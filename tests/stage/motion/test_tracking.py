@@ -2,7 +2,7 @@
 
 import pytest
 
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.errors import ManifestError
 from stage.motion.tracking import Interval, intervals, tracking_frames
 from tests.scenes.moving import Subject, write_moving

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from stage.camera import Camera
-from stage.capture import Capture
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
 from stage.errors import CalibrationError
-from stage.tof.frames import read_correlations, read_histograms
 from stage.tof.light_time import delay_s, range_of_delay_m, range_of_phase_m, toothed_wheel_speed_m_s
+from stage.tof.raw_frames import read_correlations, read_histograms
 from stage.tof.simulate import (
     CorrelationCamera,
     HistogramCamera,

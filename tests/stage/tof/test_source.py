@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from stage.camera import Camera
-from stage.capture import Capture
+from stage.capture.camera import Camera
+from stage.capture.capture import Capture
 from stage.errors import ManifestError
-from stage.tof.frames import read_source
+from stage.tof.raw_frames import read_source
 from stage.tof.source import SourcePath
 
 PERSPECTIVE = Camera(projection="perspective", resolution=(16, 12), focal_px=(14, 15))

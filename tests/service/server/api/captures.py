@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stage import exr
+from stage.formats import exr
 
 SIDE = 8
 LIGHTS = ((0, 0, 1), (0.6, 0, 0.8), (0, 0.6, 0.8), (-0.6, 0, 0.8))

@@ -6,13 +6,13 @@ import sys
 import time
 from pathlib import Path
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import RelightJob, SolveJob
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys, tables
 from service.server.database.engine import Database, connect
 from service.server.jobs.queue import JobQueue
-from service.server.settings import Settings
 from service.server.storage import layout
 from tests.service.server_process import Server
 

@@ -4,7 +4,7 @@ import time
 
 import httpx2
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from tests.service.server_process import Server
 
 ENDED = ("succeeded", "failed", "cancelled")

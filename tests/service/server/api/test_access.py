@@ -8,11 +8,11 @@ from typing import NamedTuple
 import httpx2
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, UPLOAD, new_id
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import intakes, keys
 from service.server.database.engine import Database, connect
-from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 

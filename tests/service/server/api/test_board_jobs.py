@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit

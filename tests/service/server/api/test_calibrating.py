@@ -25,6 +25,7 @@ from service.requests.calibrate import (
 )
 from tests.reference import tof
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
+from tests.service.calibrate.solvers import test_procam as boards
 from tests.service.calibrate.test_calibrate_tof import cw, sweep
 from tests.service.calibrate.test_laser_planes import boards as laser_boards
 from tests.service.calibrate.test_procam import write_view
@@ -32,7 +33,6 @@ from tests.service.depth.test_tof import pulsed_frames
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload
-from tests.stage.calibration import test_procam as boards
 
 LEVELS = np.linspace(0, 1, 5)
 BOARD = {"board": "9x6", "square_m": 0.03, "projector": "256x192"}

@@ -8,10 +8,10 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
+from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.service.server.api.test_watch import queue
 from tests.service.server_process import serving
 

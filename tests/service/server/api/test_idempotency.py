@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx2
 import pytest
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import idempotency, intakes, keys
 from service.server.database.engine import Database, connect
 from service.server.database.schema import upgrade
-from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 

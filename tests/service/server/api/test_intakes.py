@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, jobs
 from service.server.database.engine import connect

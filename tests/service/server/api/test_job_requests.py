@@ -6,7 +6,7 @@ import re
 import httpx2
 import pytest
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from service.server.database.engine import storable
 from tests.service.server.api.job_calls import NOBODY, finish, refused, submit
 

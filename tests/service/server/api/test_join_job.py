@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from stage.maps import SurfaceMaps
+from stage.results.maps import SurfaceMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import write_exr, write_manifest
 from tests.scenes.depth import BLACK_WHITE, CENTRE, NORMAL, RADIUS, entry_of, gray_patterns, make_scene, phase_patterns, write_patterns

@@ -13,10 +13,10 @@ from service.requests.keys import NewKey, Scope
 from service.server.api import json_body
 from service.server.api.app import create_app
 from service.server.api.json_body import MAX_DEPTH, MAX_FIELDS, parse
+from service.server.base.settings import Settings
 from service.server.database import keys
 from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings
 from tests.service.server.api.asgi import Call
 from tests.service.server_process import Server, serving
 

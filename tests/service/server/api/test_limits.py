@@ -11,9 +11,9 @@ from service.server.api import context, limits
 from service.server.api.app import create_app
 from service.server.api.limits import CREATION_COST, RateLimiter
 from service.server.api.problems import ApiError
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
-from service.server.settings import Settings
 from tests.service.server.api.asgi import Call
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from service.depth.projection import make_patterns
+from service.depth.patterns.projection import make_patterns
 from service.requests.patterns import PatternsRequest
 from tests.service.server.api.job_calls import finish, made_by, refused, submit
 

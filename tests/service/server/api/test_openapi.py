@@ -15,18 +15,18 @@ import pytest
 from pydantic import BaseModel, TypeAdapter
 
 from service import __version__
+from service.requests.base.identifiers import pattern
 from service.requests.depth import DepthRequest
-from service.requests.identifiers import pattern
 from service.requests.jobs import UserJob
+from service.requests.views.intakes import IntakeView
+from service.requests.views.jobs import JobView, ResultView
 from service.server.api.app import create_app
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority
 from service.server.api.problems import KINDS
+from service.server.base.settings import Settings
 from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings
-from service.views.intakes import IntakeView
-from service.views.jobs import JobView, ResultView
 from tests.service.server.api.fuzz import fuzz, seed
 from tests.service.server_process import serving
 

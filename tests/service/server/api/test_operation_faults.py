@@ -13,9 +13,9 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from service.server.base.settings import Settings
 from service.server.database import jobs, workers
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.test_operations import PATIENCE_S, until
 from tests.service.server_process import Server, serving

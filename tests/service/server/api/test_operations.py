@@ -10,11 +10,11 @@ import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.server import log
 from service.server.api.app import create_app
+from service.server.base import log
+from service.server.base.settings import Settings
 from service.server.database.engine import connect
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings
 
 PATIENCE_S = 60.0
 

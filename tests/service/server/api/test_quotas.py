@@ -3,9 +3,9 @@
 import pytest
 
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.service.server_process import serving
 
 TUS = {"Tus-Resumable": "1.0.0", "Upload-Metadata": "path YQ=="}

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from service.requests.jobs import SolveJob
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
 from service.server.api.results import Opened, _names, _part
+from service.server.base.settings import Settings
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare
-from service.server.settings import Settings
 from service.server.storage.folder import FolderStorage
 from stage.errors import StorageError
 from tests.service.server.api.asgi import Call

@@ -6,7 +6,7 @@ import numpy as np
 
 from service.calibrate.stereo import stereo
 from service.requests.calibrate import StereoRequest
-from stage.depth_maps import DepthMaps
+from stage.results.depth_maps import DepthMaps
 from tests.scenes import stereo as scenes
 from tests.scenes.stereo import OTHER, POSE, Plane
 from tests.service.calibrate.test_calibrate_stereo import write_board

@@ -16,7 +16,7 @@ from service.requests.keys import Scope
 from service.server.api import tokens
 from service.server.api.problems import ApiError
 from service.server.api.tokens import TokenReader
-from service.server.settings import Settings
+from service.server.base.settings import Settings
 from tests.service.server_process import serving
 
 GRANTS = "artists=larch:write,td=larch:admin,guests=willow:read"

@@ -10,8 +10,8 @@ import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
 
 from service.errors import RequestError
-from service.server import telemetry
-from service.server.settings import Settings
+from service.server.base import telemetry
+from service.server.base.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import serving
 

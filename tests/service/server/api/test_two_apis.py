@@ -8,9 +8,9 @@ from typing import NamedTuple
 import pytest
 
 from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys
 from service.server.database.engine import Database, connect
-from service.server.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server_process import Server, serving
 

@@ -12,15 +12,15 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from fastapi.testclient import TestClient
 
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.keys import NewKey, Scope
 from service.server.api import uploads as api_uploads
 from service.server.api.app import create_app
+from service.server.base.settings import Settings
 from service.server.database import keys, tables, uploads
 from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
 from service.server.database.schema import upgrade
-from service.server.settings import Settings
 from service.server.storage.part_files import PartFile, PartFileLocked
 from tests.service.server.api.test_uploads import at_once, begun, made, part, soon, stored
 from tests.service.server.api.tus import Tus, checksum, encoded

@@ -10,17 +10,17 @@ import pytest
 import sqlalchemy as sa
 from sqlalchemy.exc import OperationalError
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from service.requests.jobs import SolveJob
-from service.server import log
 from service.server.api import events, watch
 from service.server.api.app import create_app
 from service.server.api.problems import ApiError
 from service.server.api.watch import Change, Listener, Watcher
+from service.server.base import log
+from service.server.base.settings import Settings
 from service.server.database import jobs, tables
 from service.server.database.engine import Database, connect
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings
 from tests.service.server.api.asgi import Call
 
 PROJECT, OTHER = "larch", "birch"

@@ -5,11 +5,11 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
 from service.requests.keys import Scope
+from service.server.base.settings import Settings
 from service.server.database import audit
 from service.server.database.engine import connect
 from service.server.database.keys import DAY_S, Caller
 from service.server.database.schema import upgrade
-from service.server.settings import Settings
 
 CALLER = Caller("larch", Scope.WRITE, "key_0123456789abcdefghjk")
 

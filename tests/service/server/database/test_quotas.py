@@ -6,12 +6,12 @@ from contextlib import suppress
 import pytest
 
 from service.errors import RequestError
-from service.requests.identifiers import CAPTURE, UPLOAD, new_id
+from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
 from service.requests.jobs import CheckJob, SolveJob
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, quotas, tables, uploads
 from service.server.database.engine import Database, connect
 from service.server.database.schema import upgrade
-from service.server.settings import Settings
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -11,11 +11,11 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
+from service.server.base.settings import Settings
 from service.server.database import audit, intakes, jobs, keys, schema, tables, uploads
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import REVISIONS, is_current, require_current, upgrade
 from service.server.jobs.queue import prepare
-from service.server.settings import Settings
 
 OLDEST = Path(__file__).parent / "schema_0009.sql"
 CAPTURE, RECEIVING, UPLOAD = "cap_0123456789abcdefghjk", "cap_1123456789abcdefghjk", "upl_0123456789abcdefghjk"
@@ -95,7 +95,7 @@ def test_the_revisions_are_those_of_alembic_and_an_open_database_needs_none_of_i
         assert MigrationContext.configure(connection, opts={"version_table": REVISIONS}).get_current_revision() == script.get_current_head()
     assert len(list(script.walk_revisions())) == len(list(Path(script.versions).glob("*.py")))
     url = {} if settings.database_url is None else {"RELIT_DATABASE_URL": settings.database_url}
-    code = ("import sys; from service.server.settings import Settings; from service.server.database.engine import connect; "
+    code = ("import sys; from service.server.base.settings import Settings; from service.server.database.engine import connect; "
             "from service.server.database.schema import upgrade; upgrade(connect(Settings().sqlalchemy_url)); "
             "assert 'alembic' not in sys.modules")
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | url | {"RELIT_DATA": str(settings.data)})

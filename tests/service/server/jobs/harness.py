@@ -15,14 +15,14 @@ from typing import Any
 import sqlalchemy as sa
 from dbos import DBOSClient, WorkflowStatus
 
-from service.requests.base import JobRequest
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.base import JobRequest
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import ANY_JOB, RelightJob
 from service.requests.relight import RelightOptions
+from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare, workflow_id
-from service.server.settings import Settings
 from service.server.storage import layout
 
 PROJECT = "tests"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs, workers
 from tests.service.server.jobs.harness import PROJECT, digests, harness
 from tests.service.server_process import SABOTAGE

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import jobs
 from tests.service.server.jobs.harness import digests, harness
 

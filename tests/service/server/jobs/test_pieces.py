@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs.context import Job, WorkerContext

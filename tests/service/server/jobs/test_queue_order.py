@@ -3,7 +3,7 @@
 These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.queue_order writes.
 """
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import SolveJob
 from service.server.database import jobs
 from service.server.database.jobs import Claim

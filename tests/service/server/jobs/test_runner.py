@@ -4,7 +4,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from service import __version__
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim
 from service.server.jobs import runner as runner_module

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from service.reporting.provenance import places_named
-from service.requests.base import SequenceOptions
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.base import SequenceOptions
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import DepthJob, SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
 from service.sequences import one_step
 from service.sequences.run import solve_sequence
+from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import steps_of
-from service.server.settings import Settings
 from service.server.storage.objects import open_storage
 from stage.errors import ManifestError
 from tests.scenes.captures import files_in

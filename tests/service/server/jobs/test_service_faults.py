@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from service.server.base.settings import Settings
 from service.server.database import jobs, workers
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from tests.service.server.jobs.harness import WAIT_S, digests
 from tests.service.server.jobs.test_faults import fill, small_disk  # noqa: F401  (a fixture)
 from tests.service.server_process import Server, serving

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.identifiers import JOB, new_id
+from service.requests.base.identifiers import JOB, new_id
 from service.requests.jobs import FuseJob, RegisterJob
 from service.requests.register import FuseOptions, FuseRequest, RegisterRequest
 from service.scans.fuse import fuse
 from service.scans.register import register_scans
 from service.server.database import jobs
 from service.server.storage import layout
-from stage.depth_maps import DepthMaps
-from stage.scans.records import ScanEntry, ScanSet, read_scan_set, write_scan_set
+from stage.results.depth_maps import DepthMaps
+from stage.sets.scan_set import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from tests.scenes.turntable import View, figure
+from tests.service.scans.registration.test_registration import seen
 from tests.service.server.jobs.harness import PROJECT, Harness, harness
 from tests.service.server.jobs.test_sharing import WORKERS, begun, both_at_work, pieces_folder
 from tests.service.server_process import SABOTAGE
-from tests.stage.scans.test_registration import seen
 
 pytestmark = pytest.mark.long
 

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.requests.jobs import SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
 from service.server.database import jobs, workers
 from service.server.storage import layout
-from service.solve import batches
+from service.solve.sharing import batches
 from service.solve.solve import solve
-from stage import stack
+from stage.stack import stack
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import PROJECT, digests, harness, relit_relight
 from tests.service.server_process import SABOTAGE

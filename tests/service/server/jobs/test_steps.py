@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from service.errors import RequestError
-from service.requests.frame_range import numbered
-from service.requests.identifiers import CAPTURE, new_id
+from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob, SolveJob
+from service.requests.light.frame_range import numbered
 from service.requests.solve import SolveOptions
 from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
 from service.server.jobs.steps import _parts, steps_of
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
-from stage import exr
 from stage.errors import StageError
+from stage.formats import exr
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.server.jobs.harness import PROJECT
 
@@ -78,7 +78,7 @@ def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harnes
 
 
 def test_the_worker_decodes_no_image_of_a_capture(idle_harness, capture, monkeypatch):
-    from stage import images
+    from stage.formats import images
 
     step = step_of(idle_harness, capture, (capture.parent,))
     for name in ("recorded_of", "header_of"):

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
+from service.server.base.settings import Settings
 from service.server.jobs import supervisor
-from service.server.settings import Settings
 from tests.service.server.jobs import stand_ins
 
 PAUSES_S = (0.0, 0.01, 0.02)

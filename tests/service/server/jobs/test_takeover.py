@@ -5,7 +5,7 @@ import threading
 import pytest
 import sqlalchemy as sa
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.server.database import jobs
 from service.server.database.jobs import Claim, StageProgress
 from service.server.jobs.progress import JobProgress

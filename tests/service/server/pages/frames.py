@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stage import exr
-from stage.colour import rgb_matrix
+from stage.colour.colour import rgb_matrix
+from stage.formats import exr
 from tests.service.server.pages.conftest import Solved
 
 STEPS = 2 / 255

@@ -4,10 +4,10 @@ import copy
 
 import pytest
 
-from service.requests.base import Role
+from service.requests.base.base import Role
+from service.requests.base.options import build, options_of
 from service.requests.calibration_jobs import ProcamJob
 from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
-from service.requests.options import build, options_of
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, Form, form_of
 
 KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from service.client import Client
-from stage import exr
-from stage.colour import rgb_matrix
+from stage.colour.colour import rgb_matrix
+from stage.formats import exr
 from tests.scenes.captures import edit_manifest
 from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
 from tests.service.server.pages.frames import assert_same, encoded, picture, rendered

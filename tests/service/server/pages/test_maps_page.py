@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from stage.capture import Capture
-from stage.correction import Correction
-from stage.maps import SurfaceMaps
+from stage.capture.capture import Capture
+from stage.results.maps import SurfaceMaps
+from stage.stack.correction import Correction
 from tests.service.server.pages.conftest import SAMPLES
 
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from stage import exr
+from stage.formats import exr
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.pages.frames import pixels

@@ -3,12 +3,12 @@
 import os
 from pathlib import Path
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
+from service.server.base.settings import Settings
 from service.server.database.jobs import FRAMES
 from service.server.jobs import progress as progresses
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.steps import KEYS_FILE
-from service.server.settings import Settings
 from service.server.storage import layout, objects, scratch
 from service.server.storage.objects import SCRATCH
 from service.server.storage.part_files import part_files_folder

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from service.errors import RequestError
-from service.server.settings import Settings
+from service.server.base.settings import Settings
 from service.server.storage import bucket as buckets
 from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage

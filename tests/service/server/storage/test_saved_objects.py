@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from service.requests.identifiers import CAPTURE, ENVIRONMENT
-from service.server.backup import CONTENTS, backup, restore
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
+from service.server.base.settings import Settings
 from service.server.database import jobs
-from service.server.settings import Settings
+from service.server.process.backup import CONTENTS, backup, restore
 from service.server.storage import layout, saved_objects
 from service.server.storage.bucket import Bucket
 from stage.errors import StorageError

@@ -14,11 +14,11 @@ import httpx2
 import numpy as np
 import pytest
 
-from service.requests.identifiers import new_id
+from service.requests.base.identifiers import new_id
 from service.requests.jobs import SolveJob
+from service.server.base.settings import Settings
 from service.server.database import jobs, uploads
 from service.server.database.engine import connect
-from service.server.settings import Settings
 from service.server.storage import upload_parts
 from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts

@@ -58,8 +58,8 @@ if is_worker and "PIECES" in os.environ:
     import random
     from pathlib import Path
 
-    import service.solve.batches as batches
-    import stage.stack as stack
+    import service.solve.sharing.batches as batches
+    import stage.stack.stack as stack
     from service.server.jobs.pieces import JobPieces
 
     claim, together = JobPieces.claim, Path(os.environ["TOGETHER"])

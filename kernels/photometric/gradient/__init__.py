@@ -1,0 +1,1 @@
+"""Normals and reflectance from spherical gradient illumination."""

@@ -1,0 +1,111 @@
+"""Diffuse albedo per channel from solved normals and the weights that the fit gave each light (Woodham 1980)."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.device import once
+from kernels.errors import ArrayError
+from kernels.packs import Band, as_packs, pack_type, vector_at, zeros
+from kernels.photometric.lambertian.lambert import NormalFit
+from kernels.photometric.lambertian.near import NearLights, directions_in, falloff_or_none, toward_or_none
+from kernels.photometric.lambertian.readings import Lights, Readings
+
+
+def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, near_lights: NearLights | None = None) -> wp.array:
+    """Fit the diffuse albedo: weighted least squares of radiance = ρ/π · E · n·l in each channel.
+
+    Args:
+        weights: what the normal solver left in its readings: the weight of each light, 0…1.
+        fit: the normals.
+        lights: direction, irradiance and scale of each light.
+        near_lights: directions and falloff per pixel, in place of the lights' directions, where some light is near.
+
+    Returns:
+        [3, pixels padded] float32 albedo ρ, scene-linear; 0 where there is no normal.
+
+    Raises:
+        ArrayError: a channel that no light reaches, or lights other than the band's.
+    """
+    band.require_channels(3)
+    if len(lights.direction) != band.frame_count:
+        raise ArrayError(f"there are {len(lights.direction)} padded lights, the band has {band.frame_count}: give its lights")
+    dead = [name for name, lit in zip("RGB", lights.irradiance.any(axis=0), strict=True) if not lit]
+    if dead:
+        raise ArrayError(f"irradiance is 0 in channel {dead[0]} of every light: its albedo cannot be known")
+    device = band.device
+    albedo = zeros(band.pixel_count, wp.float32, device, rows=3)
+    # E in stored units: radiance / scale = ρ/π · (E / scale) · n·l
+    stored = np.divide(lights.irradiance, lights.scale[:, None], out=np.zeros_like(lights.irradiance),
+                       where=lights.scale[:, None] > 0)
+    devices.launch(_albedo_kernel(devices.pack_width(device), near_lights is not None), band.packs,
+                   [band.values, weights.values, toward_or_none(near_lights, device), falloff_or_none(near_lights, device),
+                    weights.pack_stride, weights.light_stride, as_packs(fit.normal, device),
+                    wp.array(lights.direction, dtype=wp.vec3, device=device), wp.array(stored, dtype=wp.vec3, device=device)],
+                   [albedo], device=device)
+    return albedo
+
+
+@wp.func
+def add_channel(value: float, irradiance: float, weight: float, cosine: float, above: wp.ref[float], below: wp.ref[float]):
+    """Add one light's reading to one channel's weighted least squares, Σ w E cos · value and Σ w (E cos)²."""
+    w = irradiance * weight * cosine
+    above += wp.where(w > 0.0, w * value, 0.0)  # a value that is not finite has weight 0, and their product is not a number
+    below += w * irradiance * cosine
+
+
+@wp.func
+def albedo_of(above: float, below: float) -> float:
+    """Return ρ from the sums, 0 where no light counts."""
+    return wp.where(below > 0.0, wp.pi * wp.max(above, 0.0) / below, 0.0)
+
+
+@once
+def _albedo_kernel(pack: int, near: bool = False) -> Any:
+    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    directions_of, step = directions_in(pack, near)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def albedo_kernel(first: int,
+                      values: wp.array2d(dtype=half_pack),  # [3 · L, P] stored radiance
+                      weights: wp.array(dtype=float_pack),  # [P · L]
+                      toward: wp.array2d(dtype=float_pack),  # [3, P · L] in place of directions, if near
+                      falloff: wp.array(dtype=float_pack),  # [P · L] irradiance here / irradiance of the light, if near
+                      pack_stride: int,
+                      light_stride: int,
+                      normal: wp.array2d(dtype=float_pack),  # [3, P]
+                      directions: wp.array(dtype=wp.vec3),  # [L]
+                      irradiance: wp.array(dtype=wp.vec3),  # [L] in stored units
+                      # outputs
+                      albedo: wp.array2d(dtype=float)):  # [3, N]
+        p = first + wp.tid()
+        nx, ny, nz = vector_at(normal, p)
+        above_r, above_g, above_b = float_pack(), float_pack(), float_pack()
+        below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
+        lights = directions.shape[0]
+        for light in range(lights):
+            red = values[light, p]
+            green = values[lights + light, p]
+            blue = values[2 * lights + light, p]
+            at = p * pack_stride + light * light_stride
+            weight = weights[at]
+            lx, ly, lz = directions_of(directions, toward, light, at)
+            if wp.static(near):
+                part = falloff[at]
+            er, eg, eb = irradiance[light][0], irradiance[light][1], irradiance[light][2]
+            for k in range(pack):
+                cosine = wp.max(nx[k] * lx[step * k] + ny[k] * ly[step * k] + nz[k] * lz[step * k], 0.0)
+                if wp.static(near):
+                    cosine = cosine * part[k]
+                add_channel(float(red[k]), er, weight[k], cosine, above_r[k], below_r[k])
+                add_channel(float(green[k]), eg, weight[k], cosine, above_g[k], below_g[k])
+                add_channel(float(blue[k]), eb, weight[k], cosine, above_b[k], below_b[k])
+        for k in range(pack):
+            pixel = p * pack + k
+            albedo[0, pixel] = albedo_of(above_r[k], below_r[k])
+            albedo[1, pixel] = albedo_of(above_g[k], below_g[k])
+            albedo[2, pixel] = albedo_of(above_b[k], below_b[k])
+
+    return albedo_kernel

@@ -1,0 +1,1 @@
+"""Diffuse and specular materials: fits, mixtures, and what pixels share."""

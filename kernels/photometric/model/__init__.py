@@ -1,0 +1,1 @@
+"""Reflectance models and the readings that they are compared with."""

@@ -1,0 +1,340 @@
+"""Readings of chosen pixels, gathered for solvers that take long for each pixel: pixels outside the mask cost nothing."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.device import once
+from kernels.errors import ArrayError
+from kernels.packs import Band, as_pixels, pack_type
+from kernels.photometric.lambertian.near import NearField, falloff, near_direction
+from kernels.photometric.lambertian.readings import LARGEST, Lights
+
+LANES_CUDA = 1
+"""Number of pixels of one thread on CUDA, which keeps the dozens of sums of a pixel in registers. On the CPU a thread takes a whole
+pack."""
+SHADOW_FRACTION = 0.1
+"""Fraction of the level of all readings below which a reading counts as shadow and is left out of the pixel's level."""
+
+
+class Samples(NamedTuple):
+    """Readings of chosen pixels; element (pack p, light l) of an array is at p · pack_stride + l · light_stride.
+
+    The last pack repeats its last pixel.
+    """
+
+    grey: wp.array  # [packs · lights] float packs: grey reading / level; below 0 where there is no reading
+    colour: wp.array  # [3, packs · lights] float packs: radiance / irradiance; below 0 where there is no reading
+    level: wp.array  # [packs] float packs: how bright the lit readings of the pixel are, grey
+    toward: wp.array  # [3, packs · lights] float packs: unit direction from the surface to the light
+    view: wp.array  # [3, packs] float packs: unit direction to the viewer
+    pixel_count: int
+    packs: int
+    light_count: int
+    lanes: int
+    pack_stride: int
+    light_stride: int
+    device: str
+
+    @property
+    def arrays(self) -> Any:
+        """These samples as kernels take them: an instance of `samples_type`."""
+        arrays = samples_type(self.lanes)()
+        for name in arrays._cls.vars:
+            setattr(arrays, name, getattr(self, name))
+        return arrays
+
+
+@once
+def samples_type(lanes: int) -> Any:
+    """Return the Warp struct of samples in packs of this width; its fields are those of `Samples`."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.struct
+    class PackedSamples:
+        grey: wp.array(dtype=lane_type)
+        colour: wp.array2d(dtype=lane_type)
+        level: wp.array(dtype=lane_type)
+        toward: wp.array2d(dtype=lane_type)
+        view: wp.array2d(dtype=lane_type)
+        light_count: int
+        pack_stride: int
+        light_stride: int
+
+    return PackedSamples
+
+
+@once
+def scratch_type(lanes: int) -> Any:
+    """Return the Warp struct of scratch memory: value v of light l of pack p is at p · pack_stride + l · light_stride + v · step."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.struct
+    class Scratch:
+        values: wp.array(dtype=lane_type)
+        pack_stride: int
+        light_stride: int
+        step: int
+
+    return Scratch
+
+
+def lanes_of(device: str) -> int:
+    """Return the number of pixels that one thread takes on this device."""
+    return devices.pack_width(device) if device == "cpu" else LANES_CUDA
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """Return indices at even steps from 0 to count - 1: all of them, or `most` where there are more.
+
+    Args:
+        count: one or more.
+        most: one or more.
+    """
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
+def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, factors: np.ndarray, light_count: int,
+           field: NearField | None = None) -> Samples:
+    """Gather the readings of some pixels of a band.
+
+    Args:
+        pixels: [n] int32 positions in the band, one or more.
+        view: [n, 3] unit directions from the surface to the viewer.
+        lights: irradiance and scale of each light.
+        factors: [lights, 3], of readings.grey_factors.
+        light_count: lights without padding.
+        field: places of the lights and the points of these pixels, in place of the lights' directions, where some light is near.
+
+    Returns:
+        The samples on the device.
+
+    Raises:
+        ArrayError: no pixel, positions outside the band, or a view or points for other pixels.
+    """
+    if len(pixels) == 0 or pixels.min() < 0 or pixels.max() >= band.pixel_count:
+        raise ArrayError(f"pixels must be one or more positions from 0 to {band.pixel_count - 1}")
+    if view.shape != (len(pixels), 3):
+        raise ArrayError(f"view is {view.shape}, expected {(len(pixels), 3)}")
+    if field is not None and (field.points.shape != (3, len(pixels)) or len(field.places.place) != len(lights.direction)):
+        raise ArrayError(f"points are {field.points.shape} under {len(field.places.place)} padded lights, expected "
+                         f"{(3, len(pixels))} under {len(lights.direction)}")
+    device, lanes = band.device, lanes_of(band.device)
+    packs = -(-len(pixels) // lanes)
+    last = len(pixels) - 1
+    order = np.minimum(np.arange(packs * lanes), last)
+    pack_stride, light_stride = (light_count, 1) if device == "cpu" else (1, packs)
+    lane_type = pack_type(lanes, wp.float32)
+    planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
+    samples = Samples(wp.empty(packs * light_count, dtype=lane_type, device=device),
+                      wp.empty((3, packs * light_count), dtype=lane_type, device=device),
+                      wp.empty(packs, dtype=lane_type, device=device), wp.empty((3, packs * light_count), dtype=lane_type, device=device),
+                      wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes, pack_stride, light_stride,
+                      device)
+    per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
+                            where=lights.irradiance > 0)
+    where = wp.array(pixels[order], dtype=wp.int32, device=device)
+    if field is None:
+        near = (wp.empty(0, dtype=wp.vec4, device=device),) * 2 + (wp.empty((3, 0), dtype=float, device=device),)
+    else:
+        near = (wp.array(field.places.place, dtype=wp.vec4, device=device), wp.array(field.places.lobe, dtype=wp.vec4, device=device),
+                wp.array(field.points[:, order], dtype=float, device=device))
+    devices.launch(_gather_kernel(lanes, field is not None), packs,
+                   [as_pixels(band.values), as_pixels(band.saturated), where, wp.array(factors, dtype=wp.vec3, device=device),
+                    wp.array(per_channel, dtype=wp.vec3, device=device), wp.array(lights.direction, dtype=wp.vec3, device=device),
+                    *near], [samples.arrays], device=device)
+    return samples
+
+
+def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
+    """Return [n, k] host values of the sampled pixels as [k, packs] packs on the device."""
+    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
+    planes = np.ascontiguousarray(values[order].astype(np.float32).T).reshape(values.shape[1], samples.packs, samples.lanes)
+    return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+
+
+def scratch_memory(samples: Samples, held: int) -> Any:
+    """Return memory for some values of each light and sampled pixel, as kernels take it: an instance of `scratch_type`.
+
+    Args:
+        samples: the readings beside which the values lie.
+        held: values for each light.
+    """
+    size = samples.light_count * held
+    scratch = scratch_type(samples.lanes)()
+    scratch.values = wp.empty(samples.packs * size, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    scratch.pack_stride, scratch.step = (size, 1) if samples.device == "cpu" else (1, samples.packs)
+    scratch.light_stride = held * scratch.step
+    return scratch
+
+
+def to_host(samples: Samples, packs: wp.array) -> np.ndarray:
+    """Return [k, packs] or [packs] packs as [n, k] or [n] host values; waits for the device."""
+    values = packs.numpy()
+    flat = values.reshape(*values.shape[:-2], -1) if values.ndim > 1 else values
+    flat = flat.reshape(-1, samples.packs * samples.lanes)[:, : samples.pixel_count]
+    return flat[0] if packs.ndim == 1 else flat.T
+
+
+def host_values(samples: Samples, packs: wp.array) -> np.ndarray:
+    """Return [packs · lights] packs on the device as [n, lights] host values; waits for the device."""
+    values = packs.numpy()
+    if samples.light_stride == 1:
+        flat = values.reshape(samples.packs, samples.light_count, samples.lanes).transpose(0, 2, 1)
+    else:
+        flat = values.reshape(samples.light_count, samples.packs, samples.lanes).transpose(1, 2, 0)
+    return flat.reshape(-1, samples.light_count)[: samples.pixel_count]
+
+
+def device_values(samples: Samples, values: np.ndarray) -> wp.array:
+    """Return [n, lights] host values as [packs · lights] packs on the device."""
+    order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
+    planes = values[order].astype(np.float32).reshape(samples.packs, samples.lanes, samples.light_count)
+    planes = planes.transpose(0, 2, 1) if samples.light_stride == 1 else planes.transpose(2, 0, 1)
+    return wp.array(np.ascontiguousarray(planes).reshape(-1, samples.lanes), dtype=samples.grey.dtype, device=samples.device)
+
+
+def readings_of(samples: Samples) -> np.ndarray:
+    """Return [n, lights] grey readings radiance over irradiance; below 0 where there is none; waits for the device."""
+    values, level = samples.grey.numpy().reshape(_planes(samples)), samples.level.numpy()
+    scaled = values * level[:, None] if samples.light_stride == 1 else values * level
+    pixels_last = scaled.transpose(1, 0, 2) if samples.light_stride == 1 else scaled
+    return pixels_last.reshape(samples.light_count, -1).T[: samples.pixel_count]
+
+
+def choose(samples: Samples, chosen: np.ndarray) -> Samples:
+    """Return the samples of some of the sampled pixels.
+
+    Args:
+        chosen: [n] bool, or positions among them; one or more.
+
+    Returns:
+        The samples on the same device. Waits for the device.
+    """
+    positions = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+    lanes, packs = samples.lanes, -(-len(positions) // samples.lanes)
+    order = positions[np.minimum(np.arange(packs * lanes), len(positions) - 1)]
+    by_pixel = samples.light_stride == 1  # [packs, lights, lanes]; else [lights, packs, lanes]
+    lane_type = pack_type(lanes, wp.float32)
+
+    def lit(values: np.ndarray) -> np.ndarray:
+        planes = values.reshape(_planes(samples))
+        if by_pixel:
+            picked = planes[order // lanes, :, order % lanes].reshape(packs, lanes, -1).transpose(0, 2, 1)
+        else:
+            picked = planes[:, order // lanes, order % lanes].reshape(-1, packs, lanes)
+        return picked.reshape(-1, lanes)
+
+    def upload(values: np.ndarray) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=lane_type, device=samples.device)
+
+    colour, toward = (upload(np.stack([lit(plane) for plane in planes.numpy()])) for planes in (samples.colour, samples.toward))
+    level = samples.level.numpy()[order // lanes, order % lanes].reshape(packs, lanes)
+    view = samples.view.numpy()[:, order // lanes, order % lanes].reshape(3, packs, lanes)
+    strides = (samples.light_count, 1) if by_pixel else (1, packs)
+    return Samples(upload(lit(samples.grey.numpy())), colour, upload(level), toward, upload(view), len(positions), packs,
+                   samples.light_count, lanes, *strides, samples.device)
+
+
+def _planes(samples: Samples) -> tuple[int, int, int]:
+    """Return the shape of readings on the host: packs, lights and lanes where the lights of a pack follow each other."""
+    lights, packs = samples.light_count, samples.packs
+    return (packs, lights, samples.lanes) if samples.light_stride == 1 else (lights, packs, samples.lanes)
+
+
+@once
+def _gather_kernel(lanes: int, near: bool = False) -> Any:
+    lane_type, samples_struct = pack_type(lanes, wp.float32), samples_type(lanes)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def gather_kernel(first: int,
+                      values: wp.array2d(dtype=wp.float16),  # [3 · L padded, N] stored radiance
+                      saturated: wp.array2d(dtype=wp.uint8),  # [L / 8, N] bits
+                      pixels: wp.array(dtype=wp.int32),  # [P · lanes]
+                      grey_factors: wp.array(dtype=wp.vec3),  # [L padded]
+                      channel_factors: wp.array(dtype=wp.vec3),  # [L padded]
+                      directions: wp.array(dtype=wp.vec3),  # [L padded]
+                      places: wp.array(dtype=wp.vec4),  # [L padded], if near in place of directions
+                      lobes: wp.array(dtype=wp.vec4),  # [L padded], if near
+                      points: wp.array2d(dtype=float),  # [3, P · lanes], if near
+                      # outputs
+                      samples: samples_struct):  # its view is given
+        p = first + wp.tid()
+        padded = grey_factors.shape[0]
+        root, given = lane_type(), lane_type()
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
+            f, g, way = grey_factors[light], channel_factors[light], directions[light]
+            inverse = lane_type()  # 1 / falloff
+            if wp.static(near):
+                place = places[light]
+                tx, ty, tz = lane_type(), lane_type(), lane_type()
+                for k in range(lanes):
+                    m = p * lanes + k
+                    near_way = near_direction(place, points[0, m], points[1, m], points[2, m])
+                    tx[k] = near_way[0]
+                    ty[k] = near_way[1]
+                    tz[k] = near_way[2]
+                    fall = falloff(place, lobes[light], points[0, m], points[1, m], points[2, m])
+                    inverse[k] = wp.where(fall > 0.0, 1.0 / wp.max(fall, 1.0e-30), 0.0)
+                samples.toward[0, at] = tx
+                samples.toward[1, at] = ty
+                samples.toward[2, at] = tz
+            else:
+                for c in range(3):
+                    same = lane_type()
+                    for k in range(lanes):
+                        same[k] = way[c]
+                    samples.toward[c, at] = same
+            y, red, green, blue = lane_type(), lane_type(), lane_type(), lane_type()
+            for k in range(lanes):
+                n = pixels[p * lanes + k]
+                r = float(values[light, n])
+                gr = float(values[padded + light, n])
+                b = float(values[2 * padded + light, n])
+                if wp.static(near):
+                    r = r * inverse[k]
+                    gr = gr * inverse[k]
+                    b = b * inverse[k]
+                sound = wp.where((int(saturated[light / 8, n]) >> (light % 8)) & 1 == 0, 1, 0)
+                value = f[0] * r + f[1] * gr + f[2] * b
+                sound = wp.where(value < LARGEST, sound, 0)  # 0 also for NaN
+                if wp.static(near):
+                    sound = wp.where(inverse[k] > 0.0, sound, 0)
+                y[k] = wp.where(sound == 1, wp.max(value, 0.0), -1.0)
+                red[k] = wp.where(sound == 1, wp.max(g[0] * r, 0.0), -1.0)
+                green[k] = wp.where(sound == 1, wp.max(g[1] * gr, 0.0), -1.0)
+                blue[k] = wp.where(sound == 1, wp.max(g[2] * b, 0.0), -1.0)
+                root[k] += wp.where(value > 0.0, wp.sqrt(wp.max(y[k], 0.0)), 0.0)
+                given[k] += wp.where(y[k] > 0.0, 1.0, 0.0)
+            samples.grey[at] = y
+            samples.colour[0, at] = red
+            samples.colour[1, at] = green
+            samples.colour[2, at] = blue
+        # the level: mean root of the lit readings, squared; highlights hardly move it
+        first_level, lit_root, lit = lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            mean = root[k] / wp.max(given[k], 1.0)
+            first_level[k] = mean * mean
+        for light in range(samples.light_count):
+            y = samples.grey[p * samples.pack_stride + light * samples.light_stride]
+            for k in range(lanes):
+                shines = wp.where(y[k] > SHADOW_FRACTION * first_level[k], 1.0, 0.0)
+                lit[k] += shines
+                lit_root[k] += shines * wp.sqrt(wp.max(y[k], 0.0))
+        scale = lane_type()
+        for k in range(lanes):
+            mean = lit_root[k] / wp.max(lit[k], 1.0)
+            scale[k] = wp.max(mean * mean, 1.0e-20)
+        samples.level[p] = scale
+        for light in range(samples.light_count):
+            at = p * samples.pack_stride + light * samples.light_stride
+            y = samples.grey[at]
+            relative = lane_type()
+            for k in range(lanes):
+                relative[k] = wp.where(y[k] >= 0.0, y[k] / scale[k], -1.0)
+            samples.grey[at] = relative
+
+    return gather_kernel

@@ -1,0 +1,1 @@
+"""Normals from a reference object: posteriors over directions."""

@@ -1,0 +1,1 @@
+"""The search of normals by hypotheses, and how certain its results are."""

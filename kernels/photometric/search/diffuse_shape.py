@@ -1,0 +1,89 @@
+"""The shape of the diffuse lobe that the pixels of an object share, chosen by how well the object is explained as a whole.
+
+Real diffuse reflection is darker than Lambert's at grazing angles on smooth plastics and brighter on rough ceramics. A pixel alone
+cannot tell that shape from a tilt of its normal; all pixels together can: the shape with the least total cost of the
+hypothesis search is also the one with the least error of the normals (docs/figures.md).
+
+Source: the lobe is Burley's, "Physically-based shading at Disney", 2012, section 5.3; choosing its shape by cost is ours.
+"""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.photometric.model.samples import Samples
+from kernels.photometric.search.descent import Schedule, descend
+from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.normal_search import find_normals
+from kernels.photometric.search.survey import QUICK
+
+ROUGHNESSES = (-1.0, 0.05, 0.2, 0.35, 0.5, 0.65, 0.8)
+"""Roughnesses of Burley's lobe that are tried; the value below 0 stands for Lambert's lobe."""
+SLOPES = (-0.3, -0.2, -0.1, 0.0, 0.1)
+"""Slopes of the lobe's further factor that are tried."""
+REFINEMENT = 0.5
+"""Step of the second search, about the best shape of the first, as a fraction of the first search's step."""
+FROM_LAMBERT = Schedule(softened=0, judged=7)
+"""Descent from the normal and weights found under Lambert's lobe: another shape moves normals by a few degrees."""
+SIMPLER = 1.01
+"""Factor on the least cost up to which Lambert's lobe, with a slope or without, is kept."""
+TEMPERATURE = 0.07
+"""Softmax temperature of the average over shapes, relative to the least cost. Costs a few per cent apart do not tell shapes apart: with the
+shape of least cost alone, the normals of a real ball are 0.07 degrees worse."""
+
+
+class Shapes(NamedTuple):
+    """The shape of the diffuse lobe of an object."""
+
+    best: Diffuse
+    """The shape of least cost, under which materials are fitted."""
+    mean: Diffuse
+    """The mean of the shapes that cost little, under which normals are found: a wrong shape bends them, and the mean errs less."""
+    tried: np.ndarray  # [shapes, 3] float64: roughness, slope, mean cost of each
+
+
+def choose_diffuse(samples: Samples, start: np.ndarray) -> Shapes:
+    """Choose the shape of the diffuse lobe from sampled pixels.
+
+    Args:
+        samples: some hundreds of pixels, spread over the object.
+        start: [n, 3] unit normals to begin from.
+
+    Returns:
+        The shapes. Waits for the device.
+    """
+    lambert = find_normals(samples, start, shape=Diffuse(), sweep=QUICK).best
+    tried: dict[Diffuse, float] = {}
+
+    def judge(rough: float, slope: float) -> None:
+        shape = Diffuse(rough=round(rough, 4), slope=round(slope, 4))
+        if shape not in tried:
+            found = descend(samples, lambert.normal, shape=shape, weights=lambert.weights, schedule=FROM_LAMBERT)
+            tried[shape] = float(np.mean(found.cost, dtype=np.float64))
+
+    for rough, slope in itertools.product(ROUGHNESSES, SLOPES):
+        judge(rough, slope)
+    best = _best(tried)
+    rough_step, slope_step = ROUGHNESSES[2] - ROUGHNESSES[1], SLOPES[1] - SLOPES[0]
+    for across, along in itertools.product((-1, 0, 1), repeat=2):
+        rough = best.rough if best.rough < 0 else float(np.clip(best.rough + across * REFINEMENT * rough_step, 0, 1))
+        judge(rough, best.slope + along * REFINEMENT * slope_step)
+    best = _best(tried)
+    return Shapes(best, _average(tried, best), np.array([(shape.rough, shape.slope, value) for shape, value in tried.items()]))
+
+
+def _best(tried: dict[Diffuse, float]) -> Diffuse:
+    """Return the shape of least cost, or the best slope of Lambert's lobe where that costs hardly more."""
+    best = min(tried, key=tried.__getitem__)
+    lambert = min((shape for shape in tried if shape.rough < 0), key=tried.__getitem__)
+    return lambert if tried[lambert] <= SIMPLER * tried[best] else best
+
+
+def _average(tried: dict[Diffuse, float], best: Diffuse) -> Diffuse:
+    """Return the mean of the shapes of the best one's lobe, Lambert's or Burley's, each weighted by how little it costs."""
+    alike = np.array([(shape.rough, shape.slope, cost) for shape, cost in tried.items() if (shape.rough < 0) == (best.rough < 0)])
+    least = alike[:, 2].min()
+    weights = np.exp(-(alike[:, 2] - least) / max(TEMPERATURE * least, 1e-12))
+    rough, slope = weights @ alike[:, :2] / weights.sum()
+    return Diffuse(rough=round(float(rough), 4), slope=round(float(slope), 4))

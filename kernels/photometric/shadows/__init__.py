@@ -1,0 +1,1 @@
+"""Cast shadows, bounced light, and the parts of light sources that a pixel sees."""

@@ -1,0 +1,1 @@
+"""Few coefficient images that stand for a capture."""

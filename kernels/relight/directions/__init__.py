@@ -1,0 +1,1 @@
+"""Directions on the sphere: lat-long maps, grids and triangulations."""

@@ -1,0 +1,1 @@
+"""Weighted sums of captured images: one frame, many frames, near lights."""

@@ -1,0 +1,1 @@
+"""The reflectance model of solved maps under lights."""

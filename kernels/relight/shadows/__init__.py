@@ -1,0 +1,1 @@
+"""Horizons and occlusion of a height field."""

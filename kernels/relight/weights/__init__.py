@@ -1,0 +1,1 @@
+"""Weights of captured lights that stand for an environment."""

@@ -1,0 +1,1 @@
+"""Continuous-wave time of flight: phases, unwrapping, noise and filters."""

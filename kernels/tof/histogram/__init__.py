@@ -1,0 +1,1 @@
+"""Pulsed time of flight: photon histograms, returns and pile-up."""

@@ -1,0 +1,127 @@
+"""The shape of the pulse, estimated from the histograms: the one under which the brightest of them are most likely."""
+
+from collections.abc import Callable
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.errors import ArrayError
+from kernels.tof.histogram.pileup import LiveCounts
+from kernels.tof.histogram.pulse import Pulse, gaussian, with_tail
+from kernels.tof.histogram.returns import find_returns, threshold
+
+WIDTHS = np.geomspace(0.25, 4.0, 13)
+"""Standard deviations, in bins, of the Gaussian pulses that are tried."""
+WIDTH_PIXELS = 512
+"""Number of brightest pixels that decide on the width."""
+WIDTH_WINDOW = 8
+"""Number of neighbouring bins whose photons rank a pixel: the highest bin alone would prefer histograms that are narrow by chance."""
+WIDTH_RETURNS = 3
+"""Most returns fitted per pixel in the width search; each extra one is penalised, because narrow pulses could imitate any shape."""
+TAIL_PIXELS = 128
+"""Number of brightest pixels that decide on the tail."""
+TAIL_PARTS, TAIL_TIMES = (0.2, 0.5, 1.0), (1.0, 2.5, 6.0)
+"""Tails that are tried first: parts of the photons, and decay times in standard deviations of the best Gaussian, whose width then shrinks
+to CORE of it."""
+CORE = 0.75
+TAIL_GAIN = 12.0
+"""Log likelihood that a tail must add: two more numbers fitted to a thousand photons or so deserve 7 (Schwarz 1978)."""
+TAIL_SPAN = 0.5
+"""Longest pulse with a tail, as a part of the histogram: what is longer cannot be told from background."""
+TAIL_ROUNDS, TAIL_STEP = 7, 1.35
+"""Rounds of the search that multiplies or divides width, decay time and part, and its first factor, whose root the next round takes."""
+
+LEAST_SIGMA = 1e-6
+"""Least standard deviation of a return's time that enters the cost, in bins: float32 resolves no smaller one."""
+
+
+class PulseShape(NamedTuple):
+    """A pulse and the numbers that describe it."""
+
+    pulse: Pulse
+    sigma: float  # bins: of the Gaussian
+    tail: float  # bins: decay time of the delayed photons, 0 without a tail
+    part: float  # of the photons that are delayed
+
+
+def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
+    """Return the pulse under which the brightest histograms are likeliest: Gaussian, or with an exponential tail where that explains them
+    better; waits for the device.
+
+    Args:
+        histograms: of all pixels.
+        counts: [pixel, bin] the same as recorded, to pick the brightest.
+
+    Raises:
+        ArrayError: none of them shows a return.
+
+    Convention:
+        The time of each return counts with all its values, not the best alone (its posterior is about √(2π)·σ wide): a time fitted to n
+        photons takes one of their n deviations away, and the pulse would come out too narrow by half a part in n.
+
+    Source:
+        Neyman, Scott, "Consistent estimates based on partially consistent observations", Econometrica 16(1), 1948.
+    """
+    chosen = brightest(counts)[:WIDTH_PIXELS]
+    some = subset(histograms, chosen)
+    totals = [_evidence(some, gaussian(float(width))) for width in WIDTHS]
+    best = int(np.argmax(totals))
+    if not np.isfinite(totals[best]):
+        raise ArrayError("no histogram shows a return: the width of the pulse cannot be told from them")
+    place = 0.0
+    if 0 < best < len(WIDTHS) - 1 and np.isfinite(totals[best - 1]) and np.isfinite(totals[best + 1]):
+        before, here, after = totals[best - 1 : best + 2]
+        place = 0.5 * (before - after) / (before - 2 * here + after)  # of the parabola through the three
+    sigma = float(WIDTHS[best] * (WIDTHS[1] / WIDTHS[0]) ** place)
+    few = subset(histograms, chosen[:TAIL_PIXELS])
+    return _tailed(lambda pulse: _evidence(few, pulse), sigma, longest=TAIL_SPAN * counts.shape[1])
+
+
+def brightest(counts: np.ndarray) -> np.ndarray:
+    """Return the pixels from that with the strongest return on, [pixel]; `counts` is [pixel, bin]."""
+    total = np.cumsum(counts, axis=1, dtype=np.float64)
+    window = min(WIDTH_WINDOW, counts.shape[1] - 1)
+    peak = (total[:, window:] - total[:, :-window]).max(axis=1) - window * np.median(counts, axis=1)
+    return np.argsort(-peak, kind="stable")
+
+
+def subset(histograms: LiveCounts, pixels: np.ndarray) -> LiveCounts:
+    """Return the histograms of these pixels."""
+    device = str(histograms.counts.device)
+    return LiveCounts(*(wp.array(array.numpy()[:, pixels], dtype=wp.float32, device=device)
+                        for array in (histograms.counts, histograms.live)), histograms.pulses)
+
+
+def _evidence(some: LiveCounts, pulse: Pulse) -> float:
+    """Return the log likelihood of histograms under a pulse, less the price of their returns; -inf where there is none."""
+    found = find_returns(some, pulse, most=WIDTH_RETURNS)
+    sigma = found.sigma.numpy()[found.photons.numpy() > 0].astype(np.float64)
+    cost = len(sigma) * 0.5 * threshold(some.counts.shape[0]) - np.log((2 * np.pi) ** 0.5 * np.maximum(sigma, LEAST_SIGMA)).sum()
+    return float(found.likelihood.numpy().sum(dtype=np.float64) - cost) if len(sigma) else -np.inf
+
+
+def _tailed(evidence: Callable[[Pulse], float], sigma: float, *, longest: float) -> PulseShape:
+    """Return the pulse with the best tail, or the Gaussian of `sigma` where no tail is worth it; `longest` in bins."""
+    plain = PulseShape(gaussian(sigma), sigma, 0.0, 0.0)
+
+    def tried(core: float, tail: float, part: float) -> tuple[float, tuple[float, float, float]]:
+        pulse = with_tail(core, tail, min(part, 1.0))
+        return (evidence(pulse) if pulse.end - pulse.begin < longest else -np.inf), (core, tail, min(part, 1.0))
+
+    found, best = max((tried(CORE * sigma, ratio * sigma, part) for ratio, part in product(TAIL_TIMES, TAIL_PARTS)),
+                      key=lambda result: result[0])
+    least = evidence(plain.pulse) + TAIL_GAIN
+    if found < least:
+        return plain
+    factor = TAIL_STEP
+    for _ in range(TAIL_ROUNDS):
+        for index in range(3):
+            for change in (factor, 1 / factor):
+                value, numbers = tried(*(number * change if index == k else number for k, number in enumerate(best)))
+                if value > found:
+                    found, best = value, numbers
+                    break
+        factor = factor**0.5
+    return PulseShape(with_tail(*best), *best)

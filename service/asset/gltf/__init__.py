@@ -1,0 +1,1 @@
+"""Assets as binary glTF."""

@@ -1,0 +1,110 @@
+"""Inspection of a .glb file for relit inspect: what it holds, and what reaches beyond the file; the validator of Khronos looks deeper.
+
+Source: glTF 2.0 Specification, 3.6 "Binary Data Storage", 4.4 "Binary glTF Layout".
+"""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from pygltflib import GLTF2, POINTS, TRIANGLES
+
+from service.asset.content.inspection import Inspection, Part, image_facts
+from service.asset.gltf.container import COMPONENT_BYTES, ELEMENT_SIZES, GlbContents, read_glb
+from service.errors import AssetError
+from stage.errors import storage
+
+
+def inspect_glb(path: Path) -> Inspection:
+    """Read what a .glb file holds.
+
+    Raises:
+        AssetError: it is not a .glb file, or a damaged one.
+        StorageError: it cannot be read.
+    """
+    with storage("read", path):
+        contents = read_glb(path)
+        try:
+            return _inspect(path, contents)
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
+            raise AssetError(f"{path}: is damaged: its document refers to what it does not hold ({error})") from error
+
+
+def _inspect(path: Path, contents: GlbContents) -> Inspection:
+    document = contents.document
+    roots = [document.nodes[number] for scene in document.scenes[:1] for number in scene.nodes or ()]
+    info = {"generator": document.asset.generator, "glTF": document.asset.version, **(document.asset.extras or {})}
+    facts = {"asset_info": {key: str(value) for key, value in info.items() if value}, "extensions": list(document.extensionsUsed or ())}
+    provenance = {key: str(value) for root in roots for key, value in (root.extras or {}).items()}
+    lenses = [(camera.name or "camera", camera.orthographic, camera.perspective) for camera in document.cameras]
+    parts = [*_primitives(document), *_materials(path, contents), *(
+        Part("camera", name, "", {"orthographic_m": [2 * flat.xmag, 2 * flat.ymag]} if flat else {"degrees_high": math.degrees(lens.yfov)})
+        for name, flat, lens in lenses)]
+    beside = [path.parent / unquote(each.uri) for each in (*document.buffers, *document.images)
+              if each.uri and not each.uri.startswith("data:")]
+    warnings = [f"the asset needs {file}, which lies outside of it" for file in beside]
+    errors = [f"{file} is not there, and the document refers to it" for file in beside if not file.is_file()]
+    size = path.stat().st_size + sum(file.stat().st_size for file in beside if file.is_file())
+    return Inspection(str(path), size, facts, tuple(parts), provenance, tuple(warnings),
+                      (*contents.faults, *errors, *_faults(contents)))
+
+
+def _primitives(document: GLTF2) -> Iterator[Part]:
+    for number, mesh in enumerate(document.meshes):
+        for primitive in mesh.primitives:
+            attributes = {name: index for name, index in vars(primitive.attributes).items() if index is not None}
+            places = document.accessors[attributes["POSITION"]]
+            corners = places.count if primitive.indices is None else document.accessors[primitive.indices].count
+            faces = {"faces": corners // 3} if primitive.mode in (None, TRIANGLES) else {"mode": primitive.mode}
+            material = None if primitive.material is None else document.materials[primitive.material].name
+            yield Part("points" if primitive.mode == POINTS else "mesh", mesh.name or f"mesh {number}", "", {
+                "vertices": places.count, **faces, "low": places.min, "high": places.max, "material": material,
+                "attributes": list(attributes)})
+
+
+def _materials(path: Path, contents: GlbContents) -> Iterator[Part]:
+    """Yield each material with its factors and those of its extensions, and the image of each of its inputs."""
+    document = contents.document
+    for number, material in enumerate(document.materials):
+        inputs = {name: value for holder in (material.pbrMetallicRoughness, material) if holder for name, value in vars(holder).items()}
+        for extension, fields in (material.extensions or {}).items():
+            inputs |= {f"{extension}.{name}": value for name, value in fields.items()} or {extension: True}
+        name = inputs.pop("name") or f"material {number}"
+        yield Part("material", name, "", {key: value for key, value in inputs.items() if isinstance(value, int | float | str | list)})
+        for key, value in inputs.items():
+            if key.endswith("Texture") and value is not None:
+                source = document.textures[value["index"] if isinstance(value, dict) else value.index].source
+                yield from () if source is None else [Part("texture", f"{name} {key}", "", _image(path, contents, source))]
+
+
+def _image(path: Path, contents: GlbContents, number: int) -> dict[str, Any]:
+    """Return the facts of an image within the file, or the name of one beside it."""
+    image = contents.document.images[number]
+    name, kind = image.name or image.uri or f"image {number}", (image.mimeType or "").rpartition("/")[2]
+    if image.bufferView is None:
+        return {"file": name}
+    view = contents.document.bufferViews[image.bufferView]
+    with open(path, "rb") as stream:
+        stream.seek(contents.data_start + (view.byteOffset or 0))
+        return {"file": name, **image_facts(stream.read(min(view.byteLength, contents.data_size)), f"{name}.{kind}")}
+
+
+def _faults(contents: GlbContents) -> Iterator[str]:
+    """Yield what reaches beyond its container."""
+    document = contents.document
+    children = [child for node in document.nodes for child in node.children or ()]
+    for kind, used, there in (("node", children, document.nodes), ("mesh", [node.mesh for node in document.nodes], document.meshes)):
+        yield from (f"the nodes refer to {kind} {each}, which is not there" for each in used if each is not None and each >= len(there))
+    if len(set(children)) < len(children) or any(root in children for scene in document.scenes for root in scene.nodes or ()):
+        yield "the nodes are no tree: one has several parents, or a root has one"
+    for number, view in enumerate(document.bufferViews):
+        if view.buffer == 0 and (view.byteOffset or 0) + view.byteLength > contents.data_size:
+            yield f"bufferView {number} reaches beyond the {contents.data_size} bytes of the buffer"
+    for number, accessor in enumerate(document.accessors):
+        if accessor.bufferView is not None:
+            element = COMPONENT_BYTES[accessor.componentType] * ELEMENT_SIZES[accessor.type]
+            stride = document.bufferViews[accessor.bufferView].byteStride or element
+            if (accessor.byteOffset or 0) + stride * (accessor.count - 1) + element > document.bufferViews[accessor.bufferView].byteLength:
+                yield f"accessor {number} reaches beyond its bufferView"

@@ -1,0 +1,121 @@
+"""Whether the regions of a design are within their tolerances, decided by σ (ISO 14253-1)."""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from service.boards.stitching.comparison import Deviation
+from service.boards.stitching.grid import BoardGrid
+from service.boards.stitching.significance import mean_of, threshold
+from stage.sets.board import Region
+
+
+class Verdict(StrEnum):
+    """What was decided about a region or a board."""
+
+    PASS = "pass"
+    """Within the tolerance, by more than the uncertainty."""
+    FAIL = "fail"
+    """Outside of the tolerance, by more than the uncertainty."""
+    UNDECIDED = "undecided"
+    """So near to a limit that the uncertainty does not tell."""
+    NOT_INSPECTED = "not inspected"
+    """Too few of its pixels are measured."""
+
+
+class RegionResult(NamedTuple):
+    """What was found about a region."""
+
+    region: Region
+    verdict: Verdict
+    deviation_m: float | None
+    sigma_m: float | None
+    pixels: int
+    """Pixels of the grid that lie within the region."""
+    measured: int
+    """How many of these have a deviation."""
+
+
+def pixels_of(region: Region, grid: BoardGrid, *, grow: float = 0.0) -> tuple[tuple[slice, slice], np.ndarray]:
+    """Return the rows and columns around a region, and within them the pixels whose centres it holds.
+
+    Args:
+        region: where.
+        grid: of the pixels.
+        grow: by how much of its size the region is made larger.
+    """
+    (x, y), (width, height) = region.centre_m, (size * (1 + grow) for size in region.size_m)
+    top, left = grid.place(np.array(x - width / 2), np.array(y + height / 2))
+    bottom, right = grid.place(np.array(x + width / 2), np.array(y - height / 2))
+    rows = slice(int(np.clip(np.ceil(top), 0, grid.rows)), int(np.clip(np.floor(bottom) + 1, 0, grid.rows)))
+    cols = slice(int(np.clip(np.ceil(left), 0, grid.cols)), int(np.clip(np.floor(right) + 1, 0, grid.cols)))
+    row, col = np.mgrid[rows, cols]
+    px, py = grid.coordinates(row, col)
+    if region.shape == "circle":
+        return (rows, cols), ((px - x) / width) ** 2 + ((py - y) / height) ** 2 <= 0.25
+    return (rows, cols), np.ones(px.shape, dtype=bool)
+
+
+def tolerances_over(grid: BoardGrid, regions: Sequence[Region], *, elsewhere_m: float) -> np.ndarray:
+    """Return the deviation that is no defect at each pixel, [rows, cols] metres: `elsewhere_m`, or the wider limit of a region."""
+    out = np.full((grid.rows, grid.cols), elsewhere_m)
+    for region in regions:
+        where, inside = pixels_of(region, grid)
+        wide = max(abs(limit) for limit in region.tolerance_m)
+        out[where] = np.where(inside, np.maximum(out[where], wide), out[where])
+    return out
+
+
+def check_regions(deviation: Deviation, regions: Sequence[Region], *, false_alarm: float) -> tuple[list[RegionResult], float]:
+    """Decide about every region.
+
+    With k the threshold of as many one-sided tests as there are limits, a region fails if its mean deviation is more than k σ outside of
+    a limit, and passes if it is more than k σ inside of both. So the probability that any region of a good board fails, and the
+    probability that any region outside its tolerance passes, are both at most `false_alarm`.
+
+    Args:
+        deviation: of the board from its design.
+        regions: of the design.
+        false_alarm: above 0 and below 1.
+
+    Returns:
+        A result for each region, and k.
+    """
+    k = threshold(false_alarm, 2 * len(regions), sides=1)
+    taken = np.zeros((deviation.grid.rows, deviation.grid.cols), dtype=bool)
+    for region in regions:
+        where, inside = pixels_of(region, deviation.grid)
+        taken[where] |= inside
+    return [_decide(deviation, region, taken, k) for region in regions], k
+
+
+def _decide(deviation: Deviation, region: Region, taken: np.ndarray, k: float) -> RegionResult:
+    where, inside = pixels_of(region, deviation.grid)
+    part = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
+    mean, count = mean_of(part, inside), int(inside.sum())
+    if mean is None or mean.pixels < region.least_inspected * expected_pixels(region, deviation.grid):
+        return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, 0 if mean is None else mean.pixels)
+    value, sigma = mean.value, mean.sigma
+    if region.datum == "surround":
+        around, ring = pixels_of(region, deviation.grid, grow=1.0)
+        whole = Deviation(deviation.grid, deviation.height[around], deviation.variance[around], deviation.systematic[around])
+        datum = mean_of(whole, ring & ~taken[around])
+        if datum is None or datum.pixels < region.least_inspected * max(int((ring & ~taken[around]).sum()), 1):
+            return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, mean.pixels)
+        value, sigma = value - datum.value, float(np.hypot(sigma, datum.sigma))
+    low, high = region.tolerance_m
+    if value < low - k * sigma or value > high + k * sigma:
+        verdict = Verdict.FAIL
+    elif low + k * sigma <= value <= high - k * sigma:
+        verdict = Verdict.PASS
+    else:
+        verdict = Verdict.UNDECIDED
+    return RegionResult(region, verdict, value, sigma, count, mean.pixels)
+
+
+def expected_pixels(region: Region, grid: BoardGrid) -> float:
+    """Return how many pixels a region has where the grid has no border."""
+    width, height = region.size_m
+    return max(width * height * (np.pi / 4 if region.shape == "circle" else 1.0) / grid.pixel_m**2 * 0.9, 1.0)

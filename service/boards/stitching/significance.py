@@ -1,0 +1,167 @@
+"""Which deviations are significant: means over windows and regions against their standard deviation, with a stated false-alarm probability.
+
+The mean over a set of pixels with weights w = 1 / (noise² + shared²) has the variance (Σ w² noise² + (Σ w shared)²) / (Σ w)²: noise
+averages out, the errors that neighbours share do not. With M tests on a board, each has the false-alarm probability P / M (Bonferroni's
+bound; windows overlap, so that the probability of any false alarm on a board is below P, Gaussian errors given).
+
+Windows are squares of the smallest defect's side, twice that, and so on, at every place (a multi-scale scan statistic: Glaz, Naus,
+Wallenstein, "Scan Statistics", 2001). A deviation counts at most CLIP σ beyond the tolerance, so that a spike of one pixel is no defect.
+"""
+
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from service.boards.stitching.comparison import Deviation
+
+CLIP = 6.0
+LEAST_MEASURED = 0.5
+"""The least part of a window that must be measured."""
+DOUBLINGS = 5
+"""Sizes of windows, each twice the one before."""
+POWER = NormalDist().inv_cdf(0.95)
+"""σ above the threshold at which a defect is found with a probability of 95 %."""
+
+
+class Mean(NamedTuple):
+    """The weighted mean of some pixels."""
+
+    value: float
+    """Metres."""
+    sigma: float
+    """Metres."""
+    pixels: int
+
+
+class Scan(NamedTuple):
+    """What the windows found."""
+
+    significant: np.ndarray  # [rows, cols] bool: pixels of significant windows
+    mean: np.ndarray  # [rows, cols] deviation in the smallest window around each pixel, metres; NaN where too little is measured
+    mean_sigma: np.ndarray  # [rows, cols] its standard deviation, metres
+    findable: np.ndarray  # [rows, cols] deviation that is found in that window with a probability of 95 %, metres
+    score: np.ndarray  # [rows, cols] the largest |mean| less tolerance over σ of the windows around a pixel
+    sides_px: tuple[int, ...]
+    tests: int
+    threshold: float
+    """σ from which on a window is significant."""
+    detectable_m: dict[int, float]
+    """By the side of windows in pixels: the deviation that is found with a probability of 95 % in the median window."""
+
+
+def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
+    """Return from how many σ on a deviation counts so that all tests together raise a false alarm with at most a given probability.
+
+    Args:
+        false_alarm: above 0 and below 1.
+        tests: their number.
+        sides: 2 where a deviation of either sign is an alarm, else 1.
+    """
+    return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))
+
+
+def mean_of(deviation: Deviation, pixels: np.ndarray) -> Mean | None:
+    """Return the weighted mean over pixels, [rows, cols] bool; None where none is known."""
+    used = pixels & deviation.known
+    count = int(used.sum())
+    if count == 0:
+        return None
+    variance, systematic = deviation.variance[used], deviation.systematic[used]
+    weight = 1 / (variance + systematic**2)
+    total = float(weight.sum())
+    spread = float((weight**2 * variance).sum()) + float((weight * systematic).sum()) ** 2
+    return Mean(float((weight * deviation.height[used]).sum()) / total, float(np.sqrt(spread)) / total, count)
+
+
+def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
+    """Look for significant windows over a whole board.
+
+    Args:
+        deviation: of the board.
+        tolerance_m: deviations up to this are no defect; one number, or one for each pixel, [rows, cols].
+        false_alarm: the probability of any false alarm on a board without defects.
+        smallest_px: side of the smallest window.
+
+    Returns:
+        What was found. Pixels of significant windows do not count in larger ones.
+    """
+    known = deviation.known.copy()
+    shape = known.shape
+    sides = tuple(side for side in (smallest_px << k for k in range(DOUBLINGS)) if side <= min(shape))
+    tests = sum(int((_sums(known, side) >= LEAST_MEASURED * side * side).sum()) for side in sides)
+    limit = threshold(false_alarm, tests)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(known, 1 / (deviation.variance + deviation.systematic**2), 0)
+    tolerance = np.broadcast_to(np.asarray(tolerance_m, dtype=np.float64), shape)
+    reach = tolerance + CLIP * deviation.sigma
+    clipped = np.where(known, np.clip(deviation.height, -reach, reach), 0)
+    noise, shared = np.where(known, deviation.variance, 0), np.where(known, deviation.systematic, 0)
+    significant, score = np.zeros(shape, dtype=bool), np.zeros(shape)
+    mean, mean_sigma, findable = (np.full(shape, np.nan) for _ in range(3))
+    detectable: dict[int, float] = {}
+    for side in sides:
+        weight = np.where(significant, 0, weight)
+        usable = _sums(known & ~significant, side) >= LEAST_MEASURED * side * side
+        total = _sums(weight, side)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = np.where(usable, _sums(weight * clipped, side) / total, np.nan)
+            spread = np.maximum(_sums(weight**2 * noise, side), 0) + _sums(weight * shared, side) ** 2
+            sigma = np.where(usable, np.sqrt(spread) / total, np.nan)
+            allowed = np.where(usable, _sums(weight * tolerance, side) / total, 0)
+            beyond = np.where(usable, (np.abs(value) - allowed) / sigma, 0)
+        if usable.any():
+            detectable[side] = float(np.median(allowed[usable] + (limit + POWER) * sigma[usable]))
+        if side == sides[0]:
+            mean, mean_sigma = _centred(value, side, shape), _centred(sigma, side, shape)
+            findable = _centred(allowed + (limit + POWER) * sigma, side, shape)
+        score = np.fmax(score, _centred(beyond, side, shape))
+        significant |= _covered(beyond >= limit, side, shape)
+    return Scan(significant, mean, mean_sigma, findable, score, sides, tests, limit, detectable)
+
+
+def core_of(scan: Scan, pixels: np.ndarray) -> np.ndarray:
+    """Return the pixels of a connected significant area, [rows, cols] bool, whose mean deviation is at least half the largest there."""
+    values = np.where(pixels & np.isfinite(scan.mean), scan.mean, 0)
+    peak = values.flat[np.abs(values).argmax()]
+    return pixels & (values * np.sign(peak) >= abs(peak) / 2) if peak else pixels
+
+
+def grown(pixels: np.ndarray, side: int) -> np.ndarray:
+    """Return the pixels whose square of a side, about them, holds one of some pixels; both [rows, cols] bool."""
+    before = side // 2
+    padded = np.pad(pixels, ((before, side - 1 - before),) * 2)
+    return _sums(padded, side) > 0.5
+
+
+def weighted_centre(values: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[float, float]:
+    """Return the mean row and column with the absolute values as weights, all [n]."""
+    weight = np.abs(values)
+    if not weight.any():
+        weight = np.ones_like(values)
+    return float((weight * rows).sum() / weight.sum()), float((weight * cols).sum() / weight.sum())
+
+
+def _sums(values: np.ndarray, side: int) -> np.ndarray:
+    """Return the sums over every square of a side, [rows − side + 1, cols − side + 1]."""
+    whole = np.zeros((values.shape[0] + 1, values.shape[1] + 1))
+    np.cumsum(np.cumsum(values, axis=0, dtype=np.float64), axis=1, out=whole[1:, 1:])
+    return np.asarray(whole[side:, side:] - whole[:-side, side:] - whole[side:, :-side] + whole[:-side, :-side])
+
+
+def _centred(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray:
+    """Return values of windows at their middle pixels, [rows, cols]; NaN where the window does not fit."""
+    out = np.full(shape, np.nan)
+    first = (side - 1) // 2
+    out[first : first + windows.shape[0], first : first + windows.shape[1]] = windows
+    return out
+
+
+def _covered(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray:
+    """Return the pixels that any of the marked windows covers, [rows, cols] bool."""
+    if not windows.any():
+        return np.zeros(shape, dtype=bool)
+    padded = np.zeros((shape[0] + side - 1, shape[1] + side - 1))
+    padded[side - 1 : side - 1 + windows.shape[0], side - 1 : side - 1 + windows.shape[1]] = windows
+    return _sums(padded, side)[: shape[0], : shape[1]] > 0.5

@@ -1,0 +1,1 @@
+"""The mathematics of calibrations: arrays in, parameters with residuals out."""

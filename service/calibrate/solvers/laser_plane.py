@@ -1,0 +1,131 @@
+"""Laser planes from their stripes on a chessboard: the board's plane by its corners, and a plane through the stripes of several poses.
+
+Sources: the pose of a plane from points, Zhang, "A flexible new technique for camera calibration", TPAMI 22(11), 2000, refined by
+Levenberg and Marquardt's method in OpenCV; the plane of light from its stripes on boards of known pose, Zhou and Zhang, "Complete
+calibration of a structured light stripe vision sensor through planar target of unknown orientations", Image and Vision Computing 23(1),
+2005.
+"""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from stage.capture.camera import Camera
+from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
+from stage.transforms import OPENCV_FROM_CAMERA
+
+LARGEST_SIGMA_DEGREES = 1.0
+"""The largest standard error of the tilt of a plane that is written: at a metre and 45 degrees it is a depth of 2 cm."""
+ROUNDS, CAUCHY = 20, 1.5
+"""Rounds of re-weighting of a plane, and the scale of its Cauchy weights in standard deviations."""
+LEAST_POINTS = 20
+
+
+class BoardPlane(NamedTuple):
+    """The plane of a chessboard in the camera frame."""
+
+    point: np.ndarray  # [3] metres, a corner
+    normal: np.ndarray  # [3] unit, towards the camera
+    rms_px: float
+    """Root mean square distance of the corners from where the pose puts them."""
+
+    def meet(self, camera: Camera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return where the lines of sight of image coordinates meet the plane, [n, 3] metres."""
+        x, y = camera.plane_at(u, v)
+        rays = np.stack([x, y, -np.ones_like(x)], axis=1)
+        return np.asarray(rays * (self.point @ self.normal / (rays @ self.normal))[:, None])
+
+
+class LightPlane(NamedTuple):
+    """A plane of light through the stripes on boards."""
+
+    point: np.ndarray  # [3] metres, the middle of the stripes
+    normal: np.ndarray  # [3] unit
+    residual_m: float
+    """Root mean square distance of the points, by the weights of the fit."""
+    sigma_degrees: float
+    """Standard error of the tilt about the direction in which the stripes lie closest together."""
+    points: int
+
+
+def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
+    """Return the plane of a chessboard.
+
+    Args:
+        corners: [across × down, 2] image coordinates, row by row.
+        board: inner corners across and down.
+        square_m: side of a square in metres.
+        camera: a calibrated perspective camera.
+
+    Raises:
+        CalibrationError: the corners have no pose.
+    """
+    across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
+    points = np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m
+    x, y = camera.plane_at(corners[:, 0], corners[:, 1])
+    seen = np.stack([x, -y], axis=1)  # lens distortion is undone, OpenCV's y is down
+    found, turn, shift = cv2.solvePnP(points, seen, np.eye(3), None, flags=cv2.SOLVEPNP_ITERATIVE)
+    if not found:
+        raise CalibrationError("the corners of the board have no pose")
+    rotation = cv2.Rodrigues(turn)[0]
+    own = points @ rotation.T + shift.ravel()
+    assert camera.focal_px is not None
+    off = (own[:, :2] / own[:, 2:] - seen) * camera.focal_px
+    to_camera = OPENCV_FROM_CAMERA.T
+    point, normal = to_camera @ shift.ravel(), to_camera @ rotation[:, 2]
+    return BoardPlane(point, normal if normal @ point < 0 else -normal, float(np.sqrt((off**2).sum(axis=1).mean())))
+
+
+def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, int]) -> np.ndarray:
+    """Return which pixels lie within the outer of the inner corners of a board, [rows, cols] bool."""
+    grid = corners.reshape(board[1], board[0], 2)
+    outline = np.concatenate([grid[0], grid[1:, -1], grid[-1, -2::-1], grid[-2:0:-1, 0]]) - 0.5
+    filled = np.zeros(shape, np.uint8)
+    cv2.fillPoly(filled, [np.rint(outline).astype(np.int32)], (1,))
+    return filled.astype(bool)
+
+
+def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
+    """Fit a plane to the points of a stripe on several boards.
+
+    Args:
+        poses: [n, 3] metres each, the stripe on one board.
+
+    Raises:
+        CalibrationError: there are too few points, or they lie along one line.
+    """
+    points = np.concatenate([np.zeros((0, 3)), *poses])
+    if len(poses) < 2 or len(points) < LEAST_POINTS:
+        raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {len(points)} places: two boards and {LEAST_POINTS} "
+                               "places are needed")
+    # every board counts alike, however much of the stripe it shows
+    share = np.concatenate([np.full(len(own), 1 / len(own)) for own in poses])
+    weight = share.copy()
+    for _ in range(ROUNDS):
+        middle = weight @ points / weight.sum()
+        values, vectors = np.linalg.eigh((points - middle).T @ ((points - middle) * weight[:, None]) / weight.sum())
+        normal = vectors[:, 0]
+        off = (points - middle) @ normal
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(off))) + 1e-9
+        weight = share / (1 + (off / (CAUCHY * spread)) ** 2)
+    residual = math.sqrt(max(float(values[0]), 0.0))
+    # a stripe on a board is straight: what it scatters is its noise, also where all points lie in the plane of one board
+    noise = max(residual, float(np.median([_scatter(own) for own in poses])))
+    # a board whose pose is off moves all its points: the boards are the independent measurements
+    sigma = math.degrees(math.atan2(max(noise, 1e-9), math.sqrt(max(float(values[1]), 1e-24)))) / math.sqrt(max(len(poses) - 1, 1))
+    if sigma > LARGEST_SIGMA_DEGREES:
+        raise CalibrationError(f"its stripes lie so close to one line that the tilt of its plane is known to {sigma:.1f}° alone: move the "
+                               "board towards the camera and away from it")
+    return LightPlane(middle, normal, residual, sigma, len(points))
+
+
+def _scatter(points: np.ndarray) -> float:
+    """Return the robust standard deviation of points about their line, metres."""
+    along = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
+    off = points - np.median(points, axis=0)
+    across = off - np.outer(off @ along, along)
+    widest = np.linalg.svd(across, full_matrices=False)[2][0]
+    return MAD_TO_SIGMA * float(np.median(np.abs(across @ widest)))

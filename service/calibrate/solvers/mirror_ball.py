@@ -1,0 +1,143 @@
+"""The direction of a light from a mirror ball: the line of sight of the bright spot, reflected at the ball.
+
+The normal at the spot bisects the directions to the viewer and to the light; it is not the direction of the light.
+
+Source: the law of reflection, r = 2(n·v)n - v; Debevec, "Rendering synthetic objects into real scenes", SIGGRAPH 1998, for
+    the mirror ball as a light probe.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import label
+
+from service.light_estimation.ball import Ball, BallView
+from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
+
+RIM_COSINE = 0.1
+"""The least cosine between normal and line of sight of a pixel that is searched: pixels at the outline mix in background."""
+MIN_COSINE = 0.2
+"""The least such cosine of a spot, for a light 157° from the view axis: beyond it an error of 1 px is one of 10/radius_px rad."""
+NEAR_RIM_COSINE = 0.35
+"""The cosine below which a spot is flagged, for a light more than 139° from the view axis."""
+MAX_SPOT_SHARE = 0.1
+"""The largest part of the ball that a spot may cover, which a light of 37° half angle covers, or an overexposed ball."""
+PROMINENCE = 8.0
+"""The standard deviations of the other pixels of the ball by which the peak must exceed their median; noise reaches 4 or 5."""
+MIN_CONTRAST = 2.0
+"""The least ratio of the peak to that median."""
+RIVAL_SHARE = 0.5
+"""The light of another spot, relative to the light of the found spot, above which the spot is flagged."""
+SMALL_SPOT = 4
+"""The count of pixels below which a spot is flagged, because its centroid is inaccurate."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpotOptions:
+    """The options of the search for the spot."""
+
+    level: float = 0.1
+    """The level relative to the peak: pixels of the spot are brighter than it and than the noise of the ball, and connected to the peak.
+
+    It is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
+    """
+
+
+class Spot(NamedTuple):
+    """The reflection of one light in a mirror ball."""
+
+    uv: np.ndarray  # [2] float64, centroid, continuous image coordinates
+    direction: np.ndarray  # [3] float64, unit, the reflected line of sight: from the ball to the light, camera frame
+    point: np.ndarray  # [3] float64, on the ball at the centroid, in the ball's unit
+    spot_degrees: float
+    """The root mean square angle of the light of the spot from its mean: the apparent size of the light."""
+    uncertainty_degrees: float
+    """The standard error of the direction, from the pixel grid and the outline of the ball."""
+    pixels: int
+    flags: tuple[str, ...]
+
+
+def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView,
+              options: SpotOptions = SpotOptions()) -> Spot:
+    """Find the bright spot on a mirror ball, and the direction of the light that it reflects.
+
+    Each pixel of the spot measures the light from its own reflected direction. The result is the mean of these directions, weighted
+    by the radiance above the level of the spot. In an orthographic image of a mirror ball equal areas are equal solid angles, so
+    that the mean is the centroid of the light. Saturated pixels count as the brightest.
+
+    Args:
+        radiance: [h, w, 3] scene-linear, the box of `view`.
+        saturated: [h, w] bool, or None.
+        ball, view: the ball, and the normals and lines of sight of its pixels.
+        options: the options of the search.
+
+    Raises:
+        CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the message does not name the frame.
+    """
+    facing = (view.normal * view.to_viewer).sum(axis=-1)
+    looked_at = view.inside & (facing > RIM_COSINE)
+    value = np.where(looked_at, radiance.astype(np.float64).mean(axis=-1), 0)
+    clipped = looked_at & saturated if saturated is not None else np.zeros_like(looked_at)
+    if clipped.any():
+        value[clipped] = value.max()
+    peak = float(value.max())
+    floor = max(options.level * peak, _noise_ceiling(value[looked_at]))
+    rise = np.maximum(value - floor, 0)
+    spot, rival = _brightest(rise, value == peak)
+    count, ball_pixels = int(spot.sum()), int(view.inside.sum())
+    if count > max(MAX_SPOT_SHARE * ball_pixels, SMALL_SPOT):
+        raise CalibrationError(f"the bright spot covers {count / ball_pixels:.0%} of the ball: shorten the exposure or make the "
+                               "light smaller")
+    weight = rise[spot] / rise[spot].sum()
+    rows, cols = np.nonzero(spot)
+    uv = np.array([weight @ cols + view.box[1].start + 0.5, weight @ rows + view.box[0].start + 0.5])
+    cosine = float(weight @ facing[spot])
+    if cosine < MIN_COSINE:
+        degrees = math.degrees(math.acos(cosine))
+        raise CalibrationError(f"the bright spot is at the rim of the ball, its normal {degrees:.0f}° off the line of sight: "
+                               "the light is behind the object, or the ball's outline is too large")
+    reflected = reflect(view.to_viewer[spot], view.normal[spot])
+    mean = weight @ reflected
+    direction = mean / np.linalg.norm(mean)
+    off = np.arctan2(np.linalg.norm(np.cross(reflected, direction), axis=-1), reflected @ direction)
+    point = weight @ view.point[spot]
+    outward = point - ball.centre
+    flags = [("near the rim", cosine < NEAR_RIM_COSINE), ("several spots", rival > RIVAL_SHARE),
+             ("saturated", clipped[spot].sum() > count / 2), ("small spot", count < SMALL_SPOT)]
+    return Spot(uv, direction, ball.centre + outward * ball.radius / np.linalg.norm(outward),
+                math.degrees(math.sqrt(float(weight @ off**2))), _uncertainty_degrees(ball, cosine, count), count,
+                tuple(name for name, raised in flags if raised))
+
+
+def reflect(to_viewer: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the mirror direction 2(n·v)n - v, [..., 3]: from the ball to the object that the mirror shows at the viewer."""
+    return 2 * (normal * to_viewer).sum(axis=-1, keepdims=True) * normal - to_viewer
+
+
+def _uncertainty_degrees(ball: Ball, cosine: float, count: int) -> float:
+    """Return the uncertainty of a centroid of `count` pixels: a pixel is uniform over its width, 1/√12, and the outline has an error.
+
+    A shift of one pixel rotates the normal by 1/(radius_px · cosine) radians, and the reflected direction by twice that.
+    """
+    shift_px = math.sqrt(1 / (12 * count) + ball.outline_error_px**2)
+    return math.degrees(2 * shift_px / (ball.radius_px * cosine))
+
+
+def _noise_ceiling(values: np.ndarray) -> float:
+    """Return a level above the noise of the ball, and raise CalibrationError when no pixel is brighter."""
+    peak, median = float(values.max()), float(np.median(values))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(values - median)))  # the standard deviation, were it noise alone
+    if peak <= 0 or peak <= median + PROMINENCE * spread or peak < MIN_CONTRAST * median:
+        raise CalibrationError("there is no bright spot on the ball")
+    return median + PROMINENCE * spread
+
+
+def _brightest(weight: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the brightest connected region of `weight > 0` with a peak, and the light of the next region relative to its light."""
+    parts, count = label(weight > 0, np.ones((3, 3)))
+    light = np.bincount(parts.ravel(), weight.ravel(), minlength=count + 1)
+    best = int(max(np.unique(parts[peak]), key=lambda part: light[part]))
+    return parts == best, float(np.delete(light, best).max()) / float(light[best])

@@ -1,0 +1,225 @@
+"""Inspection of a capture for relit info: its facts, and every fault of it; every frame is decoded and checked."""
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.captures.explained import Findings, findings, pixels_to_look_at
+from service.captures.front_lights import front_lights
+from service.reporting.progress import Progress, Timings
+from service.requests.captures import InfoRequest
+from stage.capture.capture import Capture
+from stage.capture.gradients import gradient_frames, has_gradients
+from stage.capture.light import DistantLight, PointLight
+from stage.capture.lighting import MEASURED_BY, check_solvable, has_placeholders, lights_from_centre
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.capture.point_lights import PlacedLights, distance_is_missing, place_lights
+from stage.capture.projector import Projector
+from stage.colour.radiance import clipping_sentences
+from stage.errors import StageError, StorageError
+from stage.formats import images
+from stage.formats.orientation import TURNS, UPRIGHT
+from stage.stack.correction import Correction
+from stage.tof.raw_frames import check_frames, read_frame
+
+FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
+"""What is said of near lights whose distance to the surface nobody has measured."""
+
+
+class Inspection(NamedTuple):
+    """Facts of a capture by name, and sentences about its faults; a capture without faults can be solved."""
+
+    facts: list[tuple[str, str]]
+    faults: list[str]
+    findings: list[str]
+    """Sentences about what explains the images better than the manifest; nothing is changed by them."""
+
+
+class _FrameLevel(NamedTuple):
+    """The readings of one frame."""
+
+    lowest: float
+    peak: float
+    saturated: int
+    fault: str | None
+    picked: np.ndarray | None = None  # [n, 3] float32, values at some pixels
+    unread: int = 0
+    """Readings of a time-of-flight frame that are not finite."""
+
+
+def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspection:
+    """Decode and check every frame of a capture.
+
+    Args:
+        request: the capture, and how its pixels are read.
+        progress: told of every frame.
+
+    Raises:
+        StageError: the capture cannot be opened.
+    """
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture, request.pixels)
+    frames = capture.manifest.frames
+    timings.stage("frames", len(frames))
+    levels = []
+    positions = pixels_to_look_at(capture)
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="relit-inspect") as pool:
+        for level in pool.map(lambda frame: _level(capture, frame, positions), frames):
+            levels.append(level)
+            timings.advance(len(levels))
+    faults = [level.fault for level in levels if level.fault is not None]
+    faults += standing_faults(capture, readable=not faults)
+    facts = list(_facts(capture))
+    read = [level for level in levels if level.fault is None]
+    if read:
+        lowest, peak = min(level.lowest for level in read), max(level.peak for level in read)
+        of_both_signs = lowest < 0 and any(frame.tof is not None for frame in frames)
+        facts.append(("recorded", f"{lowest:.4g} to {peak:.4g}: correlation images have both signs") if of_both_signs else
+                     ("brightest", f"{peak:.4g} recorded"))
+    if unread := sum(level.unread for level in read):
+        facts.append(("not finite", f"{unread} readings, which count as saturated"))
+    if capture.manifest.saturation is not None:
+        count = sum(level.saturated for level in levels)
+        facts.append(("saturated", f"{count} readings at or above {capture.manifest.saturation:g}"))
+    facts += [("clipped", sentence) for sentence in clipping_sentences(capture.clipped)]
+    with suppress(StageError):
+        mask = capture.mask()
+        facts.append(("mask", f"{int(mask.sum())} of {mask.size} pixels"))
+    if capture.lit_by(PointLight):
+        with suppress(StageError):
+            facts.append(("near lights", FAR_UNKNOWN if distance_is_missing(capture) else _near_lights(place_lights(capture))))
+    found = Findings([], {})
+    if positions is not None and not faults:
+        found = findings(capture, positions, {frame.image: level.picked for frame, level in zip(frames, levels, strict=True)
+                                              if level.picked is not None})
+    looks = [*capture.doubts, *found.sentences]
+    if request.picture is not None:
+        peak = max((level.peak for level in read), default=1.0)
+        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, timings)))
+    timings.close()
+    return Inspection(facts, faults, looks)
+
+
+def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], timings: Timings) -> str:
+    """Write the picture of a capture, and return its path, or why there is none."""
+    from service.captures.capture_picture import write_picture
+    from service.relight.outputs import check_outputs
+
+    check_outputs([(f"--picture {path}", path)], (capture.folder / FILE_NAME, *(capture.file(name) for _, name in capture.files())))
+    timings.stage("picture", len(capture.manifest.frames))
+    try:
+        write_picture(path, capture, peak, suspects, timings.advance)
+    except StorageError:
+        raise
+    except StageError as error:  # of the mask, or the dark, flat or ambient frames
+        timings.advance(len(capture.manifest.frames))
+        return f"none: {error}"
+    return str(path)
+
+
+def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
+    """Return what is wrong with a capture beside its frames: lights that determine no normal, the mask, the dark and flat frames.
+
+    Args:
+        capture: an opened capture.
+        readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
+    """
+    faults = []
+    try:
+        if any(frame.tof is not None for frame in capture.manifest.frames):
+            check_frames(capture)
+        if capture.sources() and not has_placeholders(capture):
+            if has_gradients(capture):
+                gradient_frames(capture)
+            elif not distance_is_missing(capture):  # else a solve says what it finds
+                check_solvable(capture)
+    except StageError as error:
+        faults.append(str(error))
+    try:
+        capture.mask()
+    except StageError as error:
+        faults.append(str(error))
+    if readable and not faults:
+        try:
+            Correction.of(capture)
+        except StageError as error:
+            faults.append(str(error))
+    return faults
+
+
+def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
+    manifest, camera = capture.manifest, capture.camera
+    yield "name", capture.name
+    yield "folder", str(capture.folder)
+    scale = f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else "no scale"
+    yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
+    yield "colour", manifest.color_space
+    with suppress(StageError):
+        orientation = images.read_header(capture.file(manifest.frames[0].image)).orientation
+        if orientation != UPRIGHT:
+            yield "orientation", f"{TURNS[orientation].words}, as EXIF orientation {orientation} of every frame says"
+    kinds = Counter(_kind(frame) for frame in manifest.frames)
+    yield "frames", ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+    given = [name for name in ("dark", "flat", "mask", "saturation", "projector") if getattr(manifest, name) is not None]
+    if manifest.frames[0].exposure_s is not None:
+        given.append("exposure_s")
+    yield "given", ", ".join(given) or "nothing beside the frames"
+    if manifest.projector is not None:
+        calibration = "calibrated" if isinstance(manifest.projector, Projector) else "not calibrated: see relit calibrate procam"
+        yield "projector", "{}x{}, {}".format(*manifest.projector.resolution, calibration)
+    directions = np.array([light.direction for _, light in capture.lit_by(DistantLight)])
+    if has_placeholders(capture):
+        yield "lights", f"{len(directions)} placeholders: {MEASURED_BY}"
+    elif len(directions):
+        behind = int((directions[:, 2] < 0).sum())
+        widest = np.degrees(np.arccos(np.clip(directions[:, 2].min(), -1, 1)))
+        yield "lights", f"{len(directions)} distant, up to {widest:.0f} degrees from the view axis, {behind} behind the object"
+        yield "irradiance", manifest.irradiance_scale
+    with suppress(StageError):
+        if not has_placeholders(capture) and (front := front_lights(lights_from_centre(capture).direction)) is not None:
+            yield "not seen", front.sentence()
+
+
+def _near_lights(lights: PlacedLights) -> str:
+    """Return how many near lights there are, and how far away."""
+    near = lights.place[:, 3] == 1
+    distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
+    return f"{int(near.sum())}, {distance.min():.3g} to {distance.max():.3g} m from the object's centre"
+
+
+def _kind(frame: Frame) -> str:
+    if frame.light is not None:
+        return f"{frame.light.type} light"
+    if frame.pattern is not None:
+        return f"{frame.pattern.code} pattern"
+    if frame.stereo is not None:
+        return "texture seen by several cameras"
+    return f"{frame.laser.type} laser" if frame.laser is not None else "time of flight"
+
+
+def _level(capture: Capture, frame: Frame, positions: np.ndarray | None) -> _FrameLevel:
+    """Return the lowest and the brightest value and the saturated readings of one frame, or its fault."""
+    path = capture.file(frame.image)
+    try:
+        if frame.tof is not None:
+            pixels = read_frame(capture, frame)[..., None]
+        else:
+            recorded = capture.recorded(frame.image)
+            pixels = np.take(images.fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
+    except StageError as error:
+        return _FrameLevel(0.0, 0.0, 0, str(error))
+    limit = capture.manifest.saturation
+    saturated = 0 if limit is None else int((pixels >= limit).any(axis=-1).sum())
+    finite = np.isfinite(pixels)
+    if not finite.any():
+        return _FrameLevel(0.0, 0.0, 0, f"{path}: no reading is finite")
+    lowest, peak = float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf))
+    picked = pixels.reshape(-1, pixels.shape[-1])[positions] if positions is not None and frame.tof is None else None
+    return _FrameLevel(lowest, peak, saturated, None, picked, int(finite.size - finite.sum()))

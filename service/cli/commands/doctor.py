@@ -1,0 +1,100 @@
+"""relit doctor: check this installation."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.service.server import ConfigOption, DataOption, settings_of
+
+ROOTS = ("stage", "kernels", "service")
+
+DoctorDevice = Annotated[str | None, typer.Option("--device", help="Check only this device; without it all.", show_default=False)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("doctor")(doctor)
+
+
+def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOption = None) -> None:
+    """Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; and the service here.
+
+    The service is that of --data or --config, or of RELIT_DATA or ./relit-data where there is such a folder.
+    """
+    import importlib.util
+    import tempfile
+
+    from service import __version__
+    from service.reporting.provenance import versions
+
+    faults = []
+    for name, value in versions().items():
+        print(f"{name:<12} {value}")
+        if value == "not installed":
+            faults.append(f"{name} is not installed")
+    home = Path(__file__).resolve().parents[3]
+    for root in ROOTS:
+        spec = importlib.util.find_spec(root)
+        found = Path(spec.origin).resolve().parent if spec is not None and spec.origin else None
+        if found != home / root:
+            faults.append(f"package {root} is taken from {found}, not from relit {__version__} in {home}: "
+                          "install relit in an environment of its own")
+    if not faults:
+        import numpy as np
+
+        from kernels import device, packs
+        from kernels.relight.frames import cublas
+        from kernels.relight.frames.combine import combine
+
+        for name in [device.resolve(only)] if only else device.names():
+            band = packs.upload(np.ones((3, 8, 64), dtype=np.float16), device=name)
+            sound = bool((combine(band, np.full((3, 8), 0.25, dtype=np.float32)).numpy() == 2.0).all())
+            print(f"{'device':<12} {device.describe(name)}: {'works' if sound else 'gives wrong sums'}")
+            if name != "cpu":
+                print(f"{'cuBLAS':<12} {name}: {cublas.describe(name)}")
+                faults += _wrong_products(name)
+            if not sound:
+                faults.append(f"{name} gives wrong sums")
+        with tempfile.TemporaryDirectory() as folder:
+            print(f"{'temporary':<12} {folder} can be written")
+    faults += _service(data, config)
+    for fault in faults:
+        print(f"{'wrong':<12} {fault}")
+    print("sound" if not faults else f"{len(faults)} faults")
+    if faults:
+        raise typer.Exit(1)
+
+
+def _wrong_products(device: str) -> list[str]:
+    """Compare batches of frames by cuBLAS with those by the kernel of relit, where both are there; return what is wrong."""
+    import numpy as np
+
+    from kernels import packs
+    from kernels.relight.frames import cublas
+    from kernels.relight.frames.combine import combine_batch
+
+    if cublas.product_of(device) is None:
+        return []
+    rng = np.random.default_rng(0)
+    band = packs.upload(rng.random((3, 16, 256)).astype(np.float16), device=device)
+    weights = rng.random((40, 3, 16), dtype=np.float32)
+    theirs, ours = (combine_batch(band, weights, with_cublas=which).numpy() for which in (True, False))
+    agree = np.allclose(theirs, ours, rtol=cublas.TOLERANCE, atol=0)
+    return [] if agree else [f"{device}: cuBLAS gives wrong sums: uninstall nvmath-python"]
+
+
+def _service(data: Path | None, config: Path | None) -> list[str]:
+    """Check the service, where there is one; return what is wrong."""
+    settings = settings_of(config, data=data)
+    if data is None and config is None and not settings.data.is_dir():
+        return []
+    from service.server.process.checkup import look
+
+    faults = []
+    for found in look(settings):
+        if found.fault:
+            faults.append(f"{found.subject}: {found.text}")
+        else:
+            print(f"{found.subject:<12} {found.text}")
+    return faults

@@ -1,0 +1,230 @@
+"""relit import LAYOUT: make a capture of files that are laid out another way, and say how they were understood."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.groups import make_group
+from service.cli.request_commands import local_command
+from service.requests.captures import (
+    DiligentImport,
+    ExposureOrder,
+    GrayImport,
+    ImageOptions,
+    ImportRequest,
+    LaserImport,
+    LensOptions,
+    LpImport,
+    NearLightsImport,
+    OlatImport,
+    OpencvGrayImport,
+    PatternImageOptions,
+    PhaseImport,
+    PhaseShift,
+    PhotosImport,
+    RelightlabImport,
+    RigOptions,
+    ScannerImport,
+    Sense,
+    WaveOrigin,
+)
+from service.requests.imports_tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
+from service.requests.patterns import PatternAxis
+
+if TYPE_CHECKING:
+    from stage.importers.camera_options import Selection, View
+    from stage.importers.layout import Imported
+    from stage.importers.patterns import PatternImages
+    from stage.importers.raw_arrays import ArrayFiles
+
+
+FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the data.", show_default=False)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
+    for function in (_diligent, _lp, _relightlab, _olat, _photos, _near_lights, _opencv_gray, _gray, _phase, _scanner, _tof, _histogram,
+                     _kinect, _laser):
+        local_command(layouts, function.__name__[1:].replace("_", "-"), function)
+    layouts.command("guess")(_guess)
+    app.add_typer(layouts)
+
+
+def _guess(folder: FolderArgument) -> None:
+    """Look at a folder: what it seems to be, why, and the command that imports it."""
+    from stage.importers.guess import guess
+
+    found = guess(folder)
+    print(f"looks    like {found.layout}")
+    print(f"because  {found.reason}")
+    for sentence in found.assumed:
+        print(f"assumed  {sentence}")
+    print(f"run      {found.command}")
+    print(f"then     {found.then}")
+
+
+def _diligent(request: DiligentImport) -> None:
+    from stage.importers import diligent
+
+    _print_path(diligent.import_folder(request.source, request.folder))
+
+
+def _lp(request: LpImport) -> None:
+    from stage.importers import lp
+
+    _print_path(lp.import_folder(request.source, request.folder))
+
+
+def _opencv_gray(request: OpencvGrayImport) -> None:
+    from stage.importers.patterns import import_opencv_gray
+
+    _print_path(import_opencv_gray(request.source, request.folder, projector=request.projector, calibration=request.calibration,
+                                   unit_m=request.unit_m))
+
+
+def _olat(request: OlatImport) -> None:
+    from stage.importers import olat
+
+    _print(olat.import_folder(
+        request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
+        variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
+        color_space=request.color_space))
+
+
+def _photos(request: PhotosImport) -> None:
+    from stage.importers.olat import import_photos
+
+    _print(import_photos(request.source, request.folder, selection=_selection(request), view=_view(request),
+                         color_space=request.color_space))
+
+
+def _near_lights(request: NearLightsImport) -> None:
+    from stage.importers.olat import import_near_lights
+
+    _print(import_near_lights(
+        request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
+        selection=_selection(request), view=_view(request), color_space=request.color_space))
+
+
+def _relightlab(request: RelightlabImport) -> None:
+    from stage.importers import relightlab
+
+    _print(relightlab.import_folder(request.source, request.destination))
+
+
+def _gray(request: GrayImport) -> None:
+    from stage.importers.patterns import import_gray
+    from stage.importers.sequences import GrayStack
+
+    gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
+                     row_bits=request.row_bits)
+    pictures = _pattern_images(request, request, request)
+    _print(import_gray(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, gray=gray))
+
+
+def _phase(request: PhaseImport) -> None:
+    from stage.importers.patterns import import_phase
+    from stage.importers.sequences import GrayStack, PhaseStack
+
+    phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
+                       order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
+    gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
+    pictures = _pattern_images(request, request, request)
+    _print(import_phase(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, phase=phase,
+                        gray_images=request.gray_images, gray_stripe_px=request.gray_stripe, gray=gray,
+                        from_centre=request.origin is WaveOrigin.CENTRE))
+
+
+def _scanner(request: ScannerImport) -> None:
+    from stage.importers.patterns import import_scanner
+
+    _print(import_scanner(request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
+                          unit_m=request.unit_m, projector=request.projector, images=request.images))
+
+
+def _laser(request: LaserImport) -> None:
+    from stage.importers import laser
+
+    _print(laser.import_folder(request.source, request.folder, view=_view(request), camera=request.camera, planes=request.planes,
+                               form=request.form, axes=request.axes, unit_m=request.unit_m, selection=_selection(request),
+                               color_space=request.color_space))
+
+
+def _tof(request: TofImport) -> None:
+    from stage.importers.tof import import_correlations
+
+    _print(import_correlations(
+        request.source, request.folder, frequencies_hz=request.frequencies_hz, phases_deg=request.phases_deg,
+        minus=request.signal is Signal.MINUS, order=request.order, arrays=_arrays(request), planes=request.planes,
+        source_m=request.source_m, view=_view(request)))
+
+
+def _histogram(request: HistogramImport) -> None:
+    from stage.importers.tof import import_histograms
+
+    _print(import_histograms(
+        request.source, request.folder, bin_s=request.bin_s, start_s=request.start_s, count_scale=request.count_scale,
+        pulses=request.pulses, first_photon_only=request.first_photon_only, bins=request.bins, arrays=_arrays(request),
+        source_m=request.source_m, view=_view(request)))
+
+
+def _kinect(request: KinectImport) -> None:
+    from stage.importers import kinect
+
+    _print(kinect.import_folder(request.source, request.folder, packet=request.packet, p0=request.p0, view=_view(request)))
+
+
+def _arrays(request: ArrayOptions) -> "ArrayFiles":
+    from stage.importers.raw_arrays import ArrayFiles
+
+    return ArrayFiles(files=request.arrays, variables=request.variable, dtype=request.dtype, size=request.size)
+
+
+def _axes(axis: PatternAxis) -> tuple[str, ...]:
+    return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
+
+
+def _pattern_images(images: PatternImageOptions, rig: RigOptions, given: ImportRequest) -> "PatternImages":
+    """Return which images are frames; those of a video are unpacked first."""
+    from stage.errors import ManifestError
+    from stage.importers.patterns import PatternImages
+    from stage.importers.video import FrameRange, is_video, unpack
+
+    video, space = None, images.color_space
+    if is_video(given.source):
+        if given.destination is None:
+            raise ManifestError(f"{given.source}: is a video: give a folder for its frames behind it")
+        video = unpack(given.source, given.destination, FrameRange.parse(images.video_frames or "0"))
+        if "color_space" not in images.model_fields_set:
+            space = "srgb_texture"  # videos are encoded for displays
+    elif images.video_frames is not None:
+        raise ManifestError(f"--video-frames {images.video_frames}: {given.source} is no video")
+    return PatternImages(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
+                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=space, video=video, exposures_s=images.exposures_s,
+                         patterns_first=images.exposure_order is ExposureOrder.PATTERN)
+
+
+def _view(request: LensOptions) -> "View":
+    from stage.importers.camera_options import View
+
+    return View(**{field.name: getattr(request, field.name) for field in fields(View) if hasattr(request, field.name)})
+
+
+def _selection(request: ImageOptions) -> "Selection":
+    from stage.importers.camera_options import Selection
+
+    return Selection(images=request.images, mask=request.mask, ambient=request.ambient)
+
+
+def _print_path(path: Path) -> None:
+    print(f"capture  {path}")
+
+
+def _print(imported: "Imported") -> None:
+    """Print where the capture is, and how the files were understood."""
+    _print_path(imported.path)
+    for name, sentence in imported.facts:
+        print(f"{name:<8} {sentence}")

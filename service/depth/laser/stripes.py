@@ -1,0 +1,275 @@
+"""The stripe of one laser frame: its centre on each line, how sure it is on textured surfaces, and which of several stripes it is.
+
+The albedo of the pixels that a sweep of laser planes lights, from the sweep itself.
+
+While the planes pass over a pixel, it reads its albedo times the profile of the stripe, sampled at the planes. The energy Σ I² over the
+frames is then the albedo squared times the same constant for every pixel, if the planes lie close enough: a Gaussian profile of standard
+deviation s planes leaves a ripple of 2 exp(-π² s²), 0.4 % at s = 0.8. The number of frames that share the energy, (Σ I²)² / Σ I⁴ = 2.5 s,
+tells where they do, and where the sweep begins or ends over a pixel.
+
+Source: Curless and Levoy, "Better optical triangulation through spacetime analysis", ICCV 1995: over the frames, texture does not bend the
+profile of a pixel.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.status import Status
+from kernels.structured.stripe import REACH, find_stripe, plane_depths
+from service.depth.laser.stripe_curves import PEAKS, Chosen, choose_curves
+from service.depth.laser.stripe_map import StripeSamples
+from stage.capture.camera import Camera
+from stage.capture.ranging import LaserPlane
+from stage.spread import MAD_TO_SIGMA
+
+LEAST_FRAMES = 2.0
+"""Least number of frames that share the energy of a pixel: with fewer, the ripple is above 0.4 %."""
+LEAST_PART = 0.75
+"""Least part of the commonest number of frames: where the sweep ends over a pixel, part of its energy is missing."""
+SIGNIFICANT = 3.0
+"""Standard deviations of the noise from which a reading counts as light of the stripe."""
+LEAST_SIGNAL = 10.0
+"""Least root of the energy in standard deviations of the noise: the albedo is then known to a tenth."""
+WINDOW_PX = 5
+"""Side of the window over which the texture of the albedo is compared with its noise, pixels."""
+
+
+class SweepEnergy:
+    """The energy of each pixel over the frames of a sweep."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        """Begin with no frame.
+
+        Args:
+            shape: rows and columns.
+        """
+        self.square = np.zeros(shape, np.float32)
+        self.fourth = np.zeros(shape, np.float32)
+        self.noise2 = 0.0
+        self.frames = 0
+
+    def add(self, signal: np.ndarray, noise: float) -> None:
+        """Add a frame.
+
+        Args:
+            signal: [rows, cols] float32, less its background.
+            noise: its standard deviation where there is no stripe.
+        """
+        square = np.where(signal > SIGNIFICANT * noise, signal, 0).astype(np.float32) ** 2
+        self.square += square
+        self.fourth += square * square
+        self.noise2 += noise * noise
+        self.frames += 1
+
+    def albedo(self) -> np.ndarray | None:
+        """Return the relative albedo, [rows, cols] float32, 0 where the sweep does not tell it; None if it tells it nowhere.
+
+        Texture that does not stand out of its noise is smoothed (Lee, "Digital image enhancement and noise filtering by use of local
+        statistics", PAMI 1980): there a division by it would only add noise.
+        """
+        if self.frames < LEAST_FRAMES:
+            return None
+        noise2 = self.noise2 / self.frames
+        lit = self.square > LEAST_SIGNAL**2 * noise2
+        shared = np.where(lit, self.square**2 / np.where(lit, self.fourth, 1), 0).astype(np.float32)
+        around = _mean(shared, lit)
+        known = lit & (around >= LEAST_FRAMES)
+        if not known.any():
+            return None
+        known &= shared >= LEAST_PART * np.median(shared[known])
+        root = np.sqrt(self.square)
+        middle = _mean(root, known)
+        variance = np.maximum(_mean(root * root, known) - middle * middle, 0)
+        texture = np.maximum(1 - noise2 / np.maximum(variance, 1e-12 * noise2 + 1e-30), 0)
+        found = middle + texture * (root - middle)
+        return np.where(known & (found > 0), found, 0).astype(np.float32)
+
+
+def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Return the mean of the values over a window, of those pixels that are marked; 0 where none is."""
+    weight = _sum_around(where.astype(np.float32))
+    return np.where(weight > 0, _sum_around(np.where(where, values, 0).astype(np.float32)) / np.maximum(weight, 1), 0)
+
+
+def _sum_around(values: np.ndarray) -> np.ndarray:
+    """Return the sum over the window about each pixel; beyond the image values count as 0."""
+    for axis in (0, 1):
+        room = [(0, 0), (0, 0)]
+        room[axis] = (WINDOW_PX // 2, WINDOW_PX // 2)
+        padded = np.pad(values, room)
+        length = values.shape[axis]
+        values = np.add.reduce([np.take(padded, range(start, start + length), axis=axis) for start in range(WINDOW_PX)])
+    return values
+
+
+NOISE_SAMPLE = 200_000
+"""Number of pixels from which the noise of a frame is estimated."""
+BESIDE_LINES, FURTHER_LINES = 4, 12
+"""Lines to either side over which odd residuals, and changes of brightness along the stripe, are averaged: a line sees few pixels, and
+fields of an even albedo change at their borders alone."""
+CUT = 3.0
+"""Odd residuals of a single line, in standard deviations by noise, from which they count whatever the lines beside it show."""
+NARROW, CUT_SHIFT = 0.9, 2.0
+"""Part of the usual width of the frame below which a profile is taken to be cut by the edge of a surface, and how far that shifts its
+centre over the width that it loses: half a Gaussian has lost 0.4 of its standard deviation, and its centre has moved by 0.8."""
+SAME_CURVE_PX = 4.0
+"""Largest step of the centre per line between two lines that see one surface."""
+
+
+class Signal(NamedTuple):
+    """One frame less its background."""
+
+    values: np.ndarray  # [rows, cols] float32, 0 outside the mask
+    channel: int
+    noise: float
+    """Standard deviation where there is no stripe."""
+
+
+def stripe_signal(radiance: np.ndarray, mask: np.ndarray) -> Signal:
+    """Return the brightest channel of a frame, with its median as zero.
+
+    Args:
+        radiance: [rows, cols, 3] float32, less ambient light.
+        mask: [rows, cols] bool, not empty.
+    """
+    channel = int(np.argmax(np.where(mask[..., None], radiance, 0).max(axis=(0, 1))))
+    inside = radiance[..., channel][mask]
+    few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
+    middle = float(np.median(few))
+    noise = max(MAD_TO_SIGMA * float(np.median(np.abs(few - middle))), 1e-6 * float(inside.max()), 1e-12)
+    return Signal(np.where(mask, radiance[..., channel] - middle, 0), channel, noise)
+
+
+def along_of(laser: LaserPlane) -> str:
+    """Return "row" if the stripe crosses the rows of the image, "column" if it crosses the columns."""
+    return "row" if abs(laser.normal[0]) >= abs(laser.normal[1]) else "column"
+
+
+class Sweep:
+    """The albedo of surfaces, from the frames of planes that cross the same lines."""
+
+    def __init__(self) -> None:
+        self.energy: SweepEnergy | None = None
+        self.channel = 0
+        self.albedo: np.ndarray | None = None
+
+    def add(self, signal: Signal) -> None:
+        """Add a frame; those of another channel than the first take no part."""
+        if self.energy is None:
+            self.energy, self.channel = SweepEnergy(signal.values.shape), signal.channel
+        if signal.channel == self.channel:
+            self.energy.add(signal.values, signal.noise)
+
+    def close(self) -> None:
+        """Compute the albedo, and let the frames go."""
+        if self.energy is not None:
+            self.albedo, self.energy = self.energy.albedo(), None
+
+    def albedo_for(self, signal: Signal) -> np.ndarray | None:
+        """Return the albedo in the channel of a frame, or None."""
+        return self.albedo if signal.channel == self.channel else None
+
+
+class Stripes(NamedTuple):
+    """The stripes of one frame."""
+
+    samples: StripeSamples
+    curve: np.ndarray
+    """[lines] int, number of the curve of the stripe on each line, -1 where there is none."""
+    doubled: int
+    """Number of lines with two stripes of comparable brightness."""
+    second: int
+    """Number of lines with a second stripe, of a tenth of the brightness or more."""
+
+
+def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: Sweep, camera: Camera, *, device: str, near_m: float,
+                   far_m: float) -> Stripes:
+    """Measure the stripe of one frame on each line.
+
+    Args:
+        signal: of the frame.
+        mask: [rows, cols] bool.
+        laser: its plane.
+        sweep: of the frames whose stripes cross the same lines.
+        camera: perspective.
+        near_m, far_m: span of depths; others are OUT_OF_RANGE.
+    """
+    along = along_of(laser)
+    place, sigma, brightness, amplitude, status = _peaks(signal, mask, along, sweep, device)
+    chosen: Chosen = choose_curves(place, brightness, status)
+    lines = np.arange(place.shape[1])
+    centre, spread_px, peak = (values[chosen.peak, lines] for values in (place, sigma, amplitude))
+    code = chosen.status.copy()
+    code[~mask.any(axis=1 if along == "row" else 0)] = Status.UNSOLVED
+    u, v = (centre.astype(np.float64), lines + 0.5) if along == "row" else (lines + 0.5, centre.astype(np.float64))
+    x, y = camera.plane_at(u, v)
+    met = plane_depths(x, y, np.array(laser.point_m), np.array(laser.normal), along=along)
+    assert camera.focal_px is not None
+    found = np.isin(code, (Status.OK, Status.MULTIPATH))
+    with np.errstate(invalid="ignore"):
+        near = np.isfinite(met.depth) & (met.depth >= near_m) & (met.depth <= far_m)
+    code[found & ~near] = Status.OUT_OF_RANGE
+    spread = spread_px * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
+    return Stripes(StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), peak, code), chosen.curve,
+                   int(chosen.doubled.sum()), int(chosen.second.sum()))
+
+
+def _peaks(signal: Signal, mask: np.ndarray, along: str, sweep: Sweep, device: str) -> tuple[np.ndarray, ...]:
+    """Return centre, deviation, brightness, peak and status of the brightest stripes of each line, [PEAKS, lines] each.
+
+    After a stripe is found, its pixels are taken out and the next is looked for.
+    """
+    left = signal.values.copy()
+    rows: list[tuple[np.ndarray, ...]] = []
+    for _ in range(PEAKS):
+        found = find_stripe(left, along=along, noise=signal.noise, device=device, albedo=sweep.albedo_for(signal), rival=np.inf)
+        centre, sigma, uneven, width, level, even, amplitude, status = (array.numpy() for array in found)
+        rows.append((centre, _deviation(centre, sigma, uneven, width, level, even, status, signal.noise), level, amplitude, status))
+        if not (status == Status.OK).any():
+            break
+        image = left if along == "row" else left.T
+        away = np.abs(np.arange(image.shape[1])[None] + 0.5 - centre[:, None])
+        image[(away <= REACH * np.maximum(width, 1.0)[:, None]) & (status == Status.OK)[:, None]] = 0
+        image[status != Status.OK] = 0
+    return tuple(np.stack(values) for values in zip(*rows, strict=True))
+
+
+def _deviation(centre: np.ndarray, sigma: np.ndarray, uneven: np.ndarray, width: np.ndarray, level: np.ndarray, even: np.ndarray,
+               status: np.ndarray, noise: float) -> np.ndarray:
+    """Return the standard deviation of each centre from noise and texture, pixels.
+
+    Texture shows in two ways: as odd residuals of the profile, and as changes of the brightness along the stripe. A gradient of the albedo
+    across the stripe shifts it without a residual; if texture is alike in all directions, brightness at a distance of √2 standard
+    deviations of the profile, w, then changes by as much: the shift is w/√2 times the change of its logarithm. The latter counts only where
+    the albedo was not divided out.
+    """
+    ok = status == Status.OK
+    odd = np.where(ok, uneven.astype(np.float64) ** 2 - sigma.astype(np.float64) ** 2, 0)
+    change = np.zeros(len(centre))
+    if ok.any():
+        lag = max(1, round(2**0.5 * float(np.median(width[ok]))))
+        logarithm = np.log(np.where(ok, np.maximum(level, 1e-12), 1).astype(np.float64))
+        pair = np.zeros(len(centre))
+        known = np.zeros(len(centre))
+        both = ok[:-lag] & ok[lag:] & (np.abs(centre[lag:] - centre[:-lag]) <= SAME_CURVE_PX * lag)
+        floor = noise**2 / (2 * np.pi**0.5 * np.maximum(width, 0.5))  # variance of the level: that of a mean under a Gaussian window
+        relative = floor / np.where(ok, np.maximum(level, 1e-12), 1).astype(np.float64) ** 2
+        step = np.where(both, (logarithm[lag:] - logarithm[:-lag]) ** 2 - relative[lag:] - relative[:-lag], 0)
+        pair[:-lag] += step
+        pair[lag:] += step
+        known[:-lag] += both
+        known[lag:] += both
+        change = np.where(even > 0, 0, 0.5 * width.astype(np.float64) ** 2
+                          * _beside(pair, FURTHER_LINES) / np.maximum(_beside(known, FURTHER_LINES), 1e-9))
+    around = _beside(odd, BESIDE_LINES) / np.maximum(_beside(ok.astype(float), BESIDE_LINES), 1e-9)
+    alone = np.where(odd > CUT**2 * sigma.astype(np.float64) ** 2, odd, 0)  # the edge of a surface cuts the stripe of this line
+    usual = float(np.median(width[ok])) if ok.any() else 0.0
+    cut = CUT_SHIFT * np.where(ok, np.maximum(NARROW * usual - width, 0), 0)
+    texture = np.maximum.reduce([around, alone, change, cut**2])
+    return np.sqrt(sigma.astype(np.float64) ** 2 + texture)
+
+
+def _beside(values: np.ndarray, lines: int) -> np.ndarray:
+    """Return the mean over so many lines on either side of each line; beyond the image values count as 0."""
+    return np.convolve(values, np.full(2 * lines + 1, 1 / (2 * lines + 1)), mode="full")[lines:lines + len(values)]

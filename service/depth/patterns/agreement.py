@@ -1,0 +1,150 @@
+"""Doubts that only the whole image raises: pixels that contradict their neighbours, other points or the epipolar geometry."""
+
+import numpy as np
+
+from kernels.status import SOLVED, Status
+from kernels.structured.opaque_surface import check_surface
+from service.depth.patterns.coordinates import DecodedSolution, stands_alone
+from service.depth.results.solution import DepthSolution
+from service.requests.depth import DepthRequest
+from stage.capture.camera import Camera
+from stage.capture.projector import Projector
+
+LIKELY = 0.5
+"""Least probability of being right of a depth that counts as solved, unless the request names a least confidence."""
+DOUBTED = 0.1
+"""Probability of being right of a depth that contradicts its neighbours or other points."""
+CONFIDENT = {Status.UNDECIDED: 0.4, Status.MULTIPATH: 0.1}
+"""Probability of being right of a depth whose decoder is not sure of it."""
+RESIDUAL_TIMES = 6.0
+"""Residual of a pixel under both axes over the usual one of the object, above which the pixel is doubted."""
+LEAST_RESIDUAL_PX = 0.5
+"""Residual that raises no doubt, however small the usual one is."""
+AROUND = 2
+"""Distance in pixels up to which neighbours count: where many of them are doubted, so is the pixel. An edge of depth doubts a fifth of
+them at most."""
+TRUSTED_PART = 0.6
+"""Least part of these neighbours that is not doubted."""
+DISTRUSTED = {Status.MULTIPATH: 1.0, Status.OUT_OF_RANGE: 1.0, Status.UNDECIDED: 0.5}
+"""How far pixels that the decoder refused count as doubted: noise alone leaves some undecided, light of other ways many of all."""
+UNLIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
+"""Statuses of pixels that the projector does not light well enough to tell anything."""
+SURE_SHARE = 0.5
+"""Share of the lit pixels with a depth that can be trusted, below which the whole capture is doubted."""
+ADVICE = {
+    Status.MULTIPATH: "light comes by several ways, as in fog or off shiny and translucent surfaces: project a code whose stripes are all "
+                      "fine (micro, modulated, xor)",
+    Status.UNDECIDED: "noise, or stripes finer than the camera resolves: use more light, or wider stripes",
+    Status.OUT_OF_RANGE: "the code and the geometry contradict each other: check the frames' patterns, projector.camera_from_projector and "
+                         "whether the projected image is mirrored",
+    Status.OCCLUDED: "the second camera does not see what this one sees: move the cameras closer together, and check that both captures "
+                     "are of the same patterns",
+    Status.ILL_POSED: "the projected coordinate hardly changes with depth: project columns from beside the camera, rows from above it",
+    Status.UNSURE: "neighbours contradict each other, as in mirrors and where frames are declared wrongly: check the frames' patterns",
+}
+"""The most frequent cause of each status, and what to do about it."""
+ENOUGH = 200
+"""Number of solved pixels from which a usual residual is taken."""
+
+
+def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera: Camera, projector: Projector, device: str) -> np.ndarray:
+    """Return the probability of each pixel's depth to be right, and add to σ what texture within the pixels does.
+
+    Args:
+        solution: of projected patterns.
+        residual_px: [rows, cols] of both axes; None with one axis.
+        camera, projector: their geometry.
+
+    Returns:
+        [rows, cols] float32, 0…1; 0 where there is no depth.
+    """
+    assert solution.sigma is not None and solution.amplitude is not None
+    solved = np.isin(solution.status, SOLVED)
+    right = np.zeros(solution.depth.shape, np.float32)
+    right[solved] = 1
+    for status, likely in CONFIDENT.items():
+        right[(solution.status == status) & (solution.depth != 0)] = likely
+    if camera.projection == "perspective" and solved.any():
+        x, y = camera.plane_coordinates()
+        found = check_surface(solution.depth, solution.sigma, solution.amplitude, solved, x, y, projector.projector_from_camera(),
+                              device=device)
+        wrong = ((found.turned.numpy() | found.alone.numpy() | found.contradicted.numpy()) > 0).reshape(right.shape) & solved
+        right[wrong] = DOUBTED
+        solution.sigma[solved] = np.hypot(solution.sigma, found.deviation.numpy().reshape(right.shape))[solved]
+        solution.facts["doubted"] = {"facing_away": int(found.turned.numpy().sum()), "alone": int(found.alone.numpy().sum()),
+                                     "lit_twice": int(found.contradicted.numpy().sum())}
+    if residual_px is not None and solved.sum() >= ENOUGH:
+        usual = max(float(np.median(residual_px[solved])), LEAST_RESIDUAL_PX / RESIDUAL_TIMES)
+        right[solved & (residual_px > RESIDUAL_TIMES * usual)] = DOUBTED
+    return _doubt_around(right, solution.status)
+
+
+def doubt_coordinates(solution: DecodedSolution) -> np.ndarray:
+    """Return the probability of each pixel's projector coordinates to be right, from its decoder and its neighbours alone.
+
+    Returns:
+        [rows, cols] float32, 0…1; 0 where there is no coordinate.
+    """
+    right = np.zeros(solution.status.shape, np.float32)
+    right[solution.solved] = 1
+    for status, likely in CONFIDENT.items():
+        right[(solution.status == status) & solution.estimated] = likely
+    alone = np.logical_or.reduce([stands_alone(axis) for axis in solution.coordinates.axes]) & solution.solved
+    right[alone] = DOUBTED
+    solution.facts["doubted"] = {"alone": int(alone.sum())}
+    return _doubt_around(right, solution.status)
+
+
+def _doubt_around(right: np.ndarray, status: np.ndarray) -> np.ndarray:
+    """Return the probabilities with those of pixels lowered around which many are doubted or refused."""
+    solved = np.isin(status, SOLVED)
+    trust = (right >= LIKELY).astype(np.float32)
+    known = solved.astype(np.float32)
+    for code, weight in DISTRUSTED.items():
+        known[status == code] = weight
+    share = _mean_around(trust * known, known)
+    return np.where(solved & (share < TRUSTED_PART), np.minimum(right, DOUBTED + share * (LIKELY - DOUBTED)), right).astype(np.float32)
+
+
+def _mean_around(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the sum of values over the sum of weights in the square of 2 AROUND + 1 pixels about each pixel; 1 where no weight is."""
+    sums = []
+    for plane in (values, weight):
+        total = np.cumsum(np.cumsum(np.pad(plane, AROUND + 1).astype(np.float64), axis=0), axis=1)
+        size = 2 * AROUND + 1
+        window = total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
+        sums.append(window[:values.shape[0], :values.shape[1]])
+    return np.asarray(np.where(sums[1] > 1e-6, sums[0] / np.maximum(sums[1], 1e-6), 1.0))
+
+
+def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask: np.ndarray, request: DepthRequest,
+             warnings: list[str]) -> None:
+    """Say what does not fit on the whole scene, and let confidence and status follow.
+
+    Args:
+        solution: its warnings, confidence and status are changed.
+        right: of `doubt_pixels` or `doubt_coordinates`.
+        mask: [rows, cols] bool.
+        request: near and far, the residual, and the least confidence; where it names one, it alone decides what counts as solved.
+        warnings: what a sample has shown of the frames; where frames are declared wrongly, no depth is believed.
+    """
+    lit = mask & ~np.isin(solution.status, UNLIT)
+    if request.near_m is not None or request.far_m is not None:
+        lit &= solution.status != Status.OUT_OF_RANGE
+    sure = lit & np.isin(solution.status, SOLVED) & (right >= LIKELY)
+    share = sure.sum() / max(int(lit.sum()), 1)
+    declared = not any(sentence.startswith("frames:") for sentence in warnings)
+    if not declared:
+        right = np.minimum(right, DOUBTED)
+    elif lit.sum() >= ENOUGH and share < SURE_SHARE:
+        refused = np.where(lit & ~sure & np.isin(solution.status, SOLVED), int(Status.UNSURE), solution.status)[lit & ~sure]
+        most = Status(int(np.bincount(refused).argmax()))
+        what = "depth" if isinstance(solution, DepthSolution) else "place in the projector"
+        warnings = [*warnings, f"frames: {100 * share:.2g} % of the {int(lit.sum())} lit pixels have a {what} that can be trusted; "
+                               f"most of the others are {most.name.lower().replace('_', ' ')}: {ADVICE[most]}"]
+    confidence = solution.confidence_map()
+    assert confidence is not None  # it follows from sigma
+    solution.confidence = (right * min(1.0, share / SURE_SHARE) * confidence).astype(np.float32)
+    solution.warnings += warnings
+    if request.least_confidence is None:
+        solution.status[np.isin(solution.status, SOLVED) & (right < LIKELY)] = Status.UNSURE

@@ -1,0 +1,292 @@
+"""Checks of a capture under patterns by a sample of its pixels: frames that are declared wrongly, and waves that the projector bends."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels.errors import KernelError
+from kernels.status import OK, Status
+from kernels.structured.decoded import Decoded
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.response import bent_wave
+from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.patterns.codes import choose_decoder
+from service.depth.patterns.decoders import AxisDecoder, PatternProjector
+from service.depth.patterns.readings import Readings
+from stage.capture.camera import Camera
+from stage.colour.colour import GREY_WEIGHTS
+from stage.errors import StageError
+from stage.patterns.base import Axis
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected, Pattern, collect
+from stage.patterns.phase import PhaseCode
+from stage.stack.planes import Planes
+
+ROWS = 32
+"""Number of image rows in the sample, evenly spread."""
+ENOUGH = 300
+"""Number of sampled pixels with signal below which nothing is concluded."""
+SMOOTH_PART, SMOOTH_SIGMAS = 0.02, 4.0
+"""Neighbours agree where their depths differ by less than this part, or this many deviations."""
+DOUBTFUL_SHARE = 0.5
+"""Share of the pixels with signal that agree with a neighbour, below which other readings of the manifest are tried."""
+CLEAR_SHARE, CLEAR_TIMES = 0.4, 2.0
+"""Another reading is named where it makes at least this share agree, and this many times as many as declared."""
+UNEVEN, LARGEST_STEP = 0.01, 0.05
+"""Mean distance of neighbouring pixels in the projector, as a part of its extent, above which other readings are tried, and the distance
+that pixels which are farther apart count with."""
+AXES: tuple[Axis, Axis] = ("column", "row")
+NOT_LIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
+"""Statuses of pixels that cannot tell whether the frames are declared rightly."""
+MEAN_TOLERANCE = 0.04
+"""Distance of the mean of a wave from half of white above which the projector is not linear; photographs have 0.01."""
+EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
+"""Exponents of light = level^γ that are compared."""
+BAD_FIT, BETTER_FIT = 3.0, 0.5
+"""Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
+LEAST_SIGNAL = 20.0
+"""Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
+
+
+class Sample(NamedTuple):
+    """Some rows of the frames."""
+
+    values: np.ndarray  # [frames, channels, pixels] float32
+    saturated: np.ndarray | None  # [frames, pixels] bool
+    x: np.ndarray  # [rows, cols] float32, line of sight
+    y: np.ndarray  # [rows, cols] float32
+    mask: np.ndarray  # [rows, cols] bool
+
+    @property
+    def grey(self) -> np.ndarray:
+        """Return [frames, pixels] float32."""
+        if self.values.shape[1] == 1:
+            return self.values[:, 0]
+        return np.tensordot(self.values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+
+
+def sample_of(planes: Planes, camera: Camera, mask: np.ndarray) -> Sample:
+    """Return evenly spread rows of the frames."""
+    rows = np.unique(np.linspace(0, mask.shape[0] - 1, ROWS + 2).astype(int)[1:-1]) if mask.shape[0] > ROWS else np.arange(mask.shape[0])
+    x, y = camera.plane_coordinates()
+    values = np.concatenate([planes.band(slice(row, row + 1)) for row in rows], axis=2)
+    saturated = None if planes.saturated is None else planes.saturated[:, rows].reshape(len(values), -1)
+    return Sample(values, saturated, x[rows].astype(np.float32), y[rows].astype(np.float32), mask[rows])
+
+
+class Reading(NamedTuple):
+    """One way to understand the frames."""
+
+    words: str
+    """The mistake that would explain it, and what to check."""
+    patterns: Callable[[list[Pattern]], list[Pattern]]
+    """Returns what the frames would show then."""
+    mirrored: bool = False
+    """Whether the coordinates run from the other border."""
+
+
+def _changed(**fields: Callable[[Any], Any]) -> Callable[[list[Pattern]], list[Pattern]]:
+    """Return a function that changes fields of the patterns that have them, each by a function of its pattern."""
+    def change(pattern: Pattern) -> Pattern:
+        return pattern.model_copy(update={name: value(pattern) for name, value in fields.items() if hasattr(pattern, name)})
+
+    return lambda patterns: [change(pattern) for pattern in patterns]
+
+
+READINGS = (
+    Reading("patterns and inverses are exchanged: check inverse in the frames' patterns",
+            _changed(inverse=lambda p: not p.inverse)),
+    Reading("columns and rows are exchanged: check axis in the frames' patterns",
+            _changed(axis=lambda p: "row" if p.axis == "column" else "column")),
+    Reading("the order of bits is reversed: check bit in the frames' patterns (bit 0 is the finest)",
+            _changed(bit=lambda p: p.bits - 1 - p.bit)),
+    Reading("the steps of the phases run backwards: check step in the frames' patterns",
+            _changed(step=lambda p: -p.step % p.steps)),
+    Reading("the images are in reverse order: check image in frames", lambda patterns: patterns[::-1]),
+    Reading("the images are one frame late: check image in frames", lambda patterns: [*patterns[1:], patterns[0]]),
+    Reading("the images are one frame early: check image in frames", lambda patterns: [patterns[-1], *patterns[:-1]]),
+    Reading("the projected image is mirrored: check the projector's settings and projector.camera_from_projector", list, True),
+)
+
+
+def agreeing_share(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
+                   device: str, *, mirrored: bool = False) -> float:
+    """Return the share of pixels with signal whose depth agrees with that of the next pixel of the row; NaN without enough signal."""
+    collected = collect(list(patterns))
+    decoders = [choose_decoder(collected, axis, projector)[0] for axis in ("column", "row")]
+    shape = sample.mask.shape
+    decoded = [None if decoder is None else decode_sample(sample, decoder, noise, device) for decoder in decoders]
+    if mirrored:
+        decoded = [None if axis is None else _mirror(axis, extent, device) for axis, extent in zip(decoded, model.size, strict=True)]
+    found = triangulate(sample.x.ravel(), sample.y.ravel(), decoded[0], decoded[1], model, near_m=0.0, far_m=np.inf, max_residual_px=4.0,
+                        device=device)
+    depth, sigma, status = (array.numpy()[:sample.mask.size].reshape(shape) for array in (found.depth, found.sigma, found.status))
+    lit = sample.mask & ~np.isin(status, NOT_LIT)
+    pairs = lit[:, 1:] & lit[:, :-1]
+    if pairs.sum() < ENOUGH:
+        return float("nan")
+    known = (status == OK) & lit
+    step = np.abs(np.diff(depth, axis=1))
+    limit = np.maximum(SMOOTH_PART * depth[:, 1:], np.minimum(SMOOTH_SIGMAS * np.hypot(sigma[:, 1:], sigma[:, :-1]), 0.1 * depth[:, 1:]))
+    return float((known[:, 1:] & known[:, :-1] & (step <= limit)).sum() / pairs.sum())
+
+
+def decode_sample(sample: Sample, decoder: AxisDecoder, noise: NoiseModel, device: str) -> Decoded:
+    """Decode the rows of a sample."""
+    return decoder.decode(Readings.of(sample.values, sample.saturated, sample.mask.shape[1], decoder.made, device=device), noise)
+
+
+def _mirror(axis: Decoded, extent: float, device: str) -> Decoded:
+    return axis._replace(coordinate=type(axis.coordinate)(extent - axis.coordinate.numpy(), device=device))
+
+
+def check_declaration(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
+                      device: str) -> str | None:
+    """Return a sentence if the frames make much more sense when they are understood in another way than the manifest declares."""
+    share = agreeing_share(sample, patterns, projector, model, noise, device)
+    if not share < DOUBTFUL_SHARE:
+        return None
+    best, chosen = 0.0, None
+    for reading in READINGS:
+        try:
+            other = reading.patterns(patterns)
+            if not reading.mirrored and other == patterns:
+                continue
+            found = agreeing_share(sample, other, projector, model, noise, device, mirrored=reading.mirrored)
+        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
+            continue
+        if found > best:
+            best, chosen = found, reading
+    if chosen is None or best < max(CLEAR_SHARE, CLEAR_TIMES * share):
+        return None
+    return (f"frames: as declared, {100 * share:.0f} % of the pixels with signal agree with their neighbours; {100 * best:.0f} % do if "
+            f"{chosen.words}")
+
+
+def check_unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjector, noise: NoiseModel, device: str) -> str | None:
+    """Return a sentence if the coordinates are far more even when the frames are understood in another way than the manifest declares.
+
+    This tells without any calibration what `check_declaration` tells with it, but for exchanged axes and mirrored images: they are as
+    even.
+    """
+    declared = unevenness(sample, patterns, projector, noise, device)
+    if not declared > UNEVEN:
+        return None
+    best, chosen = declared, None
+    for reading in READINGS:
+        try:
+            other = reading.patterns(patterns)
+            found = float("nan") if reading.mirrored or other == patterns else unevenness(sample, other, projector, noise, device)
+        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
+            continue
+        if found < best:
+            best, chosen = found, reading
+    if chosen is None or best > declared / CLEAR_TIMES:
+        return None
+    return (f"frames: as declared, neighbouring pixels lie {100 * declared:.2g} % of the projector apart on average; {100 * best:.2g} % if "
+            f"{chosen.words}")
+
+
+def unevenness(sample: Sample, patterns: list[Pattern], projector: PatternProjector, noise: NoiseModel, device: str) -> float:
+    """Return how far apart neighbouring pixels of a row lie in the projector, on average, as a part of its extent.
+
+    Pairs that are far apart or not decoded count as LARGEST_STEP, as do pairs without light. NaN without enough of them.
+    """
+    collected = collect(list(patterns))
+    steps = []
+    for axis, extent in zip(AXES, projector.resolution, strict=True):
+        decoder, _ = choose_decoder(collected, axis, projector)
+        if decoder is None:
+            continue
+        decoded = decode_sample(sample, decoder, noise, device)
+        u, status = (array.numpy()[:sample.mask.size].reshape(sample.mask.shape) for array in (decoded.coordinate, decoded.status))
+        sure = (status == OK)[:, 1:] & (status == OK)[:, :-1]
+        pairs = sample.mask[:, 1:] & sample.mask[:, :-1]
+        step = np.where(sure, np.minimum(np.abs(np.diff(u, axis=1)) / extent, LARGEST_STEP), LARGEST_STEP)[pairs]
+        steps.append(float(step.mean()) if step.size >= ENOUGH else float("nan"))
+    return max(steps, default=float("nan"))
+
+
+def find_exponent(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel, device: str) -> float:
+    """Return the exponent γ of light = level^γ that the waves of a capture show; 1.0 where they are as they should be."""
+    for code in collected.codes:
+        if isinstance(code, PhaseCode):
+            found = _exponent_of_mean(sample, code, collected, noise)
+            if found is None:
+                found = _exponent_of_fit(sample, code, collected, projector, noise, device)
+            if found != 1.0:
+                return found
+    return 1.0
+
+
+def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noise: NoiseModel) -> float | None:
+    """Return the exponent from the mean of the waves between black and white; None without frames that tell them."""
+    grey = sample.grey
+    if collected.white is not None and collected.black is not None:
+        dark, span = grey[collected.black], grey[collected.white] - grey[collected.black]
+    else:
+        pair = next((other for other in collected.codes if isinstance(other, BinaryCode) and other.inverses is not None), None)
+        if pair is None or pair.inverses is None:
+            return None
+        span = np.max([np.abs(grey[a] - grey[b]) for a, b in zip(pair.frames, pair.inverses, strict=True)], axis=0)
+        dark = 0.5 * (grey[pair.frames[-1]] + grey[pair.inverses[-1]] - span)
+    good = sample.mask.ravel() & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
+    if sample.saturated is not None:
+        good &= ~sample.saturated.any(axis=0)
+    if good.sum() < ENOUGH:
+        return None
+    shifts, periods = np.array(code.shifts), np.array(code.periods_px)
+    even = [np.flatnonzero(periods == period) for period in dict.fromkeys(code.periods_px)]
+    even = [members for members in even if len(members) >= 3 and abs(np.exp(2j * np.pi * shifts[members]).sum()) < 1e-6]
+    if not even:
+        return None
+    means = [np.median((np.mean(grey[[code.frames[i] for i in members]], axis=0)[good] - dark[good]) / span[good]) for members in even]
+    mean = float(np.median(means))
+    if abs(mean - 0.5) <= MEAN_TOLERANCE:
+        return 1.0
+    fine = np.linspace(0.3, 4.0, 371)
+    table = [float(bent_wave(np.linspace(0, 1, 256)**g).mean()) for g in fine]
+    return float(np.interp(-mean, -np.array(table), fine))
+
+
+def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, projector: PatternProjector, noise: NoiseModel,
+                     device: str) -> float:
+    """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
+    grey = sample.grey[list(code.frames)].astype(np.float64)
+    if len(code.frames) < 5:
+        return 1.0  # offset, amplitude and place leave one reading over at most
+    variance = noise.read**2 + noise.gain * np.maximum(grey.mean(axis=0), 0)
+    misfit = {}
+    for exponent in EXPONENTS:
+        response = np.linspace(0, 1, 256)**exponent
+        bent = projector._replace(response=None if exponent == 1.0 else tuple(response.tolist()))
+        try:
+            decoder, _ = choose_decoder(collected, code.axis, bent)
+            if decoder is None:
+                return 1.0
+            decoded = decode_sample(sample, decoder, noise, device)
+        except KernelError:  # two places look alike under this response
+            continue
+        u, status = (array.numpy()[:grey.shape[1]] for array in (decoded.coordinate, decoded.status))
+        keep = (status == OK) & sample.mask.ravel()
+        if keep.sum() < ENOUGH:
+            continue
+        wave = bent_wave(response)
+        turns = (u[keep] / np.array(code.periods_px)[:, None] - np.array(code.shifts)[:, None]) % 1.0
+        light = np.interp(turns, np.arange(len(wave) + 1) / len(wave), np.append(wave, wave[0]))
+        light -= light.mean(axis=0)
+        seen = grey[:, keep] - grey[:, keep].mean(axis=0)
+        rest = (seen**2).sum(axis=0) - (light * seen).sum(axis=0)**2 / np.maximum((light**2).sum(axis=0), 1e-12)
+        misfit[exponent] = float(np.median(rest / variance[keep]) / (len(code.frames) - 3))
+    plain = misfit.get(1.0, float("nan"))
+    if not misfit or not plain > BAD_FIT:
+        return 1.0
+    best = min(misfit, key=lambda exponent: misfit[exponent])
+    return best if misfit[best] < BETTER_FIT * plain else 1.0
+
+
+def response_sentence(exponent: float, codes: Sequence[str]) -> str:
+    """Return what is said of waves that a projector bends."""
+    return (f"projector.response: is not given, but the projected waves look like light = level^{exponent:.2g}, not linear: the error that "
+            f"this makes is in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")

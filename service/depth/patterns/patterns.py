@@ -1,0 +1,311 @@
+"""Depth from frames under projected patterns: decode each axis band by band, then triangulate, where the capture is calibrated."""
+
+from collections.abc import Iterator, Sequence
+from math import ceil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels.status import ESTIMATED, SOLVED, Status
+from kernels.structured.decoded import Decoded, cropped
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.patterns.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
+from service.depth.patterns.codes import choose_decoder
+from service.depth.patterns.coordinates import Coordinates, DecodedSolution
+from service.depth.patterns.decoders import AxisDecoder, PatternProjector
+from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
+from service.depth.patterns.readings import Readings, even_light
+from service.depth.patterns.triangulation_check import check_projector, missing_calibration
+from service.depth.results.solution import DepthSolution
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.depth import DepthRequest
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.capture.projector import Projector
+from stage.colour.colour_spaces import is_linear
+from stage.errors import ManifestError
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected, collect
+from stage.patterns.kary import KaryCode
+from stage.patterns.modulated import ModulatedCode
+from stage.stack.correction import Correction
+from stage.stack.pattern_exposures import JoinedExposures, frames_shown
+from stage.stack.planes import Planes, frame_planes
+
+SCALE_PERCENTILE = 99.9
+"""Percentile of the brightest frame that is taken for full scale, for images in floating point without a given saturation."""
+SCALE_SAMPLE = 500_000
+"""Number of pixels of a frame from which full scale is taken."""
+DECODE_BYTES_PER_PIXEL = 200
+"""Memory that decoding and triangulation take for each pixel, beside the planes."""
+
+
+class PatternCodes(NamedTuple):
+    """The codes of a capture and the decoder of each axis; None where an axis has no code."""
+
+    collected: Collected
+    columns: AxisDecoder | None
+    rows: AxisDecoder | None
+    unused: tuple[str, ...]
+    """Codes that no decoder reads."""
+
+    @property
+    def method(self) -> str:
+        """Return the names of the decoders."""
+        return ", ".join(sorted({decoder.name for decoder in (self.columns, self.rows) if decoder is not None}))
+
+    @property
+    def colour(self) -> bool:
+        """Return whether a decoder needs colour frames."""
+        return any(decoder is not None and decoder.colour for decoder in (self.columns, self.rows))
+
+
+def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str,
+                   timings: Timings) -> DepthSolution | DecodedSolution:
+    """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
+
+    Args:
+        capture: with pattern frames.
+        mask: [rows, cols] bool.
+        request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
+
+    Returns:
+        Depth; or the decoded coordinates alone, where the capture is not calibrated or where no decoded pixel has a depth.
+
+    Raises:
+        StageError: a calibration that cannot be, an incomplete code, an unreadable frame.
+        RequestError: options about depth for a capture that is not calibrated.
+    """
+    missing = missing_calibration(capture)
+    projector = check_projector(capture) if missing is None else None
+    if missing is not None:
+        _refuse_depth_options(request, missing)
+    frames, series = frames_shown(capture)
+    shown = pattern_projector(capture, frames)
+    codes = read_codes(capture, frames, shown, refine=request.refine)
+    joined = None
+    if series is not None:
+        timings.stage("exposures", len(frames))
+        joined = JoinedExposures(capture, series, timings.advance)
+    timings.stage("frames", len(frames))
+    with frame_planes(capture, frames, colour=codes.colour, cache=request.cache, progress=timings.advance, joined=joined) as planes:
+        full = full_scale(planes, capture, frames) if joined is None else joined.full_scale
+        reads = 1 if series is None else len(series.times_s)
+        noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
+        warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
+        coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
+        if projector is None:
+            timings.stage("decode", mask.shape[0])
+            for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
+                coordinates.put(band, mask[band], decoded)
+                timings.advance(band.stop)
+        else:
+            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
+        if planes.exposure is not None:
+            coordinates.amplitude /= planes.exposure
+    facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
+             "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
+             "unused": list(codes.unused)}
+    if series is not None and joined is not None:
+        facts |= {"exposures_s": list(series.times_s), "pixels_of_exposures": list(joined.counts)}
+    spanned = request.near_m is not None or request.far_m is not None  # which may be what refuses all depths
+    if projector is not None and (spanned or solution.estimated.any() or not np.isin(coordinates.status(), SOLVED).any()):
+        conclude(solution, right, mask, request, warnings)
+        solution.colour = scene_colour(capture, frames, codes.collected, joined)
+        solution.facts |= facts
+        return solution
+    reason = missing or f"no decoded pixel has a depth ({_refused(solution, mask)}"
+    decoded_only = DecodedSolution(method=codes.method, coordinates=coordinates, extents=shown.resolution, status=coordinates.status())
+    conclude(decoded_only, doubt_coordinates(decoded_only), mask, request, warnings)
+    decoded_only.warnings.insert(0, f"decoded only, without depth: {reason}")
+    decoded_only.facts |= facts | {"decoded_only": reason}
+    return decoded_only
+
+
+def _refuse_depth_options(request: DepthRequest, missing: str) -> None:
+    """Refuse options that say something about depths where there will be none.
+
+    Raises:
+        RequestError: names the option.
+    """
+    for option in ("near_m", "far_m", "max_sigma", "normals"):
+        if getattr(request, option) not in (None, False):
+            raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
+
+
+def _refused(solution: DepthSolution, mask: np.ndarray) -> str:
+    """Return how many pixels have each status, and what most often is the cause of the commonest that triangulation gives."""
+    counts = {Status[name.upper()]: count for name, count in solution.counts(mask).items() if count}
+    most = max((Status.OUT_OF_RANGE, Status.ILL_POSED), key=lambda status: counts.get(status, 0))
+    listed = ", ".join(f"{count} {status.name.lower()}" for status, count in counts.items() if status != Status.UNSOLVED)
+    return f"{listed}): {ADVICE[most]}"
+
+
+def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProjector:
+    """Return what decoding needs of the projector; where the manifest has none, stripes that are counted by bits or digits tell its size.
+
+    Raises:
+        ManifestError: the projector is missing, and the codes do not tell how many pixels it has.
+    """
+    projector = capture.manifest.projector
+    if projector is not None:
+        return PatternProjector(projector.resolution, projector.response, projector.crosstalk)
+    codes = collect([frame.pattern for frame in frames]).codes
+    size = {"column": 0, "row": 0}
+    for code in codes:
+        if isinstance(code, BinaryCode | KaryCode):
+            size[code.axis] = max(size[code.axis], ceil(code.stripe_count * code.stripe_px))
+    for code in codes:
+        if not size[code.axis]:
+            raise ManifestError(f"{capture.folder / FILE_NAME}: projector: is missing, and a {code.name} code does not tell how many "
+                                'pixels it has: give its size at least, as "projector": {"resolution": [1280, 800]}')
+    return PatternProjector((size["column"] or 1, size["row"] or 1))  # an axis without a code has no coordinate
+
+
+def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: PatternProjector, projector: Projector | None,
+             capture: Capture, frames: list[Frame], noise: NoiseModel, device: str,
+             request: DepthRequest) -> tuple[list[str], PatternCodes]:
+    """Return what a sample of the frames says about all of them, and the decoders that heed it."""
+    sample = sample_of(planes, capture.camera, mask)
+    patterns = [frame.pattern for frame in frames if frame.pattern is not None]
+    wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
+             else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
+    if wrong is not None:
+        return [wrong], codes
+    if shown.response is None:
+        exponent = find_exponent(sample, codes.collected, shown, noise, device)
+        if exponent != 1.0:
+            names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
+            return ([response_sentence(exponent, names)],
+                    read_codes(capture, frames, shown._replace(exponent=exponent), refine=request.refine))
+    return [], codes
+
+
+def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:
+    """Return the codes of a capture and how each axis is decoded.
+
+    Raises:
+        ManifestError: a code is incomplete; names the file.
+    """
+    try:
+        if len(frames) == sum(frame.pattern is not None for frame in capture.manifest.frames):
+            collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
+        collected = collect([frame.pattern for frame in frames])
+        columns, unused_columns = choose_decoder(collected, "column", projector, refine=refine)
+        rows, unused_rows = choose_decoder(collected, "row", projector, refine=refine)
+        return PatternCodes(collected, columns, rows, unused_columns + unused_rows)
+    except ManifestError as error:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames: {error}") from error
+
+
+def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
+           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
+    """Return the depth of each pixel and its probability to be right; fill the coordinates."""
+    shape = mask.shape
+    columns, rows = codes.columns, codes.rows
+    model = projector_model(projector)
+    x, y = capture.camera.plane_coordinates()
+    maps = {name: np.zeros(shape, np.float32) for name in ("depth", "sigma", "residual")}
+    status = np.zeros(shape, np.uint8)
+    timings.stage("decode", shape[0])
+    for band, decoded in decoded_bands(planes, (columns, rows), noise, device):
+        found = triangulate(x[band].ravel().astype(np.float32), y[band].ravel().astype(np.float32), decoded[0], decoded[1], model,
+                            near_m=request.near_m or 0.0, far_m=request.far_m or np.inf, max_residual_px=request.max_residual_px,
+                            device=device)
+        part = mask[band]
+        coordinates.put(band, part, decoded)
+        code = found.status.numpy()[:part.size].reshape(part.shape)
+        status[band] = np.where(part, code, int(Status.UNSOLVED))
+        solved = np.isin(status[band], SOLVED)
+        kept = solved | (np.isin(status[band], ESTIMATED) & (found.depth.numpy()[:part.size].reshape(part.shape) > 0))
+        for name in maps:
+            maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
+        timings.advance(band.stop)
+    for index, axis in enumerate((coordinates.columns, coordinates.rows)):
+        if axis is not None:
+            missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
+            axis.coordinate[missing] = projector.project(capture.camera.points(-maps["depth"])[missing])[0][:, index]
+            axis.sigma[missing] = 0
+    solved = np.isin(status, SOLVED)
+    facts: dict[str, Any] = {}
+    both = columns is not None and rows is not None
+    if both and solved.any():
+        low, high = np.percentile(maps["residual"][solved], [50, 95])
+        facts["residual_px"] = {"median": float(f"{low:.4g}"), "p95": float(f"{high:.4g}")}
+    u, v = coordinates.columns, coordinates.rows
+    solution = DepthSolution(method=codes.method, depth=maps["depth"], status=status, sigma=maps["sigma"],
+                             projector_u=None if u is None else u.coordinate, projector_v=None if v is None else v.coordinate,
+                             sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
+                             amplitude=coordinates.amplitude, facts=facts)
+    right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
+    return solution, right
+
+
+def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,
+                  device: str) -> Iterator[tuple[slice, list[Decoded | None]]]:
+    """Decode the planes band by band.
+
+    Yields:
+        A range of rows, and each axis decoded in it; None where an axis has no decoder.
+    """
+    _, height, _, width = planes.values.shape
+    made = next((decoder.made for decoder in decoders if decoder is not None and decoder.made is not None), None)
+    halo = max((decoder.halo for decoder in decoders if decoder is not None), default=0)
+    for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+        around = slice(max(band.start - halo, 0), min(band.stop + halo, height))
+        values = planes.band(around)
+        saturated = None if planes.saturated is None else planes.saturated[:, around].reshape(len(values), -1)
+        exposure = None if planes.exposure is None else planes.exposure[around].reshape(-1)
+        readings = Readings.of(values, saturated, width, made, device=device, exposure=exposure)
+        decoded = [None if decoder is None else decoder.decode(readings, noise) for decoder in decoders]
+        if around != band:
+            first, count = (band.start - around.start) * width, (band.stop - band.start) * width
+            decoded = [None if axis is None else cropped(axis, first, count, device=device) for axis in decoded]
+        yield band, decoded
+
+
+def projector_model(projector: Projector) -> ProjectorModel:
+    """Return the projector as triangulation takes it."""
+    width, height = projector.resolution
+    lens = projector.distortion
+    return ProjectorModel((width, height), projector.focal_px, projector.principal_px or (width / 2, height / 2),
+                          lens.k if lens is not None else (0.0, 0.0, 0.0), lens.p if lens is not None else (0.0, 0.0),
+                          projector.projector_from_camera())
+
+
+def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
+    """Return the largest reading there can be, in the unit of the corrected images."""
+    exposure = min((frame.exposure_s for frame in frames if frame.exposure_s is not None), default=1.0)
+    manifest = capture.manifest
+    integers = all(Path(frame.image).suffix.lower() in (".png", ".jpg", ".jpeg") for frame in frames)
+    if integers or not is_linear(manifest.color_space):
+        return 1.0 / exposure
+    if manifest.saturation is not None:
+        return manifest.saturation / exposure
+    every = max(1, planes.values[0].size // SCALE_SAMPLE)
+    return max(float(max(np.percentile(frame.reshape(-1)[::every], SCALE_PERCENTILE) for frame in planes.values)), 1e-12)
+
+
+def scene_colour(capture: Capture, frames: list[Frame], collected: Collected, joined: JoinedExposures | None = None) -> np.ndarray | None:
+    """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light,
+    else the mean of a wave over its shifts.
+
+    None if the capture has none of them.
+    """
+    parts = {collected.white: 1.0} if collected.white is not None else {}
+    for code in collected.codes:
+        if not parts and isinstance(code, BinaryCode) and code.inverses is not None:
+            parts = {code.frames[0]: 1.0, code.inverses[0]: 1.0}
+    waves = even_light(collected)
+    if not parts and waves is not None:
+        parts = dict(zip(waves.frames, waves.weights[:, 0], strict=True))
+    for code in collected.codes:
+        if not parts and isinstance(code, ModulatedCode):
+            parts = {number: 1.0 for step in code.frames for number in step}
+    if not parts:
+        return None
+    read = Correction.of(capture).apply if joined is None else joined.read
+    return np.asarray(np.sum([weight * read(frames[number]).pixels for number, weight in parts.items()], axis=0))

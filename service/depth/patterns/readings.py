@@ -1,0 +1,109 @@
+"""The frames of a band on the device, with white and black made of phases where a capture has photographed neither.
+
+The mean of a wave over its shifts is the light half way between white and black, and its amplitude is half their difference: a wave that is
+resolved by camera and projector says what both frames would.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.packs import Band
+from kernels.structured.pattern_frames import saturated_bits, upload
+from kernels.structured.phase import weights
+from kernels.structured.response import bent_wave
+from stage.colour.colour import GREY_WEIGHTS
+from stage.patterns.codes import Collected
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+
+
+class EvenLight(NamedTuple):
+    """How white and black are made of the phase frames of one period."""
+
+    frames: tuple[int, ...]
+    weights: np.ndarray  # [frames, 3] of each reading in the mean, the cosine and the sine
+    mean: float = 0.5
+    """Mean of the projected wave between black and white."""
+    swing: float = 0.5
+    """Amplitude of its fundamental, white minus black being 1."""
+
+    def white_and_black(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the frames of white and black would be, from all frames [frames, ...] of a band."""
+        mean, along, across = np.tensordot(self.weights.T, readings[list(self.frames)], 1).astype(np.float32)
+        whole = np.hypot(along, across) / np.float32(self.swing)
+        return mean + np.float32(1 - self.mean) * whole, mean - np.float32(self.mean) * whole
+
+
+def even_light(collected: Collected, response: Sequence[float] | None = None) -> EvenLight | None:
+    """Return how white and black follow from the phases of a capture: from the longest period, which blur dims least.
+
+    Args:
+        collected: the codes of the capture.
+        response: the projector's light at even levels from 0 to 1; None: linear.
+
+    Returns:
+        None if no period has three shifts.
+    """
+    found: list[tuple[float, EvenLight]] = []
+    for code in collected.codes:
+        if not isinstance(code, PhaseCode):
+            continue
+        for period in dict.fromkeys(code.periods_px):
+            members = [index for index, other in enumerate(code.periods_px) if other == period]
+            if len(members) >= FULL_STEPS:
+                shifts = np.array([code.shifts[index] for index in members])
+                frames = tuple(code.frames[index] for index in members)
+                found.append((period, EvenLight(frames, weights(shifts, period))))
+    if not found:
+        return None
+    light = max(found, key=lambda pair: pair[0])[1]
+    if response is None:
+        return light
+    wave = bent_wave(response)
+    first = 2 * np.abs(np.fft.rfft(wave)[1]) / len(wave)
+    return light._replace(mean=float(wave.mean()), swing=float(first))
+
+
+class Readings(NamedTuple):
+    """The frames of a band on the device."""
+
+    grey: Band
+    colour: Band | None
+    """The frames with three channels; None if no code has colours."""
+    columns: int
+    """Number of pixels of an image row; the band consists of whole rows."""
+    made: tuple[int, int] | None = None
+    """White and black that are made of phases, as indices of `grey`; None if none are."""
+    radiance: Band | None = None
+    """The grey frames without the exposures of the pixels, where these differ; None: `grey` is."""
+
+    @property
+    def alike(self) -> Band:
+        """Return grey frames whose neighbouring pixels can be compared, as the edges of stripes between them need."""
+        return self.grey if self.radiance is None else self.radiance
+
+    @classmethod
+    def of(cls, values: np.ndarray, saturated: np.ndarray | None, columns: int, made: EvenLight | None, *, device: str,
+           exposure: np.ndarray | None = None) -> "Readings":
+        """Upload the frames of a band.
+
+        Args:
+            values: [frames, channels, pixels] float32; channels 1 or 3.
+            saturated: [frames, pixels] bool; None when no reading saturates.
+            columns: pixels of an image row.
+            made: how white and black are made; None to leave them out.
+            exposure: [pixels] by which the values were multiplied; None: all by the same.
+        """
+        grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+        bits = None if saturated is None else saturated_bits(saturated)
+        colour = upload(values, bits, device=device) if values.shape[1] > 1 else None
+        radiance = None if exposure is None else upload(np.ascontiguousarray(grey / exposure), bits, device=device)
+        if made is None:
+            return cls(upload(np.ascontiguousarray(grey), bits, device=device), colour, columns, radiance=radiance)
+        count = len(grey)
+        grey = np.concatenate([grey, *(frame[None] for frame in made.white_and_black(grey))])
+        if saturated is not None:
+            cut = saturated[list(made.frames)].any(axis=0, keepdims=True)
+            bits = saturated_bits(np.concatenate([saturated, cut, cut]))
+        return cls(upload(grey, bits, device=device), colour, columns, (count, count + 1), radiance)

@@ -1,0 +1,1 @@
+"""What every depth method returns, and its points."""

@@ -1,0 +1,1 @@
+"""Depth from two or more cameras."""

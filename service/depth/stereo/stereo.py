@@ -1,0 +1,252 @@
+"""Depth from two or more cameras under projected texture, at the pixels of the camera of the capture.
+
+Each other camera is matched with the camera of the capture (stereo_pair.py) in rectified images; the disparity at a pixel of the camera,
+lens distortion undone, gives its depth. Where several cameras see a place, their depths are averaged by their variances.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels.status import ESTIMATED, SOLVED, Status
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.patterns import full_scale
+from service.depth.patterns.triangulation_check import check_perspective
+from service.depth.results.solution import DepthSolution, statistics
+from service.depth.stereo.rectification import Rectification, rectify
+from service.depth.stereo.rectified_frames import RectifiedFrames, rectified_frames
+from service.depth.stereo.stereo_pair import LEAST_PLACES, MOST_LABELS, SURE_LEAD, Disparity, Places, match, range_of, unique_places
+from service.reporting.progress import Timings
+from service.requests.depth import DepthRequest
+from stage.capture.capture import Capture
+from stage.capture.manifest import FILE_NAME, Frame
+from stage.errors import ManifestError
+from stage.stack.correction import Correction
+from stage.stack.planes import Planes
+
+BEHIND_SHARE = 0.5
+"""Share of unique places behind the cameras from which the images are taken to be swapped."""
+ROW_OFFSET_PX = 0.12
+"""Median offset between the rows of both images from which the calibration is doubted."""
+LEAST_OFFSETS = 50
+"""Places from which an offset between rows is told."""
+AGREEMENT_SIGMAS = 4.0
+"""Depths from two cameras agree when they differ by no more standard deviations."""
+ROWS_AT_ONCE = 256
+"""Rows of the camera that are triangulated at one time."""
+REFUSED_SHARE = 0.5
+"""Share of refused pixels from which the capture as a whole is doubted."""
+CHANCE_SHARE = 0.03
+"""Share of the pixels with texture that must have a depth for any to be believed. Images that have nothing to do with each other leave one
+in a hundred by chance."""
+DOUBTED = 0.1
+"""Factor of the confidence of depths that are not believed."""
+ENOUGH = 200
+"""Pixels with texture from which their share tells something."""
+ADVICE = {
+    Status.LOW_MODULATION: "the texture is not seen there: more light, a longer exposure, or a coarser pattern",
+    Status.UNDECIDED: "the texture repeats itself or is too noisy: project random dots in place of a grid, or several different patterns",
+    Status.OCCLUDED: "one camera sees no such place: move the cameras closer together, or check camera_from_other",
+    Status.OUT_OF_RANGE: "the disparities reach the end of the range: check --near-m and --far-m",
+    Status.UNSURE: "the two images differ too much: check the focus, the calibration, and that both images are of the same moment",
+}
+"""The most frequent cause of each status, and what to do about it."""
+
+
+class PairDepth(NamedTuple):
+    """Depths at the pixels of the camera, from one other camera."""
+
+    depth: np.ndarray  # [rows, cols] float32 metres, 0 where there is none
+    sigma: np.ndarray  # [rows, cols] float32 metres
+    sure: np.ndarray  # [rows, cols] float32, 0…1
+    contrast: np.ndarray  # [rows, cols] float32
+    status: np.ndarray  # [rows, cols] uint8
+
+
+def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
+    """Match the frames under texture and triangulate them.
+
+    Args:
+        capture: with stereo frames.
+        mask: [rows, cols] bool.
+        request: its noise and its span of depths; depths outside are OUT_OF_RANGE.
+
+    Raises:
+        StageError: a calibration that cannot be, swapped images, nothing that matches, an unreadable frame.
+    """
+    check_perspective(capture)
+    frames = [frame for frame in capture.manifest.frames if frame.stereo is not None]
+    found: list[PairDepth] = []
+    facts: dict[str, Any] = {"frames": len(frames), "cameras": []}
+    warnings: list[str] = []
+    for index, other in enumerate(capture.manifest.other_cameras):
+        where = f"{capture.folder / FILE_NAME}: other_cameras[{index}]"
+        geometry = rectify(capture.camera, other, where=where)
+        timings.stage("frames", len(frames))
+        with rectified_frames(capture, frames, index, geometry, cache=request.cache, progress=timings.advance) as images:
+            full = full_scale(Planes(images.left[:, :, None], None), capture, frames)
+            noise = NoiseModel(request.read_noise * full, request.photon_gain * full)
+            timings.stage("range", 1)
+            places = unique_places(images, device)
+            _check_order(places, geometry, where, other.name)
+            least, most = _span(places, geometry, request, where, other.name)
+            timings.stage("match", images.left.shape[1])
+            disparity = _matched(images, least, most, noise, device, timings)
+        told = {"name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
+                "disparity_px": [_short(least + geometry.offset_px), _short(most + geometry.offset_px)],
+                "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
+        if len(disparity.row_offset) >= LEAST_OFFSETS:
+            offset = float(np.median(disparity.row_offset))
+            told["row_offset_px"] = statistics(disparity.row_offset)
+            if abs(offset) > ROW_OFFSET_PX:
+                warnings.append(f"other_cameras[{index}]: the rows of {other.name} lie {offset:+.2f} px from those of the camera (median "
+                                f"over {len(disparity.row_offset)} places): depths may be off by as much disparity; calibrate the cameras "
+                                "again (relit calibrate stereo)")
+        facts["cameras"].append(told)
+        found.append(_triangulated(disparity, geometry, capture, request))
+    solution = _joined(found, frames, capture, mask)
+    solution.facts |= facts
+    if request.least_confidence is None:
+        warnings += _chance(solution, mask)
+    solution.warnings += [*warnings, *_doubts(solution, mask)]
+    return solution
+
+
+def _matched(images: RectifiedFrames, least: float, most: float, noise: NoiseModel, device: str, timings: Timings) -> Disparity:
+    """Return the disparity of all bands."""
+    done = list(_told(match(images, least, most, noise, device), timings))
+    return done[-1]
+
+
+def _told(steps: Iterator[tuple[int, Disparity]], timings: Timings) -> Iterator[Disparity]:
+    """Yield the disparity after each band, and tell the timings of it."""
+    for rows, disparity in steps:
+        timings.advance(rows)
+        yield disparity
+
+
+def _check_order(places: Places, geometry: Rectification, where: str, name: str) -> None:
+    """Refuse images that match behind the cameras.
+
+    Raises:
+        ManifestError: says that the images or the pose are the wrong way round.
+    """
+    behind = int((places.disparity + geometry.offset_px < 0).sum())
+    if behind >= LEAST_PLACES and behind > BEHIND_SHARE * len(places.disparity):
+        raise ManifestError(f"{where}: {behind} of {len(places.disparity)} places that match have a negative disparity, as if they lay "
+                            f"behind the cameras: the images of the camera and of {name} are swapped, or camera_from_other is the inverse "
+                            "of the pose")
+
+
+def _span(places: Places, geometry: Rectification, request: DepthRequest, where: str, name: str) -> tuple[float, float]:
+    """Return the least and the largest disparity to consider, between columns of the rectified images.
+
+    Raises:
+        ManifestError: too few places match to find a range, and the request gives none.
+    """
+    reach = geometry.focal_px * geometry.baseline_m
+    _, _, ahead = geometry.positions(slice(0, geometry.reference.height))
+    ends = [None if metres is None else reach / (metres * float(z)) - geometry.offset_px
+            for metres, z in ((request.far_m, ahead.max()), (request.near_m, ahead.min()))]
+    found = range_of(Places(places.disparity[places.disparity + geometry.offset_px > 0], places.compared))
+    if found is None and None in ends:
+        raise ManifestError(f"{where}: only {len(places.disparity)} of {places.compared} places match between the camera and {name}: the "
+                            "images show no texture that both see, are not of one moment, or the calibration is wrong (a repeating pattern "
+                            "does not tell depth either); --near-m and --far-m give the range of depths if there is one")
+    least = ends[0] if ends[0] is not None else max(found[0], -geometry.offset_px) if found is not None else 0.0
+    most = ends[1] if ends[1] is not None else found[1] if found is not None else 0.0
+    if most - least < 1:
+        most = least + 1
+    if most - least > MOST_LABELS:
+        raise ManifestError(f"{where}: the disparities span {most - least:.0f} px, more than {MOST_LABELS}: --near-m says how near the "
+                            "scene begins")
+    return least, most
+
+
+def _triangulated(found: Disparity, geometry: Rectification, capture: Capture, request: DepthRequest) -> PairDepth:
+    """Return depth at the pixels of the camera, each from the nearest pixel of the rectified image and its slopes."""
+    height, width = capture.camera.height, capture.camera.width
+    blank = np.zeros((height, width), np.float32)
+    result = PairDepth(blank, blank.copy(), blank.copy(), blank.copy(), np.zeros((height, width), np.uint8))
+    reach = geometry.focal_px * geometry.baseline_m
+    for first in range(0, height, ROWS_AT_ONCE):
+        rows = slice(first, min(first + ROWS_AT_ONCE, height))
+        x, y, ahead = geometry.positions(rows)
+        col, row = (np.clip(np.rint(at), 0, size - 1).astype(int) for at, size in
+                    ((x, found.status.shape[1]), (y, found.status.shape[0])))
+        status = found.status[row, col]
+        disparity = found.disparity[row, col] + found.slope_x[row, col] * (x - col) + found.slope_y[row, col] * (y - row)
+        whole = disparity + geometry.offset_px
+        kept = (found.sigma[row, col] > 0) & (whole > 0)
+        depth = np.where(kept, reach / (np.where(kept, whole, 1.0) * ahead), 0)
+        lost = np.isin(status, ESTIMATED) & ~kept & (found.sigma[row, col] > 0)
+        beyond = kept & ((depth < (request.near_m or 0)) | (depth > (request.far_m or np.inf)))
+        status = np.where(beyond | lost, int(Status.OUT_OF_RANGE), status)
+        depth = np.where(beyond, 0, depth)
+        result.depth[rows] = depth
+        result.sigma[rows] = np.where(depth > 0, depth * found.sigma[row, col] / np.where(kept, whole, 1.0), 0)
+        result.sure[rows] = np.where(depth > 0, np.clip(found.lead[row, col] / SURE_LEAD, 0, 1), 0)
+        result.contrast[rows] = found.contrast[row, col]
+        result.status[rows] = status
+    return result
+
+
+def _joined(found: list[PairDepth], frames: list[Frame], capture: Capture, mask: np.ndarray) -> DepthSolution:
+    """Return one depth a pixel from those of all cameras."""
+    best = found[0]
+    depth, sigma, sure, status = (array.copy() for array in (best.depth, best.sigma, best.sure, best.status))
+    for other in found[1:]:
+        both = np.isin(status, SOLVED) & np.isin(other.status, SOLVED)
+        agree = both & (np.abs(depth - other.depth) <= AGREEMENT_SIGMAS * np.hypot(sigma, other.sigma))
+        one, two = (1 / np.maximum(each, 1e-12) ** 2 for each in (sigma, other.sigma))
+        mean, spread = (one * depth + two * other.depth) / (one + two), 1 / np.sqrt(one + two)
+        taken = np.isin(other.status, SOLVED) & ~np.isin(status, SOLVED)
+        taken |= (status != Status.UNSURE) & (other.status == Status.UNSURE) & ~np.isin(status, SOLVED)
+        depth, sigma = (np.where(agree, joint, np.where(taken, theirs, ours)).astype(np.float32) for joint, theirs, ours in
+                        ((mean, other.depth, depth), (spread, other.sigma, sigma)))
+        sure = np.where(agree, np.maximum(sure, other.sure), np.where(taken, other.sure, sure))
+        status = np.where(taken, other.status, np.where(both & ~agree, np.uint8(Status.UNSURE), status))
+    status = np.where(mask, status, np.uint8(Status.UNSOLVED)).astype(np.uint8)
+    kept = np.isin(status, ESTIMATED)
+    solution = DepthSolution(method="stereo", depth=np.where(kept, depth, 0).astype(np.float32), status=status,
+                             sigma=np.where(kept, sigma, 0).astype(np.float32), amplitude=best.contrast,
+                             colour=_scene_colour(frames, capture))
+    confidence = solution.confidence_map()
+    assert confidence is not None  # it follows from sigma
+    solution.confidence = (confidence * np.where(status == Status.UNSURE, DOUBTED, 1.0) * sure).astype(np.float32)
+    return solution
+
+
+def _scene_colour(frames: list[Frame], capture: Capture) -> np.ndarray:
+    """Return the mean of the frames of the camera, [rows, cols, 3] linear: many patterns together light a scene evenly."""
+    correction = Correction.of(capture)
+    return np.asarray(sum(correction.apply(frame).pixels for frame in frames) / len(frames))
+
+
+def _chance(solution: DepthSolution, mask: np.ndarray) -> list[str]:
+    """Believe no depth where hardly any of the pixels with texture has one, and say so."""
+    textured = mask & ~np.isin(solution.status, (Status.UNSOLVED, Status.LOW_MODULATION))
+    solved, count = mask & solution.solved, int(textured.sum())
+    if not solved.any() or count < ENOUGH or solved.sum() >= CHANCE_SHARE * count:
+        return []
+    assert solution.confidence is not None  # `_joined` sets it
+    solution.status[solved] = Status.UNSURE
+    solution.confidence[solved] *= DOUBTED
+    return [f"frames: only {100 * solved.sum() / count:.1f} % of the {count} pixels with texture match, as in images that have nothing to "
+            "do with each other: no depth is trusted"]
+
+
+def _doubts(solution: DepthSolution, mask: np.ndarray) -> list[str]:
+    """Return a sentence where most pixels of the mask are refused, with what most often is the cause."""
+    refused = mask & ~solution.solved
+    if refused.sum() <= REFUSED_SHARE * mask.sum():
+        return []
+    codes = np.bincount(solution.status[refused], minlength=max(Status) + 1)
+    most = max(ADVICE, key=lambda status: int(codes[status]))
+    return [f"frames: {100 * refused.sum() / mask.sum():.0f} % of the pixels have no depth that can be trusted; most of them are "
+            f"{most.name.lower().replace('_', ' ')}: {ADVICE[most]}"]
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.6g}")

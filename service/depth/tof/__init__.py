@@ -1,0 +1,1 @@
+"""Depth from time of flight."""

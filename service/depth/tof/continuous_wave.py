@@ -1,0 +1,248 @@
+"""Ranges from the correlation images of a continuous-wave camera: noise, phases, wiggling, wraps.
+
+The sources stand with the kernels of each step (kernels/tof).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.errors import ArrayError
+from kernels.status import ESTIMATED, Status
+from kernels.tof.continuous.continuous import ENTRIES, LEAST_PHASES, Correlation, Noise, decode, sample_harmonics, straighten, weights
+from kernels.tof.continuous.decide import AGREEMENT_RAD, DECIDED, UNCALIBRATED_RAD, Ranges, decide
+from kernels.tof.continuous.disagreement import widen
+from kernels.tof.continuous.modulation import common_range_m, require_span
+from kernels.tof.continuous.pool import pool
+from kernels.tof.continuous.steps import cover_steps
+from kernels.tof.continuous.unwrap import unwrap, vote
+from service.depth.results.solution import RangeImage
+from service.requests.depth import TofOptions
+from stage.tof.calibration import TofCalibration
+from stage.tof.light_time import SPEED_OF_LIGHT
+from stage.tof.raw_frames import CorrelationImages
+
+BINS = 24
+"""Number of bins over the level, each with the same number of pixels."""
+LEAST_IN_BIN = 32
+"""Least number of readings in a bin. With fewer than three bins no line is fitted, and all noise counts as read noise."""
+LEAST_READ_ELECTRONS = 5.0
+"""Read noise in electrons that is assumed where every part of the image is too bright to show it: black pixels must not pass for noise-free
+ones."""
+HIDDEN = 4.0
+"""The read noise cannot be measured when the variance of shot noise in the darkest bin is more than this many times that of
+LEAST_READ_ELECTRONS."""
+CHI_SQUARED_MEDIAN = 0.4549
+"""Median of chi-squared with one degree of freedom."""
+
+
+def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Sequence[float] | np.ndarray,
+                   *, cols: int, scale: Sequence[float] | np.ndarray | None = None, usable: np.ndarray | None = None) -> Noise:
+    """Fit variance = read² + shot · level.
+
+    Where frequencies have four images or more, what their least-squares fit leaves is noise whatever the scene is. Three images fit
+    exactly; then two stand-ins are taken, which other things can make larger but nothing smaller, and of both the smaller one:
+    differences of the offsets of two frequencies, and second differences along the rows.
+
+    Args:
+        images: [M, pixel] float32.
+        modulation_hz, reference_phase_rad: [M].
+        cols: of the image.
+        scale: [M] factor of each image (unequal exposures); None: 1.
+        usable: [pixel] bool; None: all.
+
+    Returns:
+        The noise, in the unit of the images; none where no pixel is usable.
+
+    Raises:
+        ArrayError: three images of one frequency on an image without three pixels in a row: the message says what to give instead.
+
+    Source:
+        Photon transfer: Janesick, "Photon Transfer", SPIE 2007.
+    """
+    keep = np.isfinite(images).all(axis=0)
+    if usable is not None:
+        keep &= usable
+    rows, frequencies, index = weights(modulation_hz, reference_phase_rad, scale)
+    delta = np.asarray(reference_phase_rad, dtype=np.float64)
+    if not keep.any():
+        return Noise(0.0, 0.0)
+    factor = np.ones_like(delta) if scale is None else np.asarray(scale, dtype=np.float64)
+    fitted, steady, spatial = _Pairs([], []), _Pairs([], []), _Pairs([], [])
+    before: np.ndarray | None = None
+    for f in range(len(frequencies)):
+        mine = images[index == f].astype(np.float64)
+        if len(mine) > LEAST_PHASES:
+            matrix = np.stack([np.ones(len(mine)), np.cos(delta[index == f]), np.sin(delta[index == f])], axis=1)
+            matrix /= factor[index == f, None]  # in units of what the exposure records
+            left = np.linalg.svd(matrix)[0][:, LEAST_PHASES:]  # unit vectors that no (P, a, b) reaches: each sees pure noise
+            fitted.add(((left**2).T @ mine)[:, keep], (left.T @ mine)[:, keep] ** 2)
+            continue
+        parts = rows[index == f, 0]
+        offset = parts @ mine
+        if before is not None:
+            steady.add((0.5 * (offset + before))[keep], ((offset - before) ** 2 / (2 * (parts**2).sum()))[keep])
+        before = offset
+        grid, whole = mine.reshape(len(mine), -1, cols), keep.reshape(-1, cols)
+        inside = (whole[:, :-2] & whole[:, 1:-1] & whole[:, 2:])[None].repeat(len(mine), axis=0)
+        bend = grid[..., :-2] - 2 * grid[..., 1:-1] + grid[..., 2:]
+        spatial.add(((grid[..., :-2] + 4 * grid[..., 1:-1] + grid[..., 2:]) / 6)[inside], (bend**2 / 6)[inside])
+    given = [pairs.fit() for pairs in ((fitted,) if fitted.levels else (steady, spatial)) if sum(map(len, pairs.levels)) > 0]
+    if not given:
+        raise ArrayError("the image has no three usable pixels in a row to estimate the noise from: "
+                         "give a calibration with the electrons of a unit and the read noise")
+    level = float(np.median(images[:, keep]))
+    return min(given, key=lambda noise: noise.read**2 + noise.shot * max(level, 0.0))
+
+
+class _Pairs(NamedTuple):
+    """Levels and the squared noise at them, from one estimator."""
+
+    levels: list[np.ndarray]
+    squares: list[np.ndarray]
+
+    def add(self, level: np.ndarray, squared: np.ndarray) -> None:
+        self.levels.append(level.reshape(-1))
+        self.squares.append(squared.reshape(-1))
+
+    def fit(self) -> Noise:
+        return _fit(np.concatenate(self.levels), np.concatenate(self.squares))
+
+
+def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
+    """Return the noise model whose line passes through the medians of squared noise over bins of level; neither coefficient is below
+    zero."""
+    bins = min(BINS, len(level) // LEAST_IN_BIN)
+    if bins < 3:
+        return Noise(0.0, float(squared.mean()) ** 0.5)
+    edges = np.array_split(np.argsort(level), bins)
+    x = np.array([level[part].mean() for part in edges])
+    y = np.array([np.median(squared[part]) for part in edges]) / CHI_SQUARED_MEDIAN
+    weight = 1 / np.maximum(y, 1e-12 * max(float(np.abs(x).max()), 1e-30) ** 2)  # the error of a variance is in proportion to it
+    for _ in range(3):
+        sx, sy, s1 = (weight**2 * x).sum(), (weight**2 * y).sum(), (weight**2).sum()
+        sxx, sxy = (weight**2 * x * x).sum(), (weight**2 * x * y).sum()
+        bottom = s1 * sxx - sx * sx
+        shot = (s1 * sxy - sx * sy) / bottom if bottom > 0 else 0.0
+        base = (sy - shot * sx) / s1
+        if shot < 0:
+            shot, base = 0.0, sy / s1
+        elif base < 0:
+            shot, base = (sxy / sxx if sxx > 0 else 0.0), 0.0
+        model = base + shot * np.maximum(x, 0)
+        weight = 1 / np.maximum(model, model.max() * 1e-6 + 1e-30)
+    shot, base = max(float(shot), 0.0), max(float(base), 0.0)
+    unseen = (LEAST_READ_ELECTRONS * shot) ** 2
+    if shot * float(x.min()) > HIDDEN * unseen:
+        base = max(base, unseen)
+    return Noise(shot, base**0.5)
+
+
+POOLED = 0.5
+"""Factor on the probability of the wrap of a pixel that was decoded with its dark neighbours: whether it is on their surface, its own light
+does not tell."""
+MOST_OF_SCENE = 0.5
+"""Part of the pixels from which a disagreement of the frequencies is told of."""
+
+
+def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
+                       far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
+    """Return the range of each pixel from correlation images, of every pixel from which one can be decoded, however unsurely.
+
+    Args:
+        frames: the images of a capture.
+        options: vote: whether neighbours are asked, for the light of dark pixels and for wraps.
+        calibration: noise and wiggling, where they are known.
+        near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
+        limit: saturation, in recorded values.
+        usable: [rows, cols] bool mask.
+
+    Raises:
+        ArrayError: the phases or frequencies cannot give the range that is asked for.
+    """
+    rows, cols = usable.shape
+    weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
+    nearest = near_m or 0.0
+    farthest = far_m or nearest + common_range_m(frames.modulation_hz, SPEED_OF_LIGHT)
+    require_span(frames.modulation_hz, nearest, farthest, SPEED_OF_LIGHT)
+    noise, source = _noise(frames, calibration, limit, usable)
+    found = decode(frames.images, frames.modulation_hz, frames.reference_phase_rad, noise=noise, saturation=limit, scale=frames.scale,
+                   device=device)
+    found = _straighten(found, calibration)
+    reach = np.zeros(rows * cols, dtype=np.int32)
+    if options.vote:
+        found, pooled = pool(found, rows, cols, light_speed=SPEED_OF_LIGHT)
+        reach = pooled.numpy()[:rows * cols]
+    straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
+    agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
+
+    def ranges_of(phases: Correlation) -> Ranges:
+        hypotheses = unwrap(phases, nearest_m=nearest, farthest_m=farthest, light_speed=SPEED_OF_LIGHT)
+        if options.vote:
+            hypotheses = vote(hypotheses, rows, cols)
+        return decide(phases, hypotheses, light_speed=SPEED_OF_LIGHT, agreement_rad=agreement)
+
+    pixels = rows * cols
+    ranges = ranges_of(found)
+    status = ranges.status.numpy()[:pixels]
+    widened = widen(found, ranges, rows, cols, light_speed=SPEED_OF_LIGHT)
+    further = widened.further.numpy()[:pixels]
+    if further.any():
+        ranges = ranges_of(widened.found)
+        again = ranges.status.numpy()[:pixels]
+        status = np.where((status == Status.MULTIPATH) & (again == Status.OK), status, again)
+    spacing_m = common_range_m(frames.modulation_hz.max(), SPEED_OF_LIGHT)
+    sigma = cover_steps(ranges, found.amplitude, rows, cols, spacing_m=spacing_m).numpy()[:pixels]
+    confidence = ranges.confidence.numpy()[:pixels] * np.where(reach > 0, POOLED, 1).astype(np.float32)
+    facts = {
+        "modulation_hz": found.modulation_hz.tolist(),
+        "images": len(frames.images),
+        "span_m": [nearest, round(farthest, 4)],
+        "common_range_m": round(common_range_m(frames.modulation_hz, SPEED_OF_LIGHT), 4),
+        "vote": options.vote,
+        "noise": {"electrons_per_unit": 1 / noise.shot if noise.shot > 0 else None, "read_units": noise.read, "from": source},
+        "wiggling": straight,
+        "agreement_rad": agreement,
+        "with_neighbours": int((usable.reshape(-1) & (reach > 0) & np.isin(status, ESTIMATED)).sum()),
+    }
+    return RangeImage("time of flight, continuous wave", ranges.range.numpy()[:pixels], sigma,
+                    found.amplitude.numpy()[:, :pixels].mean(axis=0), confidence, status, facts, DECIDED,
+                    _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz)))
+
+
+def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[str, ...]:
+    """Return a sentence if the frequencies disagree by more than noise over most of the scene.
+
+    Args:
+        further: [pixel] τ² of `widen`, radians².
+        calibrated: whether the wiggling of every frequency is.
+    """
+    part = float((further > 0).mean()) if further.size else 0.0
+    if part < MOST_OF_SCENE:
+        return ()
+    size = 1000 * float(np.sqrt(np.median(further[further > 0])))
+    advice = ("check that the calibration is of this camera" if calibrated
+              else "measure the wiggling with relit calibrate tof and give --tof-calibration")
+    return (f"frames[].tof: the phases of the frequencies disagree by {size:.0f} mrad more than noise at {100 * part:.0f} % of the pixels, "
+            f"by wiggling or by light that comes over several ways: {advice}; the standard deviations cover it",)
+
+
+def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:
+    """Return the noise of a reading, and where it is known from."""
+    if calibration.electrons_per_unit is not None and calibration.read_noise_electrons is not None:
+        unit = calibration.electrons_per_unit
+        return Noise(1 / unit, calibration.read_noise_electrons / unit), "calibration"
+    keep = usable.reshape(-1)
+    if limit is not None:
+        keep = keep & (frames.images < limit).all(axis=0)
+    return estimate_noise(frames.images, frames.modulation_hz, frames.reference_phase_rad, cols=usable.shape[1], scale=frames.scale,
+                          usable=keep), "images"
+
+
+def _straighten(found: Correlation, calibration: TofCalibration) -> Correlation:
+    known = [calibration.of_frequency(hz) for hz in found.modulation_hz.tolist()]
+    if not any(known):
+        return found
+    table = np.stack([np.zeros(ENTRIES) if h is None else sample_harmonics(np.array(h.cos), np.array(h.sin)) for h in known])
+    return straighten(found, table)

@@ -1,1 +1,0 @@
-"""Assets as binary glTF (.glb)."""

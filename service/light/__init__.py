@@ -1,1 +1,0 @@
-"""Captures and solved maps under new light."""

@@ -1,0 +1,220 @@
+"""A ball in an image: its position in the camera frame, and the normal and the line of sight at each of its pixels.
+
+The direction of a distant light needs no scale: a perspective camera determines a ball up to scale, and an orthographic camera does
+not determine its distance.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.capture.camera import Camera
+from stage.errors import CalibrationError
+
+CIRCLE_POINTS = 360
+"""The count of outline points that are taken from a circle which the user gives."""
+CIRCLE_ERROR_PX = 0.5
+"""The standard error of the centre of a circle which the user gives, in pixels."""
+
+
+class Ball(NamedTuple):
+    """A sphere in the camera frame."""
+
+    centre: np.ndarray  # [3] float64; for an orthographic camera z is an assumption
+    radius: float
+    metric: bool
+    """True when centre and radius are in metres; otherwise they are in pixels (orthographic) or in radii of the ball (perspective)."""
+    radius_px: float
+    """The mean radius of the outline in pixels."""
+    outline_error_px: float
+    """The standard error of the centre of the outline in pixels."""
+
+
+class BallView(NamedTuple):
+    """The normals, lines of sight and points of a ball at the pixels of a box of the image."""
+
+    box: tuple[slice, slice]
+    """The rows and columns of the image that the box covers."""
+    inside: np.ndarray  # [h, w] bool, True where the line of sight of the pixel centre meets the ball
+    normal: np.ndarray  # [h, w, 3] float64, unit, camera frame; 0 outside
+    to_viewer: np.ndarray  # [h, w, 3] float64, unit, from the ball to the camera
+    point: np.ndarray  # [h, w, 3] float64, on the ball, in the unit of the ball; 0 outside
+
+
+def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the origin and the direction of the line of sight of each image point.
+
+    Returns:
+        origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
+        perspective camera, and lies on z = 0 for an orthographic camera.
+    """
+    x, y = camera.plane_at(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
+    zero = np.zeros_like(x)
+    if camera.projection == "orthographic":
+        return np.stack([x, y, zero], axis=-1), np.stack([zero, zero, zero - 1], axis=-1)
+    toward = np.stack([x, y, zero - 1], axis=-1)
+    return np.zeros_like(toward), toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+
+
+def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, radius_m: float | None = None,
+                     z_m: float | None = None) -> Ball:
+    """Return the ball whose outline is a given circle.
+
+    In a perspective image the outline of a ball off the axis is an ellipse, which the circle approximates.
+
+    Args:
+        camera: the camera of the image.
+        u, v: the centre, continuous image coordinates.
+        radius_px: the radius in pixels.
+        radius_m, z_m: as in `ball_from_outline`.
+
+    Raises:
+        CalibrationError: the circle is not wholly inside the image.
+    """
+    if not (radius_px > 1 and radius_px <= u <= camera.width - radius_px and radius_px <= v <= camera.height - radius_px):
+        raise CalibrationError(f"ball {u:g},{v:g},{radius_px:g}: is not wholly inside the {camera.width}x{camera.height} image")
+    turn = np.linspace(0, 2 * np.pi, CIRCLE_POINTS, endpoint=False)
+    outline = np.stack([u + radius_px * np.cos(turn), v + radius_px * np.sin(turn)], axis=-1)
+    return ball_from_outline(camera, outline, error_px=CIRCLE_ERROR_PX, radius_m=radius_m, z_m=z_m)
+
+
+def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, radius_m: float | None = None,
+                      z_m: float | None = None) -> Ball:
+    """Fit a ball to points of its outline by linear least squares.
+
+    For an orthographic camera the outline is a circle in the image plane. For a perspective camera the unit rays r through the
+    outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
+
+    Args:
+        camera: the camera of the image.
+        outline: [points, 2] u, v.
+        error_px: the standard error of the centre of the outline, which the result holds.
+        radius_m: the radius of the ball, which determines its distance from a perspective camera.
+        z_m: the camera-frame z of the centre of the ball, for an orthographic camera.
+
+    Raises:
+        CalibrationError: the points lie on no circle.
+    """
+    origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
+    span = np.linalg.norm(outline - outline.mean(axis=0), axis=1)
+    radius_px = float(span.mean())
+    try:
+        if camera.projection == "orthographic":
+            centre, radius = fit_circle(origin[:, :2])
+            return Ball(np.array([*centre, z_m or 0.0]), radius, camera.pixel_size_m is not None,
+                        radius / (camera.pixel_size_m or 1.0), error_px)
+        axis, half_angle = fit_cone(direction)
+    except np.linalg.LinAlgError as error:
+        raise CalibrationError("the outline of the ball lies on a line") from error
+    radius = 1.0 if radius_m is None else radius_m
+    return Ball(axis * radius / math.sin(half_angle), radius, radius_m is not None, radius_px, error_px)
+
+
+def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a circle x² + y² = 2ax + 2by + c to points by linear least squares (Kåsa 1976).
+
+    Args:
+        points: [points, 2], three or more.
+
+    Returns:
+        centre [2] and radius.
+
+    Raises:
+        numpy.linalg.LinAlgError: the points lie on a line.
+    """
+    middle = points.mean(axis=0)
+    shifted = points - middle
+    scale = np.abs(shifted).max() or 1.0
+    unit = shifted / scale  # so that the equations do not depend on where the circle lies or in which unit
+    a, b, c = _solve(np.column_stack([2 * unit, np.ones(len(unit))]), (unit**2).sum(axis=1))
+    return middle + scale * np.array([a, b]), scale * math.sqrt(max(c + a * a + b * b, 0.0))
+
+
+def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a cone to unit rays by linear least squares of r·g = 1, with g the axis over the cosine of the half angle.
+
+    Args:
+        rays: [rays, 3] unit, three or more.
+
+    Returns:
+        axis [3], a unit vector, and the half angle in radians.
+
+    Raises:
+        numpy.linalg.LinAlgError: the rays lie in one plane.
+    """
+    middle = rays.mean(axis=0)
+    middle = middle / np.linalg.norm(middle)
+    basis = np.linalg.svd(np.eye(3) - np.outer(middle, middle))[0]  # two directions across the mean ray, then the ray itself
+    basis[:, 2] = middle
+    across, along = rays @ basis[:, :2], rays @ basis[:, 2]
+    width = np.abs(across).max() or 1.0  # so that a narrow cone is as well posed as a wide one
+    # with c along (p, q, 1) in this basis, r·c = cos α reads along = k - across·(p, q)
+    p, q, _ = _solve(np.column_stack([-across / width, np.ones(len(rays))]), along)
+    axis = basis @ np.array([p / width, q / width, 1.0])
+    axis /= np.linalg.norm(axis)
+    # atan2 keeps the digits that the cosine of a narrow cone has lost
+    return axis, float(np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis).mean())
+
+
+def view_ball(ball: Ball, camera: Camera) -> BallView:
+    """Return the normals, lines of sight and surface points of the pixels of a ball.
+
+    Raises:
+        CalibrationError: no pixel of the image shows the ball.
+    """
+    rows, cols = _box(ball, camera)
+    u, v = np.meshgrid(np.arange(cols.start, cols.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+    inside, point, direction = intersect(ball, camera, u, v)
+    if not inside.any():
+        raise CalibrationError(f"the ball has no pixel in the {camera.width}x{camera.height} image")
+    normal = np.where(inside[..., None], (point - ball.centre) / ball.radius, 0)
+    return BallView((rows, cols), inside, normal, -direction, point)
+
+
+def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intersect the lines of sight of image points with a ball.
+
+    Returns:
+        inside [...] bool, True where the line meets the ball; point [..., 3], the intersection nearer to the camera, 0 where there is
+        none; direction [..., 3], the unit direction of the line.
+    """
+    origin, direction = lines_of_sight(camera, u, v)
+    to_centre = ball.centre - origin
+    along = (to_centre * direction).sum(axis=-1)
+    across = np.linalg.norm(to_centre - along[..., None] * direction, axis=-1)
+    inside = across < ball.radius
+    first = along - np.sqrt(np.where(inside, ball.radius**2 - across**2, 0))
+    return inside, np.where(inside[..., None], origin + first[..., None] * direction, 0), direction
+
+
+def project(camera: Camera, point: np.ndarray) -> tuple[float, float]:
+    """Return the image coordinates u and v of a camera-frame point, which is in the unit of the camera."""
+    cu, cv = camera.principal_point
+    if camera.projection == "orthographic":
+        pixel = camera.pixel_size_m or 1.0
+        return float(cu + point[0] / pixel), float(cv - point[1] / pixel)
+    assert camera.focal_px is not None  # the camera's validator saw to it
+    x, down = point[0] / -point[2], point[1] / point[2]
+    if camera.distortion is not None:
+        x, down = camera.distortion.apply(x, down)
+    return float(cu + camera.focal_px[0] * x), float(cv + camera.focal_px[1] * down)
+
+
+def _box(ball: Ball, camera: Camera) -> tuple[slice, slice]:
+    """Return the rows and columns of the image that contain the outline of a ball."""
+    u, v = project(camera, ball.centre)
+    # the outline of a ball off the axis is an ellipse, stretched by no more than 1/cos² of its angle from the axis
+    reach = ball.radius_px * 1.1 + 2
+    if camera.projection == "perspective":
+        reach *= float(ball.centre @ ball.centre) / float(ball.centre[2] ** 2)
+    rows = slice(max(0, math.floor(v - reach)), min(camera.height, math.ceil(v + reach)))
+    cols = slice(max(0, math.floor(u - reach)), min(camera.width, math.ceil(u + reach)))
+    return rows, cols
+
+
+def _solve(matrix: np.ndarray, values: np.ndarray) -> np.ndarray:
+    solution, _, rank, _ = np.linalg.lstsq(matrix, values, rcond=1e-9)
+    if rank < matrix.shape[1]:
+        raise np.linalg.LinAlgError("the points do not determine a circle")
+    return solution

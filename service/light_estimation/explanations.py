@@ -1,0 +1,245 @@
+"""Whether another reading of the manifest explains the images much better than the manifest: encoding, brightness, order of lights.
+
+Every explanation is judged by the same robust Lambertian fit of the same pixels. On a right manifest no explanation is better by more
+than a factor of 1.9 (all objects of docs/methods.md but bare metal, for which no explanation is good: those must also leave little).
+The wrong manifests leave three to a hundred times more than the right explanation does.
+"""
+
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from service.light_estimation.encodings import other_readings
+from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, least_squares, median_of
+from service.light_estimation.semi_calibrated import TINY, fit_intensities
+from stage.colour.colour import GREY_WEIGHTS
+from stage.colour.colour_spaces import is_linear
+from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
+
+PIXELS = 600
+"""Number of pixels, spread over the object, on which explanations are compared: three times as many change no misfit by a tenth."""
+MIN_LIGHTS = 6
+"""Least count of lights that contradict a manifest: three readings of a pixel always fit."""
+MIN_LIGHTS_SCALED, MIN_LIGHTS_FREE = 8, 12
+"""Least count of lights where their brightness, and where their directions are free: bare metal under six lights of free brightness, or
+ten of free directions, fits too well."""
+MIN_READINGS_FREE = 7
+"""Least count of lit readings of a pixel that is judged under free directions, twice its three unknowns and one."""
+MIN_PIXELS = 60
+"""Least count of pixels with more readings than unknowns; they are also the least part, a quarter, of the pixels that were given."""
+MIN_PART = 0.25
+"""The part of the pixels that must have readings to spare, for the misfit to speak for the object."""
+TIMES = 2.5
+"""An encoding or another order is named if it leaves this many times less: it has no free parameter."""
+TIMES_FREE = 3.0
+"""Explanations with free parameters are named if they leave this many times less."""
+LARGEST_LEFT = 0.05
+"""The most that an explanation may leave, relative to |b|: it must explain the images, which no Lambertian fit of bare metal does."""
+LEAST_ENCODED, LEAST_ORDER, LEAST_LEFT = 0.02, 0.03, 0.05
+"""The least misfit of the manifest at which an encoding, an order or the rest is looked for: what smooth real surfaces leave."""
+LEAST_SPREAD = 0.1
+"""Least standard deviation of the logarithm of the brightness that the images ask for: less does little harm."""
+ABOUT = 1.3
+"""The brightness of the lights can imitate an encoding, or another order, on a flat object. It has a number for each light: the others are
+meant unless they leave more than this many times what the brightness leaves."""
+SCALE_ROUNDS, FREE_ROUNDS = 12, 12
+"""Rounds of alternating least squares."""
+MEASURED_EVERY = 3
+"""Every third pixel suffices to measure the brightness, whose rounds are many."""
+PLENTY = 60
+"""Least count of pixels, seen by most lights, from which free directions are started."""
+
+
+class Cause(Enum):
+    """What is wrong with the manifest."""
+
+    ENCODED = "the images are display-encoded, and declared linear"
+    LINEAR = "the images are linear, and declared display-encoded"
+    IRRADIANCE = "the irradiance of the lights is wrong"
+    ENCODED_OR_IRRADIANCE = "the images are display-encoded, or the irradiance of the lights is wrong"
+    NORMALISED = "the images are divided by the irradiance already"
+    REVERSED = "the lights are in reverse order"
+    SHIFTED = "the lights are one frame off"
+    DIRECTIONS = "directions and images do not belong together"
+
+
+class Explanation(NamedTuple):
+    """What explains the images better than the manifest."""
+
+    cause: Cause
+    misfit: float
+    """What the manifest leaves: robust standard deviation of the readings over |b|."""
+    left: float
+    """What the explanation leaves."""
+    degrees: float
+    """Median angle between the normals of the two; where no normals follow, between those of every other light and the rest."""
+    spread: float = 0.0
+    """Standard deviation of the logarithm of the brightness that the images ask for."""
+    space: str = ""
+    """Colour space that would declare the encoding; empty where the encoding is not the cause."""
+
+
+class Sample(NamedTuple):
+    """Pixels of the object with what the manifest says of them."""
+
+    radiance: np.ndarray  # [lights, pixels, 3] float64, scene-linear as declared
+    usable: np.ndarray  # [lights, pixels] bool: unsaturated
+    directions: np.ndarray  # [lights, 3] float64, unit
+    irradiance: np.ndarray  # [lights, 3] float64
+    exposure: np.ndarray  # [lights] float64: recorded values over radiance
+    color_space: str
+
+
+def fit_manifest(sample: Sample) -> Fit:
+    """Return the fit of the readings as the manifest gives them."""
+    return _fit(sample, sample.radiance)
+
+
+def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
+    """Return what explains the images much better than the manifest, or None.
+
+    Args:
+        sample: pixels spread over the object.
+        given: their fit, of fit_manifest.
+    """
+    count, misfit = len(sample.directions), given.misfit()
+    if count < MIN_LIGHTS or given.spare.sum() < MIN_PIXELS or given.spare.mean() < MIN_PART:
+        return None
+    encoding = _encoding(sample, given, misfit)
+    order = _order(sample, given, misfit)
+    plain = min((found for found in (encoding, order) if found is not None), key=lambda found: found.left, default=None)
+    brightness = _brightness(sample, given, misfit) if count >= MIN_LIGHTS_SCALED else None
+    if plain is not None and (brightness is None or plain.left <= ABOUT * brightness.left):
+        return plain
+    if brightness is not None:
+        if encoding is None or encoding.cause is not Cause.ENCODED:
+            return brightness
+        return brightness._replace(cause=Cause.ENCODED_OR_IRRADIANCE, degrees=max(brightness.degrees, encoding.degrees),
+                                   space=encoding.space)
+    return _free_directions(sample, given) if count >= MIN_LIGHTS_FREE else None
+
+
+def _explains(left: float, misfit: float, times: float) -> bool:
+    return left <= LARGEST_LEFT and misfit >= times * left
+
+
+def _angle(one: Fit, other: Fit) -> float:
+    cosine = np.clip((one.normal * other.normal).sum(axis=0), -1, 1)
+    return float(np.degrees(np.median(np.arccos(cosine))))
+
+
+def grey_readings(radiance: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
+    """Return grey readings, [lights, pixels], from the channels in which every light has irradiance.
+
+    Args:
+        radiance: [lights, pixels, 3].
+        irradiance: [lights, 3].
+    """
+    weights = np.where((irradiance > 0).all(axis=0), GREY_WEIGHTS, 0)
+    factors = np.divide(weights, irradiance, out=np.zeros_like(irradiance), where=irradiance > 0)
+    return np.asarray(np.einsum("lpc,lc->lp", radiance, factors))
+
+
+def _fit(sample: Sample, radiance: np.ndarray) -> Fit:
+    return fit_lambertian(grey_readings(radiance, sample.irradiance), sample.usable, sample.directions)
+
+
+def _encoding(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
+    """Return the opposite of the declared encoding if it explains the images.
+
+    Linear captures are decoded as if they were sRGB or a power of 2.2, where no value is above one; display-encoded ones are taken as
+    linear.
+    """
+    linear = is_linear(sample.color_space)
+    if misfit < (LEAST_ENCODED if linear else LEAST_LEFT):
+        return None
+    found: list[Explanation] = []
+    for space, radiance in other_readings(sample.radiance, sample.exposure[:, None, None], sample.color_space):
+        fit = _fit(sample, radiance)
+        if _explains(fit.misfit(), misfit, TIMES if linear else TIMES_FREE):
+            found.append(Explanation(Cause.ENCODED if linear else Cause.LINEAR, misfit, fit.misfit(), _angle(given, fit), space=space))
+    if not found:
+        return None
+    best = min(found, key=lambda one: one.left)
+    return found[0] if found[0].left <= ABOUT * best.left else best  # sRGB is the usual one
+
+
+def _order(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
+    """Return the reverse order of the lights, or one that is a frame off, if it explains the images."""
+    if misfit < LEAST_ORDER:
+        return None
+    numbers, found = np.arange(len(sample.directions)), []
+    for cause, order in ((Cause.REVERSED, numbers[::-1]), (Cause.SHIFTED, np.roll(numbers, 1)), (Cause.SHIFTED, np.roll(numbers, -1))):
+        fit = fit_manifest(sample._replace(directions=sample.directions[order], irradiance=sample.irradiance[order]))
+        if _explains(fit.misfit(), misfit, TIMES):
+            found.append(Explanation(cause, misfit, fit.misfit(), _angle(given, fit)))
+    return min(found, key=lambda one: one.left, default=None)
+
+
+def _brightness(sample: Sample, given: Fit, misfit: float) -> Explanation | None:
+    """Return a brightness of each light that explains the images, by alternating least squares between it and the normals.
+
+    Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform light intensities and exposures", ECCV 2016.
+    """
+    if misfit < LEAST_LEFT:
+        return None
+    readings = grey_readings(sample.radiance, sample.irradiance)
+    factor = np.ones(len(readings))
+    for _ in range(SCALE_ROUNDS):
+        fit = fit_lambertian(readings / factor[:, None], sample.usable, sample.directions, rounds=3)
+        model = sample.directions @ fit.vector
+        seen = fit.lit & (model > SHADOW * np.linalg.norm(fit.vector, axis=0))
+        step = median_of((readings / factor[:, None] / np.where(seen, model, 1)).T, seen.T)
+        factor *= np.where(step > 0, step, 1.0)
+        factor /= np.exp(np.log(factor).mean())
+    left = fit_lambertian(readings / factor[:, None], sample.usable, sample.directions).misfit()
+    if np.log(factor).std() < LEAST_SPREAD or not _explains(left, misfit, TIMES_FREE):
+        return None
+    # the alternation stops half-way: enough to see that brightness explains the images, but not how far the normals are off
+    try:
+        few = slice(None, None, MEASURED_EVERY)
+        measured = fit_intensities(sample.radiance[:, few], sample.usable[:, few], sample.directions).irradiance
+    except CalibrationError:
+        measured = sample.irradiance * factor[:, None]
+    known = np.isfinite(measured).all(axis=1)
+    part = sample._replace(radiance=sample.radiance[known], usable=sample.usable[known], directions=sample.directions[known],
+                           irradiance=measured[known])
+    spread = float(np.log(measured[known]).std(axis=0).max())
+    cause = Cause.NORMALISED if spread < LEAST_SPREAD else Cause.IRRADIANCE
+    return Explanation(cause, misfit, left, _angle(given, fit_manifest(part)), spread)
+
+
+def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
+    """Say whether some directions explain the images where those of the manifest do not.
+
+    A Lambertian object has images of rank three whatever its lights are (Shashua 1992; Hayakawa, JOSA A 11(11), 1994). Lights and
+    surface are found by alternating least squares from the singular vectors of the pixels that most lights reach, with shadows
+    left out. A misfit is compared relative to the bright readings of each pixel, because |b| is not defined.
+    """
+    readings = grey_readings(sample.radiance, sample.irradiance)
+    top = np.maximum(bright_readings(readings, sample.usable), TINY)
+    readings = readings / top
+    lit = sample.usable & (readings > SHADOW)
+    enough = lit.sum(axis=0) >= MIN_READINGS_FREE
+    if enough.mean() < MIN_PART:
+        return None
+    lit &= enough
+    best = np.argsort(-lit.sum(axis=0), kind="stable")[: max(PLENTY, lit.shape[1] // 4)]
+    left, values, _ = np.linalg.svd(readings[:, best], full_matrices=False)
+    lights, weight = left[:, :3] * values[:3], lit.astype(np.float64)
+    surface = least_squares(readings, weight, lights)
+    for _ in range(FREE_ROUNDS):
+        lights = least_squares(readings.T, weight.T, surface.T).T
+        surface = least_squares(readings, weight, lights)
+        residual = np.where(lit, readings - lights @ surface, 0)
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit]))) + 1e-4
+        weight = lit / (1 + (residual / (3 * spread)) ** 2)
+    free = MAD_TO_SIGMA * float(np.median(np.abs(residual[lit])))
+    scaled = np.abs(given.residual) * np.linalg.norm(given.vector, axis=0) / top
+    misfit = MAD_TO_SIGMA * float(np.median(scaled[lit]))
+    if misfit < LEAST_LEFT or not _explains(free, misfit, TIMES_FREE):
+        return None
+    halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
+    return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))

@@ -1,0 +1,95 @@
+"""A robust Lambertian fit of the readings of a few pixels, with which explanations of the images are compared.
+
+It is no solver: it is fast, it treats every explanation alike, and its misfit is the spread of the readings about n·l.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stage.spread import MAD_TO_SIGMA
+
+SHADOW = 0.1
+"""A reading below this part of the bright readings of its pixel is in shadow, or grazed, and is not compared."""
+BRIGHT_END = 0.9
+"""The quantile of the readings of a pixel that stands for its bright ones: a highlight is brighter still."""
+ROUNDS = 6
+"""Rounds of re-weighting; the weights change by less than a hundredth after five."""
+CAUCHY = 1.5
+"""Scale of the Cauchy weights in standard deviations of the pixel's residual, as in service.light_estimation.grey_ball."""
+LEAST_SPREAD = 0.01
+"""Least standard deviation that the weights assume, relative to |b|: half rounding and eight-bit images are below it."""
+SPARE = 2
+"""Readings above the three unknowns that a pixel needs to have a misfit."""
+
+
+class Fit(NamedTuple):
+    """b = level · normal of each pixel, and what it leaves."""
+
+    vector: np.ndarray  # [3, pixels] float64
+    residual: np.ndarray  # [lights, pixels] float64, (reading - b·l) / |b|; 0 where not lit
+    lit: np.ndarray  # [lights, pixels] bool: readings that are compared
+
+    @property
+    def normal(self) -> np.ndarray:
+        """The unit normals, [3, pixels]."""
+        return self.vector / np.maximum(np.linalg.norm(self.vector, axis=0), 1e-300)
+
+    @property
+    def facing(self) -> float:
+        """The part of the pixels whose normal has z > 0, as every visible surface has."""
+        return float((self.vector[2] > 0).mean())
+
+    @property
+    def spare(self) -> np.ndarray:
+        """Whether each pixel has more readings than unknowns, [pixels] bool."""
+        return np.asarray(self.lit.sum(axis=0) > 2 + SPARE)
+
+    def misfit(self) -> float:
+        """Return the robust standard deviation of the residuals of pixels with readings to spare; NaN without any."""
+        chosen = self.lit & self.spare
+        return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
+
+
+def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, rounds: int = ROUNDS) -> Fit:
+    """Fit b·l to the readings of each pixel by re-weighted least squares with Cauchy weights.
+
+    Args:
+        readings: [lights, pixels] radiance over irradiance.
+        usable: [lights, pixels] bool, True for unsaturated readings.
+        directions: [lights, 3] unit.
+        rounds: how often the weights are found again.
+    """
+    lit = usable & (readings > SHADOW * bright_readings(readings, usable)) & (readings > 0)
+    weight = lit.astype(np.float64)
+    for _ in range(rounds):
+        vector = least_squares(readings, weight, directions)
+        residual = np.where(lit, readings - directions @ vector, 0) / np.maximum(np.linalg.norm(vector, axis=0), 1e-300)
+        spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
+        weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
+    return Fit(vector, residual, lit)
+
+
+def least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight."""
+    outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
+    gram = (weight.T @ outer).reshape(-1, 3, 3)
+    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
+    return np.asarray(np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T)
+
+
+def bright_readings(readings: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Return the level of the bright readings of each pixel, [pixels]."""
+    return np.asarray(np.quantile(np.where(usable, readings, 0), BRIGHT_END, axis=0))
+
+
+def median_of(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the lower median of the chosen values of each column, [columns]; 0 where none is chosen.
+
+    Args:
+        values: [rows, columns], finite where chosen.
+        chosen: [rows, columns] bool.
+    """
+    count = chosen.sum(axis=0)
+    ordered = np.sort(np.where(chosen, values, np.inf), axis=0)
+    return np.where(count > 0, ordered[np.maximum(count - 1, 0) // 2, np.arange(values.shape[1])], 0.0)

@@ -1,0 +1,210 @@
+"""Semi-calibrated photometric stereo: the brightness of lights of known direction from images of the object.
+
+Readings y_lp = e_l · l·b_p of a Lambertian surface are linear in q_l = 1/e_l and b_p together, q_l y_lp - l·b_p = 0. Every b_p is
+eliminated in closed form, which leaves one small symmetric eigenvalue problem in q. Weights exclude shadows and highlights, and the
+last rounds alternate between b and e.
+
+Source: Cho, Matsushita, Tai and Kweon, "Photometric stereo under non-uniform light intensities and exposures", ECCV 2016, and
+    "Semi-calibrated photometric stereo", TPAMI 42(1), 2020: the linear joint estimation and the alternating one.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from service.light_estimation.grey_ball import WEIGHT_SCALE
+from stage.errors import CalibrationError
+from stage.spread import MAD_TO_SIGMA
+
+MIN_LIGHTS = 4
+"""The least count of lights: each gives two equations for the eight unknowns of the ambiguity."""
+MIN_PIXELS = 30
+"""The least count of pixels that must show a light."""
+MIN_DETERMINED = 1e-3
+"""The least relative singular value of the equations for the ambiguity: below it the brightness is not determined."""
+SHADOW = 0.1
+"""A reading below this part of the bright readings of the pixel, or of |b|, is in shadow or grazing light."""
+BRIGHT_END = 0.9
+"""The quantile of the readings of a pixel that stands for its brightest one."""
+ROUNDS = 60
+"""The most rounds."""
+LINEAR_ROUNDS = range(6, 12)
+"""The rounds that solve the eigenvalue problem."""
+CONVERGED = 1e-4
+"""The largest relative change of a light in the last round, a hundredth of the uncertainty on real surfaces."""
+TINY = 1e-200
+"""A number below any reading, which avoids division by zero."""
+
+
+class Intensities(NamedTuple):
+    """The brightness of each light; NaN for a light that too few pixels show, because it is behind the object or dark."""
+
+    irradiance: np.ndarray  # [lights, 3] float64, mean 1 over the measured lights in each channel
+    residual: np.ndarray  # [lights, 3] float64, weighted root mean square of the residual over |b|
+    uncertainty: np.ndarray  # [lights, 3] float64, standard error relative to the value, from that residual
+    pixels: int
+    """The count of pixels that were used."""
+
+
+class _UnlitError(Exception):
+    """Too few pixels show these lights."""
+
+    def __init__(self, lights: np.ndarray) -> None:
+        super().__init__(lights)
+        self.lights = lights
+
+
+def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> Intensities:
+    """Measure the irradiance of every light, up to one factor in each channel.
+
+    Args:
+        readings: [lights, pixels, 3] scene-linear radiance of pixels of the object.
+        usable: [lights, pixels] bool, True for unsaturated readings.
+        directions: [lights, 3] unit.
+
+    Raises:
+        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
+    """
+    result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
+    told, fits = _fit_channels(readings, usable, directions, "RGB")
+    for part, values in enumerate(result):
+        values[told] = np.stack([fit[part] for fit in fits], axis=-1)
+    return Intensities(result[0], result[1], result[2], min(fit[3] for fit in fits))
+
+
+def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, *, rounds: int = ROUNDS) -> np.ndarray:
+    """Measure one brightness of every light, up to one factor; quicker than three channels.
+
+    Args:
+        readings: [lights, pixels] scene-linear grey readings of pixels of the object.
+        usable: [lights, pixels] bool, True for unsaturated readings.
+        directions: [lights, 3] unit.
+        rounds: the most rounds, more than LINEAR_ROUNDS.stop.
+
+    Returns:
+        [lights] float64, mean 1 over the measured lights; NaN for a light that too few pixels show.
+
+    Raises:
+        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
+    """
+    told, (fit,) = _fit_channels(readings[..., None], usable, directions, ("grey",), rounds)
+    result = np.full(len(directions), np.nan)
+    result[told] = fit[0]
+    return result
+
+
+def _fit_channels(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray,
+                  names: Sequence[str], rounds: int = ROUNDS) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray, int]]]:
+    """Return the lights that enough pixels show, and the fit of each channel to them."""
+    check_directions(directions)
+    told = np.arange(len(directions))
+    while True:
+        try:
+            return told, [_fit_channel(readings[told, :, channel].astype(np.float64), usable[told], directions[told], name, rounds)
+                          for channel, name in enumerate(names)]
+        except _UnlitError as unlit:
+            told = np.delete(told, unlit.lights)
+            check_directions(directions[told])
+
+
+def check_directions(directions: np.ndarray) -> None:
+    """Check that the directions of the lights determine their brightness.
+
+    Another brightness explains the same images when there is a 3×3 matrix G, other than a multiple of the identity, with Gᵀ l
+    parallel to l for every light. l × Gᵀ l = 0 is linear in G, so its null space must have one dimension.
+
+    Raises:
+        CalibrationError: there are fewer than four lights, or all lights but one lie in one plane.
+    """
+    if len(directions) < MIN_LIGHTS:
+        raise CalibrationError(f"{len(directions)} distant lights: brightness needs {MIN_LIGHTS} or more")
+    x, y, z = directions.T
+    zero = np.zeros_like(x)
+    cross = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=1)
+    equations = np.einsum("lij,lk->lijk", cross, directions).reshape(-1, 9)
+    singular = np.linalg.svd(equations, compute_uv=False)
+    if singular[7] < MIN_DETERMINED * singular[0]:
+        raise CalibrationError("all lights but one lie in one plane (or on a line): brightness cannot be told from shape")
+
+
+def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray,
+                 name: str, rounds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return the irradiance [lights] of one channel, its residual, its uncertainty, and the count of pixels.
+
+    Each channel is fitted alone: under lights of different colours the grey of a coloured surface is no product of light and albedo.
+    """
+    lit = usable & (reading > 0)
+    enough = lit.sum(axis=0) >= MIN_LIGHTS
+    count = int(enough.sum())
+    if count < MIN_PIXELS:
+        raise CalibrationError(f"channel {name}: {count} pixels are lit and unsaturated under {MIN_LIGHTS} or more lights: "
+                               f"{MIN_PIXELS} are needed")
+    reading, lit = reading[:, enough], lit[:, enough]
+    reading = reading / np.where(lit, reading, 0).max(axis=0)  # so that pixels of dark albedo have the same weight
+    e, weight = np.ones(len(directions)), lit.astype(np.float64)
+    for step in range(rounds):
+        weight = _weights(reading, lit, e, directions, weight)
+        unlit = (weight > 0).sum(axis=1) < MIN_PIXELS
+        if unlit.any():
+            raise _UnlitError(np.flatnonzero(unlit))
+        before = e
+        # the first rounds alternate: they converge slowly, but highlights cannot make them negative
+        e = _linear(reading, weight, directions, e) if step in LINEAR_ROUNDS else e
+        b = _normals(reading / e[:, None], weight * e[:, None] ** 2, directions)
+        e = _scale(reading, directions @ b, weight)
+        e /= e.mean()
+        if step >= LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
+            break
+    error = np.where(weight > 0, (reading / e[:, None] - directions @ b) / np.maximum(np.linalg.norm(b, axis=0), TINY), 0)
+    total = weight.sum(axis=1)
+    residual = np.sqrt((weight * error**2).sum(axis=1) / total)
+    return e, residual, residual / np.sqrt(total), count
+
+
+def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Return e = 1/q from the minimum of q D Σ_p w_p y_p (I - projection on the lights) y_p D q, with D = (Σ w y²)^-1/2 of each light.
+
+    A negative result, which outliers cause in early rounds, is replaced by the given `e`.
+    """
+    gram = _gram(weight, directions)
+    values, vectors = np.linalg.eigh(gram)
+    root = vectors / np.sqrt(np.maximum(values, 1e-9 * values[:, 2:] + TINY))[:, None, :]
+    spread = np.einsum("lp,li,pij->lpj", weight * reading, directions, root, optimize=True).reshape(len(reading), -1)
+    scale = 1 / np.sqrt((weight * reading**2).sum(axis=1))
+    q = np.linalg.eigh(np.eye(len(reading)) - scale[:, None] * (spread @ spread.T) * scale)[1][:, 0] * scale
+    q = q * np.sign(q.sum())
+    return len(q) / q / (1 / q).sum() if (q > 0).all() else e
+
+
+def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return Cauchy weights of the residual over |b| from the last weights; 0 where the readings or the model show a shadow."""
+    scaled = reading / e[:, None]
+    top = np.quantile(np.where(lit, scaled, 0), BRIGHT_END, axis=0)
+    bright = lit & (scaled > SHADOW * top)
+    b = _normals(scaled, weight * bright, directions)
+    model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
+    chosen = bright & (model > SHADOW * length)
+    relative = np.where(chosen, scaled - model, 0) / length
+    spread = MAD_TO_SIGMA * np.median(np.abs(relative[chosen])) if chosen.any() else 1.0
+    weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
+    weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
+    return weight
+
+
+def _normals(scaled: np.ndarray, weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return b of every pixel [3, pixels] by weighted least squares."""
+    gram = _gram(weight, directions)
+    gram += (1e-12 * np.trace(gram, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)  # pixels of no weight get no b
+    return np.linalg.solve(gram, ((weight * scaled).T @ directions)[:, :, None])[:, :, 0].T
+
+
+def _gram(weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the normal equations of every pixel [pixels, 3, 3]."""
+    outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
+    return (weight.T @ outer).reshape(-1, 3, 3)
+
+
+def _scale(reading: np.ndarray, model: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the least-squares factor [lights] between the readings of each light and the model."""
+    return (weight * reading * model).sum(axis=1) / (weight * model**2).sum(axis=1)

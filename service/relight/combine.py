@@ -1,0 +1,87 @@
+"""Linear frames as weighted sums of the captured images; all frames of a chunk are computed in one pass over the images."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels import packs
+from kernels.relight.frames.combine import combine, combine_batch
+from service.requests.relight import CHUNK_FRAMES
+from stage.formats.exr_rows import BLOCK_ROWS
+from stage.stack.stack import PIXEL_PAD, Stack
+
+CHUNK_BYTES = 256 << 20
+"""Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
+written."""
+
+BLOCK_BYTES = 1280 << 20
+"""Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
+and 64 lights, a block of 64 frames has 128 rows; every block of every frame costs some milliseconds beyond its pixels."""
+
+
+class RowBlock(NamedTuple):
+    """Rows of an image."""
+
+    first: int
+    last: int
+    """Behind the last row."""
+    pixels: slice
+    """Their pixels in the stack; those of the last rows include its padding."""
+
+
+def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:
+    """Return how many whole frames a chunk holds, `most` at most."""
+    channels, _, pixels = stack.shape
+    return max(1, min(most, CHUNK_BYTES // (4 * channels * pixels)))
+
+
+def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
+    """Yield blocks of rows whose readings and pictures fit in memory, from the top to the bottom.
+
+    Args:
+        stack: the images.
+        width: of an image.
+        pictures: pictures of three channels that are made of the rows of a block.
+    """
+    channels, lights, _ = stack.shape
+    multiple = math.lcm(BLOCK_ROWS, PIXEL_PAD)  # whole chunks of EXR files and whole packs of pixels
+    step = max(multiple, BLOCK_BYTES // (channels * (2 * lights + 4 * pictures) * width) // multiple * multiple)
+    height = stack.pixel_count // width
+    for first in range(0, height, step):
+        last = min(first + step, height)
+        yield RowBlock(first, last, slice(first * width, stack.shape[2] if last == height else last * width))
+
+
+def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str,
+                  pixels: slice | None = None) -> np.ndarray:
+    """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
+
+    Args:
+        stack: the images.
+        weights: [frames, 3, lights padded] float32.
+        places: the row of each frame in the full chunk, also when only some of its frames are made: cuBLAS sums may differ by row, and
+            frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
+            faster product is used.
+        device: where.
+        pixels: of a block of rows; None: all.
+    """
+    channels, _, count = stack.shape
+    begin, end, _ = (pixels or slice(None)).indices(count)
+    placed = weights
+    if places is not None and device != "cpu":
+        placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
+        placed[list(places)] = weights
+    bands = list(stack.bands(4 * channels * CHUNK_FRAMES)) if pixels is None else [(begin, end)]
+    kept = slice(None) if places is None or len(placed) == len(weights) else list(places)
+    frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float32)
+    for start, stop in bands:
+        band = packs.upload(stack.band(start, stop), device=device)
+        found = combine(band, weights[0]).numpy()[None] if places is None else combine_batch(band, placed).numpy()[kept]
+        if frames is None:
+            frames = found
+        else:
+            frames[:, :, start:stop] = found
+    assert frames is not None
+    return frames[:, :, : min(end, stack.pixel_count) - begin]

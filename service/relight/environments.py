@@ -1,0 +1,91 @@
+"""Environment maps, one for all frames or one for each: the headers of all are checked at the start, and a map is read when its first frame
+is made."""
+
+import re
+from collections.abc import Iterable
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from kernels.relight.weights.environment_sources import EnvironmentParts, EnvironmentSamples, sample_environment, split_environment
+from service.errors import RequestError
+from service.requests.light.frame_range import numbered
+from stage.colour.environment_maps import check_environment, read_environment
+from stage.stack import fingerprint
+
+SHARP_RADIUS_DEGREES = 2.0
+"""Largest angular radius of a map's sample that casts shadows of its own: small samples lie where the map is bright. The visibility of
+other samples is interpolated from the captured lights around them."""
+
+
+class EnvironmentMap:
+    """An environment map in a working space."""
+
+    def __init__(self, radiance: np.ndarray) -> None:
+        """Args: radiance: [rows, cols, 3] float32, scene-linear."""
+        self.radiance = radiance
+
+    @cached_property
+    def samples(self) -> EnvironmentSamples:
+        """The samples of the environment map, for a model of a surface."""
+        return sample_environment(self.radiance)
+
+    @cached_property
+    def parts(self) -> EnvironmentParts:
+        """The small bright places of the environment map, and the rest."""
+        return split_environment(self.radiance, np.radians(SHARP_RADIUS_DEGREES))
+
+
+class Environments:
+    """The environment maps of `--environment`: a file, or a sequence of files where the name has a run of #."""
+
+    def __init__(self, pattern: Path, *, clip_negative: bool = False) -> None:
+        """Keep the path of the maps, as it was given.
+
+        With `clip_negative`, values that are negative beyond the noise of their map are set to 0; else such maps are refused.
+
+        Raises:
+            RequestError: several runs of #, or one in the folder.
+        """
+        self._pattern = pattern
+        self._sequence = "#" in str(pattern) and not pattern.is_file()
+        self.clipped: dict[str, int] | None = {} if clip_negative else None
+        """The number of pixels with a value that was set to 0, by the names of the maps that were read so far; None: such are refused."""
+        self._digests: dict[Path, str] = {}
+        self._last: tuple[Path, str, EnvironmentMap] | None = None
+        if self._sequence and (len(re.findall("#+", pattern.name)) != 1 or "#" in str(pattern.parent)):
+            raise RequestError(f"--environment {pattern}: the file name of a sequence has one run of # for the frame number")
+
+    def path(self, number: int) -> Path:
+        """Return the file of a frame's environment map."""
+        return self._pattern.with_name(numbered(self._pattern.name, number)) if self._sequence else self._pattern
+
+    def check(self, numbers: Iterable[int]) -> None:
+        """Check the header of the environment map of every frame.
+
+        Raises:
+            RequestError: an environment map of the sequence is not there; names it and its frame.
+            ImageError: not EXR or HDR, or not twice as wide as high.
+            StorageError: an environment map cannot be opened.
+        """
+        for path, number in {self.path(number): number for number in numbers}.items():
+            if self._sequence and not path.exists():
+                raise RequestError(f"--environment {self._pattern}: frame {number} has no map: {path} is not there")
+            check_environment(path)
+
+    def read(self, path: Path, space: str) -> EnvironmentMap:
+        """Return one environment map in a working space; the last one that was read is kept.
+
+        Raises:
+            ImageError: impossible values (counted), or a colour space that is not known.
+        """
+        if self._last is None or self._last[:2] != (path, space):
+            self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped)))
+        return self._last[2]
+
+    def content(self, path: Path) -> str:
+        """Return the content hash of an environment map."""
+        if path not in self._digests:
+            self._digests[path] = fingerprint.digest(path)
+        return self._digests[path]

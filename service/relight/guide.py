@@ -1,0 +1,272 @@
+"""Model-guided relighting: what a model of the surface says the plain sum of captured images misses is added, as far as it can be trusted.
+
+frame = Σ w_i I_i + β · (model under the wanted light − Σ w_i · model under captured light i). The captured images bring shadows,
+interreflection and scattering, the model brings what lies between the lights: sharp lobes, and the shadows of small bright lights. The
+lobes are first refined to what the captured images show of them (kernels.relight.model.lobe_profile), and what is still missing of a
+highlight is a ratio, not a difference (kernels.relight.model.gloss_ratio). β of each pixel is fitted to the captured images
+(kernels.relight.model.guide). Light from beyond the captured lights has a β of its own, and what the model takes away there is a share of
+the sum (kernels.relight.model.beyond).
+
+Source: a control variate with a regression coefficient, Glasserman, "Monte Carlo Methods in Financial Engineering", section 4.1.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from kernels import packs
+from kernels.errors import ArrayError
+from kernels.relight.frames.near_sum import sum_near
+from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs, share_beyond
+from kernels.relight.model.captured import Captured
+from kernels.relight.model.gloss_ratio import sum_shown
+from kernels.relight.model.guide import compare_model, fit_trust, seen_lobes
+from kernels.relight.model.lobe_profile import MOMENTS, fit_profile, profile_moments
+from kernels.relight.model.shading import shade
+from kernels.relight.model.sources import Sources
+from service.relight.clipping import Clipping, clipped_channels
+from service.relight.far_light import captured_lights
+from service.relight.model_light import ModelLight, NearLights
+from service.relight.model_range import LitBeyond, LitModel, ModelRange, correction
+from service.relight.range_light import RangeLight
+from service.relight.surface_model import ModelBatch, SurfaceModel
+from service.relight.weights.triangulation import left_out, triangles_between
+from service.reporting.progress import Timings
+from service.reporting.provenance import other_inputs
+from stage.capture.point_lights import DistantLights
+from stage.errors import ResultError
+from stage.results.maps import SurfaceMaps
+from stage.stack.replaced import ReplacedStack
+from stage.stack.stack import Stack
+
+NOTHING = np.zeros((0, 4), dtype=np.float32)
+"""An empty list of places to march to."""
+KEPT_BYTES = 1 << 30
+"""Most bytes of the captured lights' visibility that are kept between chunks; for larger pictures it is computed again."""
+
+
+class Guide:
+    """A model of one capture's surface, and how far each pixel trusts it."""
+
+    def __init__(self, maps: SurfaceMaps, where: Path, stack: Stack, lights: DistantLights, clipping: Clipping, *, space: str, device: str,
+                 progress: Timings | None) -> None:
+        """Compare the model with every captured image, fit β, and estimate the clipped readings.
+
+        Args:
+            maps: of the capture, in its working space.
+            where: their file, for messages.
+            stack, lights: the captured images and lights.
+            clipping: of the captured images.
+            space: the scene-linear space of the stack.
+            device: where.
+            progress: told of every batch.
+
+        Raises:
+            ResultError: maps of other images or another colour space, or without the layers that a model needs; fewer than four
+                lights, or all in one plane.
+        """
+        self.doubt = other_inputs(maps.provenance, stack.key, where)
+        """The sentence for maps of another version, of which nothing tells whether they are of these images; None: they are."""
+        if maps.color_space != space:
+            raise ResultError(f"{where}: is in {maps.color_space}, the capture in {space}: solve it again")
+        maps = maps.with_lobes(partial(seen_lobes, direction=lights.direction))
+        try:
+            neighbours, shares = left_out(lights.direction)
+        except ArrayError as error:
+            raise ResultError(f"{where}: cannot guide this capture: a model helps between four lights or more that are not all in one "
+                              "plane") from error
+        self._model, self._lights, self._stack = SurfaceModel(maps, where, device, by_normal=True), lights, stack
+        self._place = np.concatenate([lights.direction, np.zeros((len(lights.direction), 1))], axis=1)
+        self._keep = len(self._place) * len(self._model.pixels) <= KEPT_BYTES
+        self._seen: dict[int, wp.array] = {}
+        if progress is not None:
+            progress.stage("guide", len(self._model.pixels))
+        moments = self._sums(MOMENTS, profile_moments, None)
+        self._model.profile = fit_profile(moments, self._model.pixels, maps.mask.shape)
+        self.trust = self._fit(partial(compare_model, neighbours=neighbours, shares=shares), progress)
+        """[n] β of the model's pixels between the captured lights, 0…1."""
+        self.stack = self._unclipped(clipping.level)
+        """The captured images, with clipped readings as bright as the model has them."""
+
+    @cached_property
+    def trust_beyond(self) -> np.ndarray:
+        """Return [n] β of the model's pixels for light from beyond the captured lights, 0…1."""
+        return self._fit(partial(compare_beyond, pairs=inward_pairs(self._lights.direction)), None)
+
+    def _fit(self, compare: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
+        """Return [n] β from sums [2, pixels] that a comparison takes of every batch."""
+        return fit_trust(self._sums(2, compare, progress), self._model.pixels, self._model.maps.mask.shape)
+
+    def _sums(self, rows: int, take: Callable[[Captured], wp.array], progress: Timings | None) -> np.ndarray:
+        """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch."""
+        sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
+        for batch in self._model.batches():
+            taken = take(self._captured(batch, self._stack, self._upload(batch, self._stack), self._visible(batch)))
+            sums[:, done : done + len(batch.pixels)] = taken.numpy()[:, : len(batch.pixels)]
+            done += len(batch.pixels)
+            if progress is not None:
+                progress.advance(done)
+        return sums
+
+    def _captured(self, batch: ModelBatch, stack: Stack, band: packs.Band, visible: wp.array) -> Captured:
+        """Return the captured images of a batch, from a stack, beside the model."""
+        return Captured.of(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, stack.scale)
+
+    def _upload(self, batch: ModelBatch, stack: Stack) -> packs.Band:
+        """Return the images of a batch on the device."""
+        return packs.upload(*stack.pick(batch.pixels), device=self._model.device)
+
+    def _unclipped(self, level: np.ndarray) -> Stack:
+        """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
+        lights, stack, count = self._lights, self._stack, len(self._lights.direction)
+        found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+        done = 0
+        for batch in self._model.batches():
+            part = slice(done, done + len(batch.pixels))
+            done = part.stop
+            if not stack.pick_saturated(batch.pixels).any():
+                continue
+            values, bits = stack.pick(batch.pixels)
+            channels = clipped_channels(values, bits, stack.scale, level)
+            visible = self._visible(batch)
+            for light in np.flatnonzero(channels[:, :count].any(axis=(0, 2))):
+                alone = captured_lights(lights.direction, np.where(np.arange(count)[:, None] == light, lights.irradiance, 0))
+                told = shade(batch.surface, alone, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1).sum(axis=0)
+                read = values[:, light].astype(np.float32) * stack.scale[light]
+                short = np.where(channels[:, light], np.maximum(told - read, 0), 0)
+                at = np.flatnonzero(short.any(axis=0))
+                found.append((batch.pixels[at], np.full(len(at), light), (read + self.trust[part] * short)[:, at]))
+        if not found:
+            return stack
+        pixel, light, radiance = zip(*found, strict=True)
+        return ReplacedStack.of(stack, np.concatenate(pixel), np.concatenate(light), np.concatenate(radiance, axis=1))
+
+    def correct(self, frames: np.ndarray, lights: Sequence[ModelLight], *, specular: bool) -> np.ndarray | None:
+        """Add to plain frames what the model says they miss, one frame after another.
+
+        Args:
+            frames: [frames, 3, pixels] float32, changed in place; never below 0 where they were not.
+            lights: the light of each frame.
+            specular: whether [frames, 3, pixels] float32 of that part, between 0 and the frame, is returned.
+        """
+        mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
+        done = 0
+        for batch in self._model.batches():
+            part = slice(done, done + len(batch.pixels))
+            done = part.stop
+            band = self._upload(batch, self.stack)
+            for index, light in enumerate(lights):
+                frame, mirror = frames[index : index + 1], None if mirrored is None else mirrored[index : index + 1]
+                self._add(frame, mirror, batch.pixels, part, self._lit(batch, band, light))
+        return mirrored
+
+    def correct_range(self, frames: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
+                      specular: bool) -> np.ndarray | None:
+        """Add to the plain frames of a chunk what the model says they miss; what they have in common is computed once.
+
+        Args:
+            frames, lights, specular: as for `correct`.
+            places: position of each frame in the full chunk, also when only some of its frames are made.
+        """
+        mirrored = np.zeros(frames.shape, dtype=np.float32) if specular else None
+        chunk = self._range.chunk(lights, places)
+        if chunk.beyond is not None:
+            _ = self.trust_beyond  # before several threads ask for it
+        done = 0
+        for batch in self._model.batches():
+            band = self._upload(batch, self.stack)
+
+            def use(at: slice, lit: LitModel, batch: ModelBatch = batch, done: int = done) -> None:
+                self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
+
+            self._range.light(batch, band, self.stack.scale, self._visible(batch), chunk, use)
+            done += len(batch.pixels)
+        return mirrored
+
+    def _add(self, frames: np.ndarray, mirrored: np.ndarray | None, pixels: np.ndarray, part: slice, lit: LitModel) -> None:
+        """Add the correction of some pixels to frames [frames, 3, pixels], and keep its specular part."""
+        plain = frames[:, :, pixels]
+        change, mirror = correction(lit, plain, self.trust[part], None if lit.beyond is None else self.trust_beyond[part])
+        guided = np.maximum(plain + change, np.minimum(plain, 0))
+        frames[:, :, pixels] = guided
+        if mirrored is not None:
+            mirrored[:, :, pixels] = np.clip(mirror, 0, np.maximum(guided, 0))
+
+    def _lit(self, batch: ModelBatch, band: packs.Band, light: ModelLight) -> LitModel:
+        """Return the model of a batch under the light of one frame."""
+        visible = self._visible(batch, light.marched)
+
+        def lit(sources: Sources) -> np.ndarray:
+            return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
+
+        wanted = lit(light.wanted)
+        given = sum_shown(self._captured(batch, self.stack, band, visible), light.captured)
+        beyond = None
+        if light.beyond is not None:
+            outside = lit(light.beyond.wanted)
+            beyond = LitBeyond(outside.sum(axis=0), outside[1], lit(light.beyond.captured).sum(axis=0))
+        return LitModel(wanted[0], wanted[1], given.whole, given.ratio, None if light.added is None else lit(light.added), beyond)
+
+    @cached_property
+    def _range(self) -> ModelRange:
+        """The model for many frames."""
+        return ModelRange(self._model, self._lights)
+
+    def add_near(self, frame: np.ndarray, specular: np.ndarray, near: NearLights) -> None:
+        """Add near lights to a frame: every pixel's own sum of the captured images, and what the model says that misses.
+
+        Args:
+            frame: [3, pixels] float32, changed in place.
+            specular: [3, pixels] float32, its specular part, changed in place.
+            near: whose rows of visibility follow those of the captured lights.
+        """
+        if not near.fine.count:
+            return
+        fine, coarse = self._beyond(near.fine), self._beyond(near.coarse)
+        done = 0
+        for batch in self._model.batches():
+            part = slice(done, done + len(batch.pixels))
+            visible = self._visible(batch, near.marched)
+            wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(1 - fine), near.coarse.scaled(1 - coarse))
+            added = pictures + self.trust[part] * (wanted.sum(axis=0) - told)
+            mirror = wanted[1]
+            if fine.any() or coarse.any():
+                wanted, pictures, told = self._near_part(batch, visible, near.fine.scaled(fine), near.coarse.scaled(coarse))
+                added = added + pictures + self.trust_beyond[part] * followed(wanted.sum(axis=0) - told, pictures, told)
+                mirror = mirror + wanted[1]
+            added = np.maximum(added, 0)
+            frame[:, batch.pixels] += added
+            specular[:, batch.pixels] += np.clip(mirror, 0, added)
+            done = part.stop
+
+    def _beyond(self, sources: Sources) -> np.ndarray:
+        """Return how far near samples lie beyond the captured lights, as the middle of the surface sees them."""
+        towards = sources.place[:, :3] - sources.place[:, 3:] * self._model.middle
+        return share_beyond(self._lights.direction, towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-20))
+
+    def _near_part(self, batch: ModelBatch, visible: wp.array, fine: Sources, coarse: Sources) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
+        count = len(batch.pixels)
+        wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
+        captured = self._captured(batch, self.stack, self._upload(batch, self.stack), visible)
+        summed = sum_near(captured, coarse, triangles_between(self._lights.direction))
+        pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
+        return wanted, pictures, told
+
+    def _visible(self, batch: ModelBatch, marched: np.ndarray = NOTHING) -> wp.array:
+        """Return which pixels see the captured lights, and the marched places [n, 4] after them."""
+        first = int(batch.pixels[0])
+        seen = self._seen.get(first)
+        if seen is None:
+            seen = self._model.see(self._place, batch.pixels)
+            if self._keep:
+                self._seen[first] = seen
+        if not len(marched):
+            return seen
+        both = wp.empty((seen.shape[0] + len(marched), seen.shape[1]), dtype=seen.dtype, device=self._model.device)
+        wp.copy(both, seen, count=seen.size)
+        wp.copy(both, self._model.see(marched, batch.pixels), dest_offset=seen.size)
+        return both

@@ -1,0 +1,279 @@
+"""The model of a surface under the light of many frames: what depends on the surface is computed once for all of them, one portion of
+its pixels after another; what depends on a frame is a matrix product and a few samples. The pixels of a portion have like normals, so that
+the directions behind all of them, where responses are 0, are left out."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
+from queue import SimpleQueue
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.packs import Band
+from kernels.relight.directions.direction_grid import direction_grid
+from kernels.relight.frames.combine import combine_rows
+from kernels.relight.model.beyond import followed
+from kernels.relight.model.captured import Captured
+from kernels.relight.model.gloss_ratio import ratio_of_sums
+from kernels.relight.model.responses import Responses, empty_responses, respond, shown_gloss
+from kernels.relight.model.shading import SourcesOnDevice, Surface, shade_frames, upload_sources
+from kernels.relight.model.sources import far, join, own_rows
+from kernels.relight.shadows.horizon import Horizons, see_above
+from service.relight.far_light import FarSamples, captured_lights, hidden_as_captured
+from service.relight.range_light import RangeBeyond, RangeLight
+from service.relight.surface_model import ModelBatch, SurfaceModel
+from stage.capture.point_lights import DistantLights
+
+RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 64 << 20
+"""Most bytes of responses that a CPU thread and a CUDA device keep at one time; they choose how many pixels a portion has."""
+HORIZON_FRAMES = 32
+"""Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
+ROUNDING = 1e-4
+"""A direction whose cosine to every normal of a portion is below minus this lights none of its pixels, in float32 neither."""
+
+NO_SOURCES = far(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+class LitModel(NamedTuple):
+    """The model of some pixels under the light of one frame or of several ([frames, 3, n] in place of [3, n])."""
+
+    matt: np.ndarray  # [3, n] diffuse part under the light between the captured lights
+    gloss: np.ndarray  # [3, n] specular part under it
+    whole: np.ndarray  # [3, n] what the weighted sum of images contains for it, with gloss as bright as the images show it
+    ratio: np.ndarray  # [3, n] of image to model that the gloss has there (kernels.relight.model.gloss_ratio)
+    added: "np.ndarray | None"  # [2, 3, n] diffuse and specular part of the captured images that the frame adds
+    beyond: "LitBeyond | None"
+    """Under the light from beyond the captured lights; None: there is none."""
+
+
+class LitBeyond(NamedTuple):
+    """The model under the light from beyond the captured lights."""
+
+    whole: np.ndarray  # [3, n]
+    gloss: np.ndarray  # [3, n] the specular part of it
+    captured: np.ndarray  # [3, n] under what stands in for it in the weighted sum of images
+
+
+class FrameEnergy(NamedTuple):
+    """The energy of frames at fixed directions, as weights of responses to them."""
+
+    weights: np.ndarray  # [positions, 3, n] float32; 0 where no frame stands
+    places: list[int]
+    """Position of each frame in the full chunk: a sum may depend on it in its last bit, and frames that are made later must be the same."""
+
+    @staticmethod
+    def of(energy: Sequence[np.ndarray], places: Sequence[int]) -> "FrameEnergy":
+        """Take the energy [n, 3] of each frame."""
+        weights = np.zeros((max(places) + 1, 3, len(energy[0])), dtype=np.float32)
+        for place, each in zip(places, energy, strict=True):
+            weights[place] = each.T
+        return FrameEnergy(weights, list(places))
+
+    def at(self, directions: np.ndarray) -> "FrameEnergy":
+        """Return the energy at some of the directions, by their numbers."""
+        return self._replace(weights=self.weights[:, :, directions])
+
+    def matt(self, responses: Responses, albedo: np.ndarray) -> np.ndarray:
+        """Return [frames, 3, n] the diffuse part of the radiance of pixels of an albedo [3, n]."""
+        count, _, terms = self.weights.shape
+        sums = combine_rows(responses.matt, self.weights.reshape(3 * count, 1, terms)).numpy().reshape(count, 3, -1)
+        return np.asarray(albedo * sums[self.places, :, : albedo.shape[1]])
+
+    def gloss(self, rows: wp.array, count: int) -> np.ndarray:
+        """Return [frames, 3, count] the specular part of the radiance, from rows as of Responses.gloss."""
+        return np.asarray(combine_rows(rows, self.weights).numpy()[self.places, :, :count])
+
+
+class SmallLights(NamedTuple):
+    """The small bright places of neighbouring frames."""
+
+    frames: slice
+    """The place of these frames in all that are made."""
+    sources: SourcesOnDevice
+    direction: np.ndarray  # [n, 3] of the samples of all these frames
+
+
+class ChunkLight(NamedTuple):
+    """The light of the frames of a chunk, on the device as far as it is shaded."""
+
+    broad: FrameEnergy
+    captured: FrameEnergy
+    small: tuple[SmallLights, ...]
+    added: FrameEnergy | None
+    beyond: "ChunkBeyond | None"
+
+
+class ChunkBeyond(NamedTuple):
+    """The part of it that lies beyond the captured lights."""
+
+    broad: FrameEnergy
+    captured: FrameEnergy
+    small: SourcesOnDevice
+
+
+class Portion(NamedTuple):
+    """Neighbouring packs of a batch."""
+
+    pixels: slice
+    """The pixels of the batch that the portion covers."""
+    surface: Surface
+    band: Band
+    visible: wp.array  # [lights, P] of the captured lights
+    horizons: tuple[Horizons | None, ...]
+    """For each group of small lights; None where it has none."""
+    normal: np.ndarray  # [n, 3]
+    albedo: np.ndarray  # [3, n]
+
+
+class ModelRange:
+    """Lights a model of the surface for many frames."""
+
+    def __init__(self, model: SurfaceModel, lights: DistantLights) -> None:
+        """Args:
+            model: the surface.
+            lights: the captured lights.
+
+        Raises:
+            ArrayError: fewer than four lights, or all in one plane.
+        """
+        self._towards = direction_grid().direction
+        grid = FarSamples(self._towards, np.ones((len(self._towards), 3)), np.zeros(len(self._towards), dtype=bool))
+        self._model, self._lights = model, lights
+        self._grid = hidden_as_captured(grid, lights.direction)
+        self._captured = upload_sources(captured_lights(lights.direction, lights.irradiance), model.device)
+
+    def chunk(self, lights: Sequence[RangeLight], places: Sequence[int]) -> ChunkLight:
+        """Put the light of frames on the device; `places` are the positions of the frames in the full chunk."""
+        nothing = np.zeros_like(lights[0].captured)
+        added = [nothing if each.added is None else each.added for each in lights]
+        beyond = None
+        if any(each.beyond is not None for each in lights):
+            parts = [each.beyond or RangeBeyond(NO_SOURCES, np.zeros_like(each.broad), nothing) for each in lights]
+            small = upload_sources(join([each.small for each in parts]), self._model.device, [each.small.count for each in parts])
+            beyond = ChunkBeyond(FrameEnergy.of([each.broad for each in parts], places),
+                                 FrameEnergy.of([each.captured for each in parts], places), small)
+        has_added = any(each.added is not None for each in lights)
+        return ChunkLight(FrameEnergy.of([each.broad for each in lights], places),
+                          FrameEnergy.of([each.captured for each in lights], places), tuple(self._small_lights(lights, places)),
+                          FrameEnergy.of(added, places) if has_added else None, beyond)
+
+    def _small_lights(self, lights: Sequence[RangeLight], places: Sequence[int]) -> Iterator[SmallLights]:
+        """Yield the small lights of frames, some neighbouring frames at a time."""
+        done = 0
+        for _, members in groupby(places, key=lambda place: place // HORIZON_FRAMES):
+            frames = slice(done, done + len(list(members)))
+            samples = own_rows(join([each.small for each in lights[frames]]))
+            sources = upload_sources(samples, self._model.device, [each.small.count for each in lights[frames]])
+            yield SmallLights(frames, sources, samples.place[:, :3])
+            done = frames.stop
+
+    def light(self, batch: ModelBatch, band: Band, scale: np.ndarray, visible: wp.array, light: ChunkLight,
+              use: Callable[[slice, LitModel], None]) -> None:
+        """Light the model for frames, portion by portion of a batch; on the CPU every thread lights portions of its own.
+
+        Args:
+            batch, band: pixels, and their captured images.
+            scale: [lights padded] radiance of a stored 1.0.
+            visible: [lights, P] of the captured lights.
+            light: of the frames.
+            use: called, by several threads, with the pixels of the batch that a portion has, and the model there.
+        """
+        device = self._model.device
+        threads = devices.worker_count() if device == "cpu" else 1
+        packs = self._portion_packs
+        memory: SimpleQueue[tuple[Responses, Responses]] = SimpleQueue()
+        for _ in range(threads):
+            memory.put((empty_responses(self._grid.count, packs, device), empty_responses(len(self._captured.place), packs, device)))
+
+        def work(portion: Portion) -> None:
+            room = memory.get()
+            try:
+                use(portion.pixels, self._lit(portion, *room, scale, light))
+            finally:
+                memory.put(room)
+
+        with ThreadPoolExecutor(threads, thread_name_prefix="relit-model") as pool:
+            list(pool.map(work, self._portions(batch, band, visible, light.small)))
+
+    @property
+    def _portion_packs(self) -> int:
+        """Return how many packs a portion has, at most."""
+        limit = RESPONSE_BYTES if self._model.device == "cpu" else CUDA_RESPONSE_BYTES
+        return max(1, limit // (4 * 4 * devices.pack_width(self._model.device) * self._grid.count))
+
+    def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: Sequence[SmallLights]) -> Iterator[Portion]:
+        """Cut a batch into portions whose responses fit into RESPONSE_BYTES."""
+        pack, count = devices.pack_width(self._model.device), len(batch.pixels)
+        step = self._portion_packs
+        horizons = [self._model.horizons(each.direction, batch) if len(each.direction) else None for each in small]
+        for first in range(0, batch.surface.packs, step):
+            packs = slice(first, min(first + step, batch.surface.packs))
+            pixels = slice(first * pack, min(packs.stop * pack, count))
+            size = pixels.stop - pixels.start
+            surface = batch.surface._replace(values=batch.surface.values[:, packs], pixel_count=size)
+            images = band._replace(values=band.values[:, packs], saturated=band.saturated[:, packs], pixel_count=size)
+            yield Portion(pixels, surface, images, visible[:, packs],
+                          tuple(None if each is None else each._replace(tangent=each.tangent[:, packs]) for each in horizons),
+                          self._model.normals(batch.pixels[pixels]), self._model.albedo(batch.pixels[pixels]))
+
+    def _lit(self, portion: Portion, grid_room: Responses, captured_room: Responses, scale: np.ndarray, light: ChunkLight) -> LitModel:
+        """Return the model of a portion under the light of frames, with memory for its responses to the grid and to the captured lights."""
+        facing = np.flatnonzero((self._towards @ portion.normal.T).max(axis=1) > -ROUNDING)  # the responses to all others are 0
+        grid = grid_room.room(len(facing), portion.surface.packs)
+        captured = captured_room.room(len(self._captured.place), portion.surface.packs)
+        respond(portion.surface, upload_sources(self._grid.taken(facing), self._model.device), portion.visible, grid)
+        respond(portion.surface, self._captured, portion.visible, captured)
+        images = Captured.of(portion.band, portion.surface, portion.visible, self._lights.direction, self._lights.irradiance, scale)
+        shown = shown_gloss(images, captured)
+        return _summed(portion, grid, facing, captured, shown, light)
+
+
+def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is added to frames, and the model's specular part of their light.
+
+    Args:
+        model: under their light.
+        plain: [3, n] or [frames, 3, n] sums of captured images.
+        trust: [n] β between the captured lights.
+        trust_beyond: [n] β beyond them; not None where the model has such light.
+    """
+    mirror = model.gloss * model.ratio
+    change = trust * (model.matt + mirror - model.whole)
+    added = None if model.added is None else model.added.sum(axis=-3)
+    if model.beyond is not None and trust_beyond is not None:
+        beyond = model.beyond
+        whole = beyond.captured + np.maximum(model.whole, 0)
+        change = change + trust_beyond * followed(beyond.whole - beyond.captured, plain, whole if added is None else whole + added)
+        mirror = mirror + beyond.gloss
+    if model.added is not None:
+        mirror = mirror + model.added[..., 1, :, :]
+    return change, mirror
+
+
+def _summed(portion: Portion, grid: Responses, facing: np.ndarray, captured: Responses, shown: wp.array, light: ChunkLight) -> LitModel:
+    """Return the model of a portion under the light of frames, from its responses to the directions of the grid that are `facing`."""
+    albedo, count = portion.albedo, portion.albedo.shape[1]
+    energy, broad = light.captured, light.broad.at(facing)
+    matt, gloss = broad.matt(grid, albedo), broad.gloss(grid.gloss, count)
+    for lights, horizons in zip(light.small, portion.horizons, strict=True):
+        if horizons is not None:
+            visible = see_above(lights.direction, portion.surface, horizons)
+            small = shade_frames(portion.surface, lights.sources, visible).numpy()[..., :count].reshape(-1, 2, 3, count)
+            matt[lights.frames] += small[:, 0]
+            gloss[lights.frames] += small[:, 1]
+    positive = energy._replace(weights=np.maximum(energy.weights, 0))
+    ratio = ratio_of_sums(positive.gloss(shown, count), positive.gloss(captured.gloss, count))
+    added = beyond = None
+    if light.added is not None:
+        added = np.stack([light.added.matt(captured, albedo), light.added.gloss(captured.gloss, count)], axis=1)
+    if light.beyond is not None:
+        outside = light.beyond.broad.at(facing)
+        shine = outside.gloss(grid.gloss, count)
+        whole = outside.matt(grid, albedo) + shine
+        small = shade_frames(portion.surface, light.beyond.small, portion.visible).numpy()[..., :count].reshape(-1, 2, 3, count)
+        stands_in = light.beyond.captured.matt(captured, albedo) + light.beyond.captured.gloss(captured.gloss, count)
+        beyond = LitBeyond(whole + small.sum(axis=1), shine + small[:, 1], stands_in)
+    return LitModel(matt, gloss, energy.matt(captured, albedo) + energy.gloss(shown, count), ratio, added, beyond)

@@ -1,0 +1,114 @@
+"""Sheets of pictures for review: frames through a display transform, side by side with titles, as one PNG."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from stage.colour.colour import CONFIG, pixels_of
+from stage.files import replacing
+from stage.formats import exr
+from stage.formats.images import write_png
+
+TILE = 320
+"""Height of one picture, pixels."""
+FRAME_TILE = 180
+"""Height of one frame on a contact sheet, pixels."""
+MOST_FRAMES = 60
+"""Most frames on a contact sheet; of a longer range, evenly spaced frames are shown, beginning with the first."""
+GAP, TITLE, MARGIN = 12, 26, 20
+"""Pixels between two pictures, above each picture for its title, and around all pictures."""
+BACKGROUND = np.array([0.055, 0.058, 0.065], dtype=np.float32)
+INK = (0.82, 0.84, 0.87)
+DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
+"""Display and view, by their names in OpenColorIO's built-in configuration."""
+
+
+def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
+    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with.
+
+    Raises:
+        StorageError: the sheet cannot be written, or a frame cannot be read.
+        ImageError: a frame is damaged.
+    """
+    shown = [frames[i] for i in np.linspace(0, len(frames), min(MOST_FRAMES, len(frames)), endpoint=False).astype(int)]
+    tiles = []
+    for frame in shown:
+        pixels, space = read_frame(frame)
+        # in linear light, and before the display transform: that is the slow part
+        tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space)))
+    across = max(1, math.ceil(math.sqrt(len(tiles) * FRAME_TILE / max(tiles[0][1].shape[1], 1) * 16 / 9)))  # as wide as a screen
+    write_sheet(path, [tiles[begin : begin + across] for begin in range(0, len(tiles), across)], height=FRAME_TILE)
+
+
+def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:
+    """Write (title, [rows, cols, 3] display values 0…1) of pictures, each scaled to a height in pixels, row by row as one PNG.
+
+    Raises:
+        StorageError: the picture cannot be written.
+    """
+    sheet = _sheet([[(title, fit(image, height)) for title, image in row] for row in rows], height)
+    with replacing(path) as temporary:
+        write_png(temporary, np.asarray(sheet.get_pixels(oiio.UINT8)), srgb=True)
+
+
+def read_frame(path: Path) -> tuple[np.ndarray, str]:
+    """Read a relit frame.
+
+    Returns:
+        [rows, cols, 3] float32 radiance, and its colour space.
+
+    Raises:
+        ImageError, StorageError: it cannot be read.
+    """
+    channels, metadata = exr.read(path)
+    return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
+
+
+def display(pixels: np.ndarray, space: str) -> np.ndarray:
+    """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through OpenColorIO's ACES view.
+
+    Black becomes the background of a sheet.
+    """
+    lit = pixels.any(axis=-1)
+    shown = np.empty(pixels.shape, dtype=np.float32)
+    shown[~lit] = BACKGROUND
+    if lit.any():  # the transform takes a microsecond a pixel, and most of an object's picture is black
+        source = oiio.ImageBuf(np.ascontiguousarray(pixels[lit][None], dtype=np.float32))
+        buffer = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
+        if buffer.has_error:
+            raise ValueError(f"cannot show {space}: {buffer.geterror()}")
+        shown[lit] = pixels_of(buffer)[0]
+    return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
+
+
+def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarray:
+    """Return an image [rows, cols, 3] scaled to a height; `kernel` is OpenImageIO's name of a filter, by default one that may ring."""
+    rows, cols = image.shape[:2]
+    if rows == height:
+        return image
+    width = max(1, round(cols * height / rows))
+    source = oiio.ImageBuf(np.ascontiguousarray(image, dtype=np.float32))
+    return pixels_of(oiio.ImageBufAlgo.resize(source, kernel, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
+
+
+def _sheet(rows: list[list[tuple[str, np.ndarray]]], tile: int) -> oiio.ImageBuf:
+    width = max(sum(image.shape[1] + GAP for _, image in row) - GAP for row in rows) + 2 * MARGIN
+    height = len(rows) * (tile + TITLE + GAP) - GAP + 2 * MARGIN
+    canvas = np.empty((height, width, 3), dtype=np.float32)
+    canvas[:] = BACKGROUND
+    titles = []
+    y = MARGIN
+    for row in rows:
+        x = MARGIN
+        for title, image in row:
+            canvas[y + TITLE : y + TITLE + tile, x : x + image.shape[1]] = image
+            titles.append((x, y + TITLE - 8, title))
+            x += image.shape[1] + GAP
+        y += TITLE + tile + GAP
+    sheet = oiio.ImageBuf(canvas)
+    for x, y, title in titles:
+        oiio.ImageBufAlgo.render_text(sheet, x, y, title, 15, "", INK)
+    return sheet

@@ -1,0 +1,158 @@
+"""Solved maps as a surface that can be lit: its pixels in batches on a device, and which lights they see over its height.
+
+The surface reflects by Relit's BRDF, Lambert and the GGX lobes of one material or two (kernels.relight.model.shading cites its equations).
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.relight.model.shading import SecondLobe, Surface, upload_surface
+from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
+from kernels.relight.shadows.occlusion import see_lights
+from kernels.surface.shadows import extent_of
+from service.solve.height.height import projection_of
+from service.solve.sharing.batches import view_directions
+from stage.errors import ResultError
+from stage.results.maps import LOBES, SurfaceMaps
+
+BATCH_PIXELS = 1 << 17
+"""Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
+
+NORMAL_CELLS = 32
+"""Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
+
+
+class ModelBatch(NamedTuple):
+    """Some pixels of the surface on the device."""
+
+    pixels: np.ndarray  # [n] row-major positions in the image
+    surface: Surface
+
+
+class SurfaceModel:
+    """A surface that can be lit."""
+
+    def __init__(self, maps: SurfaceMaps, where: Path, device: str, *, chosen: np.ndarray | None = None, by_normal: bool = False) -> None:
+        """Keep solved maps for lighting.
+
+        Args:
+            maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe, and where abundance
+                is above 0 there are those of two materials.
+            where: their file, for messages.
+            device: where.
+            chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
+            by_normal: True to make pixels of like normals neighbours within each batch; else pixels ascend.
+        """
+        for name in ("normal", "diffuse_albedo", "height"):
+            if getattr(maps, name) is None:
+                raise ResultError(f"{where}: has no layer {name}, which lighting the maps needs: solve with lambert, robust or svbrdf")
+        if maps.abundance is not None and (lacking := [name for lobe in LOBES for name in lobe if getattr(maps, name) is None]):
+            raise ResultError(f"{where}: has a layer abundance and no layer {lacking[0]}, which pixels of two materials need: solve again")
+        assert maps.normal is not None and maps.diffuse_albedo is not None and maps.height is not None
+        self.maps, self.device = maps, device
+        normal = maps.normal.reshape(-1, 3)
+        whole = maps.mask.reshape(-1) & np.isfinite(maps.height).reshape(-1) & (np.abs(normal).sum(axis=1) > 0)
+        pixels = np.flatnonzero(whole if chosen is None else whole & chosen.reshape(-1))
+        self.pixels = _by_normal(pixels, normal) if by_normal else pixels
+        """[n] Row-major positions of the solved pixels that will be lit."""
+        if not len(self.pixels):
+            raise ResultError(f"{where}: no pixel is solved")
+        self.middle = self.places(self.pixels).mean(axis=0)
+        """[3] Mean place of these pixels."""
+        self._view = view_directions(maps.camera)
+        inside = whole.reshape(maps.mask.shape)
+        self._height = wp.array(np.where(inside, maps.height, 0).astype(np.float32), dtype=wp.float32, device=device)
+        self._mask = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=device)
+        self._projection = projection_of(maps.camera)
+        self._extent = extent_of(np.where(inside, maps.height, 0), inside)
+        self.profile: np.ndarray | None = None
+        """[n, 3] Profile of the specular part at the solved pixels (kernels.relight.model.lobe_profile); None: that of the BRDF."""
+
+    def batches(self) -> Iterator[ModelBatch]:
+        """Yield the solved pixels in batches."""
+        maps = self.maps
+        assert maps.normal is not None and maps.diffuse_albedo is not None
+        for start in range(0, len(self.pixels), BATCH_PIXELS):
+            pixels = self.pixels[start : start + BATCH_PIXELS]
+
+            def rows(values: np.ndarray, pixels: np.ndarray = pixels) -> np.ndarray:
+                return values.reshape(maps.mask.size, -1)[pixels].astype(np.float32, copy=False)
+
+            specular, roughness = np.zeros((len(pixels), 3), np.float32), np.zeros((len(pixels), 1), np.float32)
+            if maps.specular is not None and maps.roughness is not None:
+                specular, roughness = rows(maps.specular), rows(maps.roughness)
+            second = None
+            if maps.abundance is not None:
+                layers = (maps.first_specular, maps.first_roughness, maps.second_specular, maps.second_roughness)
+                first_specular, first_roughness, *other = (rows(layer) for layer in layers if layer is not None)
+                abundance = rows(maps.abundance)
+                specular = np.where(abundance > 0, first_specular, specular)
+                roughness = np.where(abundance > 0, first_roughness, roughness)
+                second = SecondLobe(*other, np.where(abundance > 0, 1 - abundance, 0))
+            yield ModelBatch(pixels, upload_surface(rows(maps.normal), rows(maps.diffuse_albedo), specular, roughness, self._view(pixels),
+                                                    self.places(pixels), second=second,
+                                                    profile=None if self.profile is None else self.profile[start : start + BATCH_PIXELS],
+                                                    device=self.device))
+
+    def places(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the places of pixels [n], row-major positions: [n, 3] float32, camera frame."""
+        assert self.maps.height is not None
+        return self.maps.camera.points_at(pixels, self.maps.height.reshape(-1)[pixels])
+
+    def see(self, place: np.ndarray, pixels: np.ndarray) -> wp.array:
+        """Return which pixels see which lights, as [n, P] uint8 packs of 255 or 0.
+
+        Args:
+            place: [n, 4] direction and 0, or position and 1.
+            pixels: [m] of a batch.
+        """
+        return see_lights(place, pixels, self._height, self._mask, self._projection, extent=self._extent, device=self.device)
+
+    def normals(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [m, 3] float32 normals of pixels [m]."""
+        assert self.maps.normal is not None
+        return self.maps.normal.reshape(-1, 3)[pixels].astype(np.float32, copy=False)
+
+    def albedo(self, pixels: np.ndarray) -> np.ndarray:
+        """Return [3, m] float32 diffuse albedo of pixels [m]."""
+        assert self.maps.diffuse_albedo is not None
+        return np.ascontiguousarray(self.maps.diffuse_albedo.reshape(-1, 3)[pixels].T, dtype=np.float32)
+
+    def horizons(self, direction: np.ndarray, batch: ModelBatch) -> Horizons:
+        """Return the horizons of a batch, as far as they tell which pixels see far lights in directions [n, 3]."""
+        sight = np.zeros((1, 2))
+        if self._projection.perspective:
+            points = self.places(batch.pixels)
+            sight = points[:, :2] / points[:, 2:]
+        return find_horizons(azimuths_of(direction, sight), batch.pixels, batch.surface, self._field)
+
+    @cached_property
+    def _field(self) -> HeightField:
+        """The height on the device, for finding horizons."""
+        return height_field(self._height.numpy(), self._mask.numpy() != 0, self._projection, self.device)
+
+
+def _by_normal(pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the pixels [n] of each batch sorted by the cell of their normal, the cells in Morton order: a far light leaves neighbours dark
+    together (service.relight.model_range).
+
+    Args:
+        pixels: row-major positions.
+        normal: [all pixels, 3] unit vectors.
+    """
+    ordered = []
+    for start in range(0, len(pixels), BATCH_PIXELS):
+        batch = pixels[start : start + BATCH_PIXELS]
+        x, y, z = normal[batch].T
+        equal_area = np.stack([x, y]) / np.sqrt(np.maximum(1 + z, 1e-3))  # -1…1 where z is 0 or above
+        cell = np.clip((equal_area + 1) / 2 * NORMAL_CELLS, 0, NORMAL_CELLS - 1).astype(np.int32)
+        place = np.zeros(len(batch), dtype=np.int32)
+        for bit in range(NORMAL_CELLS.bit_length() - 1):
+            place |= ((cell[0] >> bit & 1) << (2 * bit)) | ((cell[1] >> bit & 1) << (2 * bit + 1))
+        ordered.append(batch[np.argsort(place, kind="stable")])
+    return np.concatenate(ordered) if ordered else pixels

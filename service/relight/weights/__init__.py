@@ -1,0 +1,1 @@
+"""Weights of captured lights: triangulations, quadrature and environments."""

@@ -1,0 +1,1 @@
+"""How options are declared, read from a command line and recorded."""

@@ -1,0 +1,1 @@
+"""Light keys, near lights, frame ranges and pictures, which several requests take."""

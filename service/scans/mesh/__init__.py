@@ -1,0 +1,1 @@
+"""Fused meshes: holes, bands of vertices, and normals joined to them."""

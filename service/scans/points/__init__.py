@@ -1,0 +1,1 @@
+"""Scans in memory: points, their neighbours, squares of pixels and rigid motions."""

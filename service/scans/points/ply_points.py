@@ -1,0 +1,129 @@
+"""Reading of the vertices of any PLY file: ASCII or binary, with any properties."""
+
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+
+from stage.errors import ResultError, storage
+from stage.formats.ply import COLOUR, MAX_HEADER, NORMAL, POSITION
+
+TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+         "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+SIGMA, CONFIDENCE = "sigma", "confidence"
+MOST_POINTS = 2**31
+
+
+class PlyPoints(NamedTuple):
+    """The vertices of a PLY file, those with a coordinate that is not finite left out."""
+
+    points: np.ndarray  # [n, 3] float64, in the unit of the file
+    normals: np.ndarray | None  # [n, 3] float32, as in the file
+    colours: np.ndarray | None  # [n, 3] uint8
+    sigma: np.ndarray | None  # [n] float64, in the unit of the file
+    confidence: np.ndarray | None  # [n] float32
+
+
+class _Element(NamedTuple):
+    name: str
+    entries: int
+    properties: list[tuple[str, str]]
+    """Name and type of each; the type of a list is `list`."""
+
+
+def read_ply_points(path: Path) -> PlyPoints:
+    """Read the vertices of a PLY file.
+
+    Args:
+        path: the file: x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma` and `confidence`
+            where there are any. Other properties and elements are skipped.
+
+    Raises:
+        ResultError: the file is no PLY file, is truncated, or has no vertices with x, y and z.
+        StorageError: the file cannot be read.
+
+    Source:
+        Turk, "The PLY Polygon File Format", 1994.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        order, elements, start = _header(stream, path)
+        stream.seek(start)
+        values = _ascii(stream, elements, path) if order == "ascii" else _binary(stream, FORMATS[order], elements, path)
+    missing = [name for name in POSITION if name not in values]
+    if missing:
+        raise ResultError(f"{path}: its vertices have no property {missing[0]}")
+    points = np.stack([values[name].astype(np.float64) for name in POSITION], axis=1)
+    there = np.isfinite(points).all(axis=1)
+    if not there.any():
+        raise ResultError(f"{path}: holds no vertex with finite coordinates")
+
+    def columns(names: tuple[str, ...]) -> np.ndarray | None:
+        return np.stack([values[name][there] for name in names], axis=1) if all(name in values for name in names) else None
+
+    colours = columns(COLOUR)
+    if colours is not None and colours.dtype != np.uint8:
+        scale = 255.0 if colours.dtype.kind == "f" else 255.0 / np.iinfo(colours.dtype).max
+        colours = np.rint(np.clip(np.nan_to_num(colours * scale), 0, 255)).astype(np.uint8)
+    normals, sigma, confidence = columns(NORMAL), columns((SIGMA,)), columns((CONFIDENCE,))
+    return PlyPoints(points[there], None if normals is None else normals.astype(np.float32), colours,
+                     None if sigma is None else sigma[:, 0].astype(np.float64),
+                     None if confidence is None else confidence[:, 0].astype(np.float32))
+
+
+def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
+    """Return the format, the elements, and the position behind the header."""
+    raw = stream.read(MAX_HEADER)
+    end = raw.find(b"end_header")
+    behind = raw.find(b"\n", end) + 1
+    lines = [line.split() for line in raw[:max(end, 0)].decode("ascii", "replace").splitlines()]
+    if end < 0 or behind == 0 or not lines or lines[0] != ["ply"]:
+        raise ResultError(f"{path}: is not a PLY file, or its header does not end within {MAX_HEADER} bytes")
+    order, elements = "", []
+    for words in lines[1:]:
+        match words:
+            case ["format", name, *_]:
+                order = name
+            case ["element", name, count] if count.isdecimal() and int(count) <= MOST_POINTS:
+                elements.append(_Element(name, int(count), []))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1].properties.append((name, "list"))
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1].properties.append((name, kind))
+            case [("comment" | "obj_info"), *_] | []:
+                pass
+            case _:
+                raise ResultError(f"{path}: its header has a line that is not understood: {' '.join(words)[:60]}")
+    if order not in FORMATS:
+        raise ResultError(f"{path}: its format is {order[:40] or 'not given'}: must be one of {', '.join(FORMATS)}")
+    place = next((index for index, element in enumerate(elements) if element.name == "vertex"), None)
+    if place is None or elements[place].entries == 0:
+        raise ResultError(f"{path}: has no vertices")
+    if any(kind == "list" for element in elements[:place + 1] for _, kind in element.properties):
+        raise ResultError(f"{path}: has lists before the end of its vertices: write the vertices first, without lists")
+    return order, elements[:place + 1], behind
+
+
+def _binary(stream: BinaryIO, order: str, elements: list[_Element], path: Path) -> dict[str, np.ndarray]:
+    for element in elements:
+        kind = np.dtype([(f"{number} {name}", order + TYPES[kind]) for number, (name, kind) in enumerate(element.properties)])
+        values = np.fromfile(stream, dtype=kind, count=element.entries)
+        if len(values) != element.entries:
+            raise ResultError(f"{path}: is truncated: it holds {len(values)} of {element.entries} entries of {element.name}")
+    names = [name for name, _ in elements[-1].properties]
+    return {name: values[f"{number} {name}"] for number, name in enumerate(names)}
+
+
+def _ascii(stream: BinaryIO, elements: list[_Element], path: Path) -> dict[str, np.ndarray]:
+    for element in elements[:-1]:
+        for _ in range(element.entries):
+            stream.readline()
+    vertex = elements[-1]
+    try:
+        table = np.loadtxt(stream, dtype=np.float64, max_rows=vertex.entries, ndmin=2, comments=None, encoding="ascii")
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ResultError(f"{path}: its vertices are not rows of {len(vertex.properties)} numbers each") from error
+    if table.shape != (vertex.entries, len(vertex.properties)):
+        raise ResultError(f"{path}: is truncated or malformed: it holds {table.shape[0]} of {vertex.entries} vertices, with "
+                          f"{table.shape[1]} of {len(vertex.properties)} properties")
+    return {name: table[:, number].astype(TYPES[kind]) for number, (name, kind) in enumerate(vertex.properties)}

@@ -1,0 +1,1 @@
+"""Poses of scans: pairs by features and surfaces, then all at once with covariances."""

@@ -1,0 +1,165 @@
+"""What the range image of one scan says of the points of another: seen, hidden behind the surface, or where the camera saw through."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from service.scans.points.cloud import Cloud
+from service.scans.points.rigid import applied, inverse
+from service.scans.points.scan import Scan
+from stage.capture.camera import Camera
+
+MOST_PIXELS = 1 << 19
+"""Most pixels that are kept of a range image. Of a larger one squares of pixels are taken together, each with its nearest and farthest."""
+
+
+class DepthRange(NamedTuple):
+    """The nearest and farthest depth around each pixel of a range image, or around each square of pixels."""
+
+    camera: Camera
+    step: int
+    """Side of a square in pixels."""
+    nearest: np.ndarray  # [rows, cols] float32 metres, of squares; 0 where any pixel of the square or around it has no depth
+    farthest: np.ndarray  # [rows, cols]
+
+
+ALIKE_AROUND = 8
+"""Neighbours of a point that are asked whether they are contradicted too."""
+MOST_ALIKE = 0.75
+"""Part of them that must be, for the point to count as one of a part of the surface: single points float before edges."""
+FACING = 0.35
+"""Cosine of the angle between the normal of a surface and a line of sight from which on the camera cannot have missed the surface: a sheet
+seen edge-on lies between its pixels."""
+
+
+class Sight(NamedTuple):
+    """How many points of one scan another scan sees, or contradicts."""
+
+    agreeing: int
+    """Points on the surface that the camera measured."""
+    contradicted: int
+    """Points before that surface, where the camera saw through."""
+    judged: int
+    """Points that fall into the image at pixels with a depth."""
+
+    @property
+    def contradicted_part(self) -> float:
+        """The contradicted part of the points on or before the surface."""
+        return self.contradicted / max(self.agreeing + self.contradicted, 1)
+
+
+class Contradiction(NamedTuple):
+    """The parts of the points of two scans, on or before the surface of the other, that the other contradicts."""
+
+    points: float
+    """All of them."""
+    surface: float
+    """Those of a part of the surface which the other camera cannot have missed."""
+
+
+def depth_range(scan: Scan) -> DepthRange | None:
+    """Return the range of depths around each pixel of a range image, or None for a set of points."""
+    if scan.camera is None:
+        return None
+    depth = scan.image(-scan.points[:, 2].astype(np.float32))
+    there = depth != 0
+    padded = np.pad(depth, 1)
+    known = np.pad(there, 1)
+    rows, cols = depth.shape
+    views = [(padded[i:i + rows, j:j + cols], known[i:i + rows, j:j + cols]) for i in range(3) for j in range(3)]
+    inner = np.logical_and.reduce([seen for _, seen in views])
+    low = np.where(inner, np.minimum.reduce([values for values, _ in views]), 0)
+    high = np.where(inner, np.maximum.reduce([values for values, _ in views]), 0)
+    step = max(1, int(np.ceil(np.sqrt(depth.size / MOST_PIXELS))))
+    return DepthRange(scan.camera, step, _of_squares(low, step, np.minimum), _of_squares(high, step, np.maximum))
+
+
+def _of_squares(values: np.ndarray, step: int, least: np.ufunc) -> np.ndarray:
+    """Return the least or largest of the values of each square of `step` pixels; beyond the border values are 0."""
+    if step == 1:
+        return values
+    rows, cols = (-(-side // step) for side in values.shape)
+    padded = np.zeros((rows * step, cols * step), dtype=values.dtype)
+    padded[:values.shape[0], :values.shape[1]] = values
+    return np.asarray(least.reduce(padded.reshape(rows, step, cols, step), axis=(1, 3)))
+
+
+def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float) -> Sight:
+    """Compare points with what a range image says of the space before and behind its surface.
+
+    Args:
+        image: the range image.
+        points: [n, 3] metres, of another scan.
+        pose: [4, 4] from the frame of the points to that of the image.
+        tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
+    """
+    before, on, judged = _seen(image, points, pose, tolerance)
+    return Sight(int(on.sum()), int(before.sum()), int(judged.sum()))
+
+
+def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which points lie before the surface of a range image, on it, and at pixels with a depth; arguments as of `sight`."""
+    camera = image.camera
+    placed = applied(pose, points)
+    front = placed[:, 2] < 0 if camera.projection == "perspective" else np.ones(len(placed), dtype=bool)
+    placed = np.where(front[:, None], placed, [0.0, 0.0, -1.0])
+    u, v = camera.image_coordinates(placed)
+    col, row = (np.clip(np.floor(np.nan_to_num(x)), -1, 2**30).astype(np.int64) for x in (u, v))
+    inside = front & (col >= 0) & (row >= 0) & (col < camera.width) & (row < camera.height)
+    at = np.where(inside, row, 0) // image.step, np.where(inside, col, 0) // image.step
+    near, far = image.nearest[at], image.farthest[at]
+    judged = inside & (near != 0)
+    depth = -placed[:, 2]
+    before = judged & (depth < near - tolerance)
+    return before, judged & ~before & (depth <= far + tolerance), judged
+
+
+def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float
+                  ) -> Contradiction:
+    """Return which parts of the points in sight lie where the other camera saw through.
+
+    On a part of the surface lie points whose neighbours are contradicted too, that are on no border and that the other camera does not see
+    edge-on: where a pixel takes in the edge of a surface and what is behind it, its point lies on neither.
+
+    Args:
+        a, b: the range images; None: a set of points, which says nothing.
+        cloud_a, cloud_b: in the frames of a and b.
+        pose: [4, 4] a_from_b.
+        tolerance: metres.
+    """
+    through = contradicted = in_sight = 0
+    for image, cloud, way in ((a, cloud_b, pose), (b, cloud_a, inverse(pose))):
+        if image is None:
+            continue
+        before, on, _ = _seen(image, cloud.points, way, tolerance)
+        at = np.flatnonzero(before & ~cloud.border)
+        at = at[_facing(image, cloud.points[at], cloud.normals[at], way) > FACING]
+        if len(at):
+            around, _ = cloud.tree.nearest(cloud.points[at], ALIKE_AROUND + 1)
+            through += int((before[around[:, 1:]].mean(axis=1) >= MOST_ALIKE).sum())
+        contradicted += int(before.sum())
+        in_sight += int(before.sum() + on.sum())
+    return Contradiction(contradicted / max(in_sight, 1), through / max(in_sight, 1))
+
+
+def _facing(image: DepthRange, points: np.ndarray, normals: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the cosine of the angle, up to 90°, between the normal of each point and the line of sight of a range image."""
+    to_camera = -applied(pose, points) if image.camera.projection == "perspective" else np.array([[0.0, 0.0, 1.0]])
+    along = np.abs((normals @ pose[:3, :3].T * to_camera).sum(axis=1))
+    return np.asarray(along / np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12))
+
+
+def both_sights(a: DepthRange | None, b: DepthRange | None, points_a: np.ndarray, points_b: np.ndarray, pose: np.ndarray,
+                tolerance: float) -> Sight:
+    """Return the sum of what both scans say of each other's points.
+
+    Args:
+        a, b: the range images; None: a set of points, which says nothing.
+        points_a, points_b: [n, 3] and [m, 3] in the frames of a and b.
+        pose: [4, 4] a_from_b.
+        tolerance: metres.
+    """
+    parts = [sight(a, points_b, pose, tolerance)] if a is not None else []
+    parts += [sight(b, points_a, inverse(pose), tolerance)] if b is not None else []
+    return Sight(*(sum(values) for values in zip(*parts, strict=True))) if parts else Sight(0, 0, 0)

@@ -1,0 +1,313 @@
+"""Registration of two scans: poses that are tried, and whether what they leave is one surface, seen twice, in one way alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
+from service.scans.points.rigid import inverse, moved, step_between
+from service.scans.points.scan import Scan
+from service.scans.registration.coarse import is_near, rough_poses
+from service.scans.registration.features import fpfh
+from service.scans.registration.fine import TUKEY, Fit, fit
+from service.scans.registration.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
+
+FEATURE_CELLS = 5.0
+"""Radius of the features in cells of the rough clouds, as Open3D's examples have it."""
+MOST_POSES = 4
+"""The most rough poses of a pair that are refined."""
+ROUGH_POINTS, FINE_POINTS = 3000, 12_000
+"""The most points of a scan that are matched at either scale."""
+CONTRADICTED = 0.1
+"""The largest part of the points in sight that may lie where the other camera saw through: borders, mixed pixels, sheets seen edge-on."""
+SEEN_THROUGH = 0.002
+"""The same of points that belong to a part of the surface which faces the camera: parts that stick out tell a body from its turned self.
+Right poses of the statue of tests/scenes leave none to .0007, those that are turned by a quarter or a half .0023 and more."""
+MATCHED_CONTRADICTED, ROUGH_CONTRADICTED = 0.4, 0.25
+"""The same of a pose from matched features, and after its fit at the rough scale."""
+BEND = 0.12
+"""The largest residual as a part of the spacing of the points, whatever σ is: what the bend of the surface between points makes."""
+ROUGH_BEND = 0.15
+"""The largest residual of a rough pose in cells: right poses leave .05 of a cell on a statue, wrong ones .3 and more."""
+RATIO = 2.5
+"""The largest residual in units of σ of scans whose residual is above `BEND`."""
+NOT_DETERMINED, WEAK = 10.0, 60.0
+"""A direction whose information is less than this many times what the noise of the normals makes alone is not determined, or is tried out.
+A vase has 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
+BENT, WEAKLY_BENT = 0.3, 1.5
+"""The same against what normals make that are as wrong as those of 8 neighbours differ from those of 16: that is too much, but grows with
+the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .1 to .2 about its axis at
+spacings of 6 to 17 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
+details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
+TRIED_POINTS = 800
+"""The most points of the fit that is first tried out."""
+SHIFTS = (0.1, -0.1, 0.3)
+"""By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
+NEAR_SHIFT = 3.0
+"""The same from a start, in spacings: a place far from the start is none."""
+KEPT = 0.3
+"""The part of such a shift that is left after a fit, from which on the scan slides along the direction."""
+AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
+"""Another pose fits as well if its residual is at most this many times that of the best, its overlap that part of it at the least, and not
+this much more of it is contradicted."""
+
+
+SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
+"""The scale of a scan is told if it differs from 1 by so many standard deviations and by these parts."""
+
+
+class PairState(StrEnum):
+    """What became of a pair."""
+
+    JOINED = "joined"
+    NO_POSE = "no pose"
+    """No pose brings enough of the two surfaces together."""
+    LITTLE_OVERLAP = "little overlap"
+    MISFIT = "misfit"
+    """The surfaces lie further apart than σ and the spacing of the points explain."""
+    CONTRADICTED = "contradicted"
+    """One scan has points where the camera of the other saw through."""
+    AMBIGUOUS = "ambiguous"
+    """Several poses fit alike: the surface is symmetric."""
+
+
+class Evidence(StrEnum):
+    """What the pose of a pair was found by."""
+
+    SURFACES = "surfaces"
+    TARGETS = "targets"
+
+
+class Pair(NamedTuple):
+    """Two scans, and the pose of one against the other."""
+
+    a: int
+    b: int
+    state: PairState
+    fit: Fit | None
+    """What the best pose leaves; None: no pose was found."""
+    overlap: float
+    """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
+    contradicted: float
+    reason: str
+    """Why it was refused, in words; empty of a joined pair."""
+    by: Evidence = Evidence.SURFACES
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A scan at both scales."""
+
+    rough: Cloud
+    fine: Cloud
+    features: np.ndarray
+    image: DepthRange | None
+    area: float
+    """Area of the surface that is seen, square metres, up to a factor that all scans share."""
+
+    @property
+    def spacing(self) -> float:
+        """Median distance of neighbouring points of the fine cloud, metres."""
+        return float(np.median(self.fine.spacing))
+
+
+def is_contradicted(found: Contradiction) -> bool:
+    """Return whether the free space of two scans refuses a pose."""
+    return found.points > CONTRADICTED or found.surface > SEEN_THROUGH
+
+
+def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
+    """Thin a scan to both scales and describe its rough points.
+
+    Args:
+        scan: the scan.
+        cell_m: side of the cells of the rough scale, metres.
+        threads: for the search of neighbours.
+    """
+    thinned = thinned_scan(scan)
+    rough = cloud_of(rough_scan(scan, thinned, cell_m), most=ROUGH_POINTS, threads=threads)
+    fine = cloud_of(thinned, most=FINE_POINTS, threads=threads)
+    return Prepared(rough=rough, fine=fine, features=fpfh(rough, FEATURE_CELLS * cell_m), image=depth_range(scan),
+                    area=len(rough.points) * cell_m**2)
+
+
+def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+    """Register two scans without a start.
+
+    Args:
+        a, b: the scans.
+        numbers: of the scans, for the result.
+        cell_m: side of the cells of the rough scale, metres.
+        least_overlap: the least part of the smaller scan that must be matched.
+    """
+    poses = rough_poses(a.rough, b.rough, a.features, b.features, cell_m=cell_m, most=MOST_POSES)
+    return _best(a, b, _settled(a, b, poses, cell_m), numbers, cell_m, least_overlap)
+
+
+def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+    """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`.
+
+    The fine scale is tried at once. The rough scale has few points, and only leads there where the start does not.
+    """
+    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, from_start=True)
+    if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
+        return pair
+    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, from_start=True)
+
+
+def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -> Iterator[np.ndarray]:
+    """Yield the poses after a fit at the rough scale, each once, without those that the free space contradicts."""
+    seen: list[np.ndarray] = []
+    for pose in poses:
+        if both_sights(a.image, b.image, a.rough.points, b.rough.points, pose, cell_m).contradicted_part > MATCHED_CONTRADICTED:
+            continue
+        found = fit(a.rough, b.rough, pose, [4 * cell_m, 2 * cell_m])
+        if found is None or any(is_near(found.pose, other, b.rough.middle, cell_m) for other in seen):
+            continue
+        seen.append(found.pose)
+        if not fits_roughly(found, a, b, cell_m):
+            continue
+        sight = both_sights(a.image, b.image, a.rough.points, b.rough.points, found.pose, cell_m / 2)
+        if sight.contradicted_part <= ROUGH_CONTRADICTED:
+            yield found.pose
+
+
+def fits_roughly(found: Fit, a: Prepared, b: Prepared, cell_m: float) -> bool:
+    """Return whether a fit at the rough scale leaves no more than the noise and the bend of the surface between points explain."""
+    noise = float(np.median(np.hypot(a.rough.sigma.mean(), b.rough.sigma)))
+    return found.residual <= max(ROUGH_BEND * cell_m, RATIO * noise)
+
+
+def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float, *,
+          from_start: bool = False) -> Pair:
+    """Return the best pair of poses that are tried; `from_start`: of the one that is given, so that others far from it are none."""
+    found: list[Pair] = []
+    for pose in poses:
+        settled = _fitted(a, b, pose, cell_m)
+        pair = None if settled is None else _judged(a, b, settled, numbers, least_overlap)
+        if pair is not None and not any(_same(pair, other, b, cell_m) for other in found):
+            found.append(pair)
+    if not found:
+        return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "no pose brings enough of the two surfaces together")
+    found.sort(key=lambda pair: (pair.state is not PairState.JOINED, -pair.overlap))
+    best = found[0]
+    if best.state is not PairState.JOINED:
+        return best
+    rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
+    if rival is not None:
+        return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
+    tried = _tried_out(a, b, best, cell_m, least_overlap, from_start)
+    if tried.state is PairState.JOINED and tried.fit is not None:
+        tried = tried._replace(fit=_doubted(a.fine, b.fine, tried.fit, 1.5 * max(a.spacing, b.spacing)))
+    return tried
+
+
+def _fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
+    """Return the fit of so many points at the fine scale from a start; None if there is none."""
+    spacing = max(a.spacing, b.spacing)
+    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most)
+
+
+def _judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
+    """Return the pair at the pose of a fit at the fine scale."""
+    spacing = max(a.spacing, b.spacing)
+    area = found.matches / len(b.fine.sample) * b.area
+    overlap = min(area / min(a.area, b.area), 1.0)
+    tolerance = max(TUKEY * found.residual, 0.5 * spacing)
+    against = contradiction(a.image, b.image, a.fine, b.fine, found.pose, tolerance)
+    state, reason = PairState.JOINED, ""
+    if found.residual > BEND * spacing and found.ratio > RATIO:
+        state = PairState.MISFIT
+        reason = f"the surfaces lie {1e3 * found.residual:.3g} mm apart (standard deviation): {found.ratio:.3g} times what σ explains"
+        if SCALE_LEAST < abs(found.scale) < SCALE_MOST and abs(found.scale) > SCALE_SIGMAS * found.scale_sigma:
+            reason += f", and one is {abs(found.scale):.2%} larger than the other: check its scale"
+    elif is_contradicted(against):
+        state, reason = PairState.CONTRADICTED, f"{against.points:.1%} of the points in sight lie where the other camera saw through"
+    elif overlap < least_overlap:
+        state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
+    return Pair(*numbers, state, found, overlap, against.points, reason)
+
+
+def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
+    """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
+    other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
+    doubt = np.zeros(6) if other is None else step_between(other.pose @ inverse(found.pose), found.pivot)
+    pull = found.information @ doubt
+    return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
+
+
+def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, from_start: bool) -> Pair:
+    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
+    assert best.fit is not None
+    units = step_units(b)
+    values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
+    weak, undetermined = [], []
+    for value, axis in zip(values, axes.T, strict=True):
+        noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
+                                  for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
+        if value < NOT_DETERMINED * noise or value < BENT * even_bend:
+            undetermined.append(units * axis / units[0])
+        elif value < WEAK * noise or value < WEAKLY_BENT * bend:
+            weak.append(units * axis / units[0])
+    if not undetermined and weak:
+        near = NEAR_SHIFT * max(a.spacing, b.spacing)
+        shifts, reach = ((near * units[0], -near * units[0]), near) if from_start else (SHIFTS, cell_m)
+        undetermined = [step for step in _left_behind(a, b, best, weak, shifts, reach) if _slides(a, b, best, step, cell_m, least_overlap)]
+    if not undetermined:
+        return best
+    kind = "turned about an axis" if np.linalg.norm(undetermined[0][:3]) > 0.5 else "shifted along itself"
+    return best._replace(state=PairState.AMBIGUOUS,
+                         reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
+
+
+def _left_behind(a: Prepared, b: Prepared, best: Pair, steps: list[np.ndarray], shifts: tuple[float, ...], reach: float
+                 ) -> list[np.ndarray]:
+    """Return the directions along which a fit of few points does not return from a shift along all of them."""
+    assert best.fit is not None
+    left: list[np.ndarray] = []
+    for shift in shifts:
+        start = moved(shift * np.sum(steps, axis=0), best.fit.pivot, best.fit.pose)
+        found = _fitted(a, b, start, reach, TRIED_POINTS)
+        if found is not None:
+            left += [step for step in steps if _kept(found, best.fit, step) / shift > KEPT and not any(step is other for other in left)]
+    return left
+
+
+def step_units(scan: Prepared) -> np.ndarray:
+    """Return the units of a motion [6] in which a step of length 1 moves the points of a scan by about 1 m."""
+    size = float(np.sqrt(((scan.rough.points - scan.rough.middle) ** 2).sum(axis=1).mean()))
+    return np.array([1 / size] * 3 + [1.0] * 3)
+
+
+def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: float, least_overlap: float) -> bool:
+    """Return whether a fit from a place along a direction ends about there, and as good."""
+    assert best.fit is not None
+    for shift in SHIFTS:
+        start, found = moved(shift * step, best.fit.pivot, best.fit.pose), None
+        for most in (TRIED_POINTS, None):
+            found = _fitted(a, b, start, cell_m, most)
+            if found is None or _kept(found, best.fit, step) / shift <= KEPT:
+                break
+        else:
+            if found is not None and _as_good(_judged(a, b, found, (best.a, best.b), least_overlap), best):
+                return True
+    return False
+
+
+def _kept(found: Fit, best: Fit, step: np.ndarray) -> float:
+    """Return how far a fit lies from another along a direction, in its length."""
+    return float(step_between(found.pose @ inverse(best.pose), best.pivot) @ step / (step @ step))
+
+
+def _as_good(pair: Pair, best: Pair) -> bool:
+    assert pair.fit is not None and best.fit is not None
+    return (pair.state is PairState.JOINED and pair.fit.ratio <= AS_GOOD * best.fit.ratio and pair.overlap >= LEAST_ALIKE * best.overlap
+            and pair.contradicted <= best.contradicted + MORE_CONTRADICTED)
+
+
+def _same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:
+    assert pair.fit is not None and other.fit is not None
+    return is_near(pair.fit.pose, other.fit.pose, b.rough.middle, cell_m)

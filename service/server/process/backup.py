@@ -1,0 +1,286 @@
+"""Backups of the service: its database, and then the files of captures and results, while jobs run.
+
+The database is copied first, in one snapshot. Files of the storage get their names only when they are complete and never change
+afterwards, so what the database tells about at that moment is there when the files are copied; files that are newer do no harm, because a
+step that runs again finds its frames and keeps them. `backup.json`, with the size and the SHA-256 of every file, is written last: without
+it a backup is not whole.
+
+With `storage_url` the files of captures and results are objects of a store. `backup.json` names those that there were after the database
+was copied, with size and ETag, and `restore` looks for them; or they are copied too, and `restore` sends what the store lacks.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote, urlsplit
+
+import sqlalchemy as sa
+
+from service import __version__
+from service.errors import RequestError
+from service.requests.views.states import ACTIVE
+from service.server.base.settings import Settings
+from service.server.database import tables
+from service.server.database.engine import Database, connect, usable
+from service.server.database.schema import require_current
+from service.server.storage import layout, saved_objects
+from service.server.storage.bucket import Bucket, Object
+from service.server.storage.part_files import part_files_folder
+from stage.errors import storage
+from stage.files import write_text
+
+SCHEMA = "relit.backup/1"
+CONTENTS, SQLITE, DUMP, OBJECTS = "backup.json", "relit.sqlite", "database.dump", "objects"
+PROJECTS = saved_objects.PROJECTS
+"""Folder of captures and results, in the data folder and in the backup."""
+BLOCK = 1 << 20
+
+
+class Backup(NamedTuple):
+    """A backup that was made or restored."""
+
+    folder: Path
+    files: int
+    size: int
+    """Bytes of all files."""
+    objects: int = 0
+    """Objects of the store of `storage_url` that belong to it."""
+    copied: bool = False
+    """True if copies of the objects are among the files."""
+    differing: int = 0
+    """Objects that were missing or had changed when it was restored: sent again where there are copies, else accepted."""
+
+
+class _Contents(NamedTuple):
+    """The contents of backup.json."""
+
+    files: dict[str, dict[str, Any]]
+    storage: dict[str, Any] | None
+    """The store of a service with storage_url: its URL, whether the objects are copied, and the objects; None without storage_url."""
+
+
+def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
+    """Copy the database and the files of a service, which may run meanwhile.
+
+    Args:
+        settings: of the service.
+        out: folder that does not exist or is empty.
+        copy_objects: whether to copy the objects of `storage_url` too, in place of naming them.
+
+    Raises:
+        RequestError: there is no service, the folder is not empty, or the database cannot be copied; nothing is changed in the service.
+        StorageError: the folder cannot be written.
+    """
+    if settings.is_sqlite and not settings.sqlite_file.exists():
+        raise RequestError(f"data {settings.data}: there is no service in this folder")
+    if out.resolve().is_relative_to(settings.data):
+        raise RequestError(f"--out {out}: lies in the data folder, which is to be saved: give a folder elsewhere")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise RequestError(f"--out {out}: is not empty: give a new folder")
+    if copy_objects and settings.storage_url is None:
+        raise RequestError("--objects: this service has no storage_url: its captures and results are in the backup without it")
+    bucket = None if settings.storage_url is None else Bucket(settings.storage_url)
+    with storage("make", out):
+        out.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with _opened(settings) as database:
+        require_current(database)
+    at, active = time.time(), set() if bucket is None else _active_jobs(settings)
+    if settings.is_sqlite:
+        with usable(settings):
+            _copy_sqlite(settings.sqlite_file, out / SQLITE)
+    else:
+        _postgres(settings, "pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--file={out / DUMP}")
+    found = {name: _entry(out / name) for name in (SQLITE, DUMP) if (out / name).exists()}
+    if settings.storage_url is None:
+        for path in _files(settings.data / PROJECTS):
+            name = path.relative_to(settings.data).as_posix()
+            if _link(path, out / name):
+                found[name] = _entry(out / name)
+    folder = part_files_folder(settings)
+    for path in _files(folder):  # a client may add to them meanwhile, so they are copied
+        name = path.relative_to(settings.data).as_posix()
+        if _copy(path, out / name):
+            found[name] = _entry(out / name)
+    contents: dict[str, Any] = {"schema": SCHEMA, "version": __version__, "at": at, "files": found}
+    objects: dict[str, Object] = {}
+    if bucket is not None:
+        objects = saved_objects.save(bucket, out / OBJECTS) if copy_objects else saved_objects.present(bucket, pieces=False)
+        active |= _active_jobs(settings)
+        contents["storage"] = {"url": bucket.url, "copied": copy_objects, "objects": {
+            path: {"size": each.size, "version": each.version} | ({"changes": True} if layout.is_of_job(path, active) else {})
+            for path, each in sorted(objects.items())}}
+        if copy_objects:
+            found |= {f"{OBJECTS}/{path}": _entry(out / OBJECTS / path) for path in sorted(objects)}
+    write_text(out / CONTENTS, json.dumps(contents, indent=1) + "\n")
+    return Backup(out, len(found), sum(entry["size"] for entry in found.values()), len(objects), copy_objects)
+
+
+def restore(settings: Settings, folder: Path, *, accept_differences: bool = False) -> Backup:
+    """Make a service from a backup; workers take over the jobs that ran when it was made.
+
+    Args:
+        settings: of the new service, whose data folder is empty and whose database has no tables.
+        folder: the backup.
+        accept_differences: whether objects of the store may be missing, or differ from those that the backup names.
+
+    Raises:
+        RequestError: the backup is not whole or damaged, the store lacks objects of it, or there is a service already; nothing is changed
+            then.
+        StorageError: the data folder cannot be written, or the store not be read or written.
+    """
+    files, stored = _contents(folder)
+    kind = SQLITE if settings.is_sqlite else DUMP
+    if kind not in files:
+        raise RequestError(f"{folder}: is of a service with {'PostgreSQL' if settings.is_sqlite else 'SQLite'}: "
+                           f"{'give' if settings.is_sqlite else 'leave out'} database_url")
+    if (settings.data / PROJECTS).exists() or (settings.is_sqlite and settings.sqlite_file.exists()):
+        raise RequestError(f"data {settings.data}: there is a service in this folder already: give a new one")
+    if not settings.is_sqlite:
+        with _opened(settings) as database:
+            has_tables = bool(sa.inspect(database.engine).get_table_names())
+        if has_tables:
+            raise RequestError("database_url: the database has tables already: give an empty one")
+    for name, entry in files.items():
+        if not (folder / name).is_file() or _entry(folder / name) != entry:
+            raise RequestError(f"{folder / name}: is missing or differs from its checksum: the backup is damaged")
+    differing = _restore_objects(settings, folder, files, stored, accept_differences=accept_differences)
+    with storage("make", settings.data):
+        settings.data.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        if name not in (SQLITE, DUMP) and not name.startswith(f"{OBJECTS}/"):
+            _copy(folder / name, settings.data / name)
+    if settings.is_sqlite:
+        _copy(folder / SQLITE, settings.sqlite_file)
+    else:
+        _postgres(settings, "pg_restore", "--no-owner", "--no-privileges", "--exit-on-error", "--single-transaction", "--dbname",
+                  str(urlsplit(str(settings.database_url)).path.lstrip("/")), str(folder / DUMP))
+    return Backup(folder, len(files), sum(entry["size"] for entry in files.values()), 0 if stored is None else len(stored["objects"]),
+                  stored is not None and stored["copied"], differing)
+
+
+@contextmanager
+def _opened(settings: Settings) -> Iterator[Database]:
+    with usable(settings), closing(connect(settings.sqlalchemy_url, connections=1)) as database:
+        yield database
+
+
+def _active_jobs(settings: Settings) -> set[str]:
+    """Return the jobs that have not ended, whose objects may still change."""
+    with _opened(settings) as database:
+        return {row["id"] for row in database.rows(sa.select(tables.jobs.c.id).where(tables.jobs.c.state.in_(ACTIVE)))}
+
+
+def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str, Any]], stored: dict[str, Any] | None, *,
+                     accept_differences: bool) -> int:
+    """Look for the objects of a backup in the store, and send those of which there are copies; return how many were missing or differed."""
+    if stored is None:
+        if settings.storage_url is not None and any(name.startswith(f"{PROJECTS}/") for name in files):
+            raise RequestError(f"{folder}: is of a service whose captures and results lie in its data folder: leave out storage_url")
+        return 0
+    if settings.storage_url is None:
+        raise RequestError(f"{folder}: is of a service with storage_url {stored['url']}: give this one, or another"
+                           f"{'' if stored['copied'] else ' with the same objects'}")
+    bucket, wanted = Bucket(settings.storage_url), stored["objects"]
+    missing, changed = saved_objects.compare(bucket, {path: (entry["size"], entry["version"]) for path, entry in wanted.items()})
+    if stored["copied"]:
+        saved_objects.send(bucket, folder / OBJECTS, [*missing, *changed])
+    else:
+        changed = [path for path in changed if not wanted[path].get("changes")]  # its job went on after the backup
+        if (missing or changed) and not accept_differences:
+            first, fault = (missing[0], "is not in the store") if missing else (changed[0], "is not what it was")
+            raise RequestError(f"{bucket.url}/{first}: {fault} ({len(missing)} objects of the backup are missing and {len(changed)} have "
+                               "changed): bring them back from the versions of the bucket, or give --accept-differences")
+    return len(missing) + len(changed)
+
+
+def _copy_sqlite(source: Path, target: Path) -> None:
+    """Copy a database by SQLite's own means, which see one moment of it."""
+    reading, writing = sqlite3.connect(f"file:{source}?mode=ro", uri=True), sqlite3.connect(target)
+    try:
+        reading.backup(writing)
+    except sqlite3.Error as error:
+        raise RequestError(f"data {source.parent}: the database in it cannot be copied ({error})") from None
+    finally:
+        reading.close()
+        writing.close()
+    target.chmod(0o600)
+
+
+def _postgres(settings: Settings, program: str, *arguments: str) -> None:
+    """Run a program of PostgreSQL on the database; the password is not an argument, which other users of the machine could read."""
+    url = urlsplit(str(settings.database_url))
+    variables = {"PGHOST": url.hostname, "PGPORT": url.port, "PGUSER": url.username, "PGPASSWORD": url.password,
+                 "PGDATABASE": unquote(url.path.lstrip("/"))}
+    environment = os.environ | {name: unquote(str(value)) for name, value in variables.items() if value}
+    if shutil.which(program) is None:
+        raise RequestError(f"{program} is not on the path: install the client programs of PostgreSQL")
+    done = subprocess.run([program, *arguments], env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RequestError(f"{program}: {' '.join(done.stderr.split())[:500]}")
+
+
+def _contents(folder: Path) -> _Contents:
+    path = folder / CONTENTS
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        files, stored = found["files"], found.get("storage")
+        assert found["schema"] == SCHEMA
+        if stored is not None:
+            assert isinstance(stored["url"], str)
+            copied = {f"{OBJECTS}/{path}" for path, entry in stored["objects"].items() if isinstance(entry["version"], str)}
+            assert not stored["copied"] or copied <= files.keys()
+    except OSError:
+        raise RequestError(f"{folder}: is no whole backup: there is no {CONTENTS} in it") from None
+    except (ValueError, KeyError, TypeError, AssertionError, RecursionError):
+        raise RequestError(f"{path}: is not of the schema {SCHEMA}") from None
+    for name in files:
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            raise RequestError(f"{path}: {name} leads out of the backup")
+    return _Contents(dict(files), stored)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield the complete files below a folder; names with a leading dot are files that are being written."""
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (Path(place) / name for name in sorted(names) if not name.startswith("."))
+
+
+def _link(source: Path, target: Path) -> bool:
+    """Give a complete file a second name, or copy it to another file system; return False if it was deleted meanwhile."""
+    with storage("write", target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return _copy(source, target)
+    return True
+
+
+def _copy(source: Path, target: Path) -> bool:
+    with storage("write", target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with open(source, "rb") as reading, open(target, "xb") as writing:
+                shutil.copyfileobj(reading, writing, BLOCK)
+                writing.flush()
+                os.fsync(writing.fileno())
+        except FileNotFoundError:
+            return False
+        target.chmod(0o600)
+    return True
+
+
+def _entry(path: Path) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        return {"size": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}

@@ -1,0 +1,1 @@
+"""Heights of solved normals: parts, distances, and the light that a surface hides or throws on itself."""

@@ -1,0 +1,107 @@
+"""The direct light of every reading: what the object itself does to the light of a lamp is taken out.
+
+From the first normals follows a height, from the height which readings lie in cast shadow, and from the height and the images the light
+that the object throws on itself.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from kernels.photometric.lambertian.near import NearField
+from kernels.photometric.lambertian.readings import Lights, channel_weights
+from kernels.photometric.model.samples import Samples
+from kernels.photometric.shadows.bounce import subtract_bounce
+from kernels.photometric.shadows.shadowing import exclude_shadows
+from service.solve.height.height import integrate, projection_of
+from service.solve.height.interreflection import ArrivingLight, arriving_light
+from service.solve.height.parts import Material, numbered, place_parts
+from service.solve.sharing.solution import SolveInput
+from stage.colour.colour import GREY_WEIGHTS
+
+LARGEST_ALBEDO = 0.98
+"""The part of light that a surface can send on; a fitted albedo may be larger where the scale of the lights is not absolute."""
+
+
+class DirectLight(NamedTuple):
+    """Shadows and interreflection of an object, to be taken out of readings."""
+
+    given: SolveInput
+    lights: Lights
+    field: NearField | None
+    """Where the lights are, where some light is near."""
+    solved: wp.array  # [rows, cols] uint8 on the device: the number of the part of each solved pixel, 0 elsewhere
+    height: wp.array  # [rows, cols] float32, on the device
+    shadows: bool
+    """Whether cast shadows of the height are taken out."""
+    arriving: ArrivingLight | None
+    """None: no interreflection is taken out."""
+    albedo: np.ndarray  # [3, pixels] of the light that other surfaces send, at the normals from which all this follows
+    albedo_scale: float = 1.0
+    """Albedo of the surface over this albedo, which is relative where the scale of the lights is."""
+
+    @property
+    def found(self) -> tuple[object, ...]:
+        """Return what was found about the whole object, by which workers compare what they have."""
+        return self.solved, self.height, self.shadows, self.arriving, self.albedo, self.albedo_scale
+
+    def on(self, device: str) -> "DirectLight":
+        """Return the same for readings on another device."""
+        if device == self.given.device:
+            return self
+        solved, height = (wp.array(plane.numpy(), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
+        return self._replace(solved=solved, height=height)
+
+    def keep(self, pixels: np.ndarray, samples: Samples) -> None:
+        """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
+
+        Args:
+            pixels: [n] row-major positions in the image.
+            samples: their readings; changed in place.
+        """
+        if self.shadows:
+            exclude_shadows(samples, pixels, self.height, self.solved, projection_of(self.given.camera),
+                            None if self.field is None else self.field.places)
+        if self.arriving is not None:
+            corners, shares = self.arriving.at(*np.divmod(pixels, self.given.camera.width))
+            albedo = np.minimum(self.albedo_scale * self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
+            subtract_bounce(samples, self.arriving.light, corners, shares, albedo, channel_weights(self.lights, GREY_WEIGHTS),
+                            None if self.field is None else self.field.at(pixels))
+
+    def under(self, lights: Lights, factor: np.ndarray) -> "DirectLight":
+        """Return the same under lights of other strength.
+
+        Args:
+            lights: the same lights with another irradiance.
+            factor: [lights] their irradiance over that so far.
+        """
+        arriving = self.arriving
+        if arriving is not None:
+            arriving = arriving._replace(light=(arriving.light / factor).astype(np.float32))
+        return self._replace(lights=lights, arriving=arriving)
+
+
+def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, material: Material,
+                 bouncing: np.ndarray, solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:
+    """Find what the object does to its own light, or return None when no pixel is solved.
+
+    Args:
+        normal: [3, pixels] float32, found so far.
+        material: of the same.
+        bouncing: [3, pixels] albedo of the light that other surfaces send.
+        shadows: whether cast shadows are taken out.
+        interreflection: whether interreflection is taken out.
+        parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.
+    """
+    surface = integrate(given, normal, solved, stage="surface")
+    if surface is None:
+        return None
+    height = surface.height
+    if parts and field is None and surface.part is not None:
+        placed = place_parts(given, lights, normal, material, height.numpy(), surface.part)
+        height = wp.array(placed.height, dtype=float, device=given.device)
+    arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
+    mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
+    on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
+    return DirectLight(given, lights, field, on_device, height, shadows, arriving, bouncing)

@@ -1,0 +1,1 @@
+"""Lights that a solve finds or refines, and what their images contradict."""

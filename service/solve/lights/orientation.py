@@ -1,0 +1,262 @@
+"""Whether the axes of the lights are those of the camera, from the surface that was solved with them.
+
+Mirrored or turned lights explain the images as well as the right ones. What tells them apart: a visible surface faces the camera, its
+slopes are those of one height (service.light_estimation.axes), and the outline and the cast shadows of what is not hollow
+(service.light_estimation.object_outline).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.photometric.model.samples import evenly
+from kernels.status import ESTIMATED
+from kernels.surface.integrate import IntegrationOptions, integrate_normals
+from service.light_estimation.axes import Axes, sites, wrong_axes
+from service.light_estimation.explanations import grey_readings
+from service.light_estimation.lambertian import Fit, fit_lambertian, median_of
+from service.light_estimation.object_outline import EDGE, Outline, cast_shadows, outline
+from service.solve.sharing.solution import Solution, SolveInput
+from stage.capture.camera import Camera
+from stage.capture.point_lights import DistantLights
+
+MAP_SIZE, FIT_SIZE = 120, 64
+"""Pixels across the small map on which the outline and shadows are compared, and of the one whose readings are fitted anew."""
+FACING, FACING_INSTEAD = 0.8, 0.95
+"""Normals of which fewer than the first part face the camera are wrong if at least the second part does with other axes. Bare metal, whose
+Lambertian normals are poor, has as little as 0.64, but then less than 0.8 in any other direction."""
+LEAST_LIGHTS = 4
+"""Fewer lights may lie almost in a plane, and then most normals of noise face away."""
+CLEAR, CLEAR_PART = 0.4, 0.8
+"""An outline is clear where the mean outward component is above the first number, in the same direction on the second part of it."""
+SHADOW_PIXELS, SHADOW_LIGHTS = 2000, 64
+"""Pixels and lights of which cast shadows are compared."""
+LEAST_COSINE, LEVEL_COSINE = 0.1, 0.25
+"""Least n·l of a reading that is compared, and of those whose median gives the level of the pixel."""
+LIT = 0.7
+"""A reading above this part of level · n·l is lit: light from other surfaces in a cast shadow of a white bowl mostly stays below it."""
+MANY_LIGHTS = 6
+"""Fewer lights seldom contradict a height: their normals leave no misfit, and shadows turn them."""
+LEAST_SHADOWS, LEAST_SHADOWS_ALONE = 30, 400
+"""Least count of readings that the height puts in shadow, for them to speak against an outline, and alone."""
+LIT_INVERTED, LIT_WRONG, LIT_SHADOW = 0.85, 0.6, 0.5
+"""An inverted surface is lit in all the shadows that it should cast (0.89 to 1), but where the right one casts some: then from the second
+part on, and up to the third part of the readings that the inverse puts in shadow is lit. In right hollows at most 0.77 is lit, in white
+ones under three to five lights 0.84, and their inverses cast no shadow, or one that is lit."""
+LEAST_SHADOWS_RIGHT, LEAST_SHADOWS_HOLLOW = 20, 8
+"""Least count of readings that the inverse puts in shadow, and of those in shadow that show a hollow if less than LIT_WRONG is lit."""
+INVERSE = np.diag([-1.0, -1.0, 1.0])
+"""The turn by 180 degrees about the view axis."""
+
+
+class LightAxes(NamedTuple):
+    """A fault of the axes of the lights."""
+
+    sentence: str
+    matrices: tuple[np.ndarray, ...] = ()
+    """[3, 3], what corrects directions and normals: one, or two between which nothing decides; none where nothing is certain."""
+    degrees: float | None = None
+    """How far the normals are off, where the solved ones are not turned with the lights."""
+
+
+class _Map(NamedTuple):
+    """A small map of the surface."""
+
+    normal: np.ndarray  # [3, rows, cols] float32, z towards the viewer of each pixel; 0 outside
+    mask: np.ndarray  # [rows, cols] bool
+    pixels: np.ndarray  # [rows, cols] row-major positions in the image
+
+
+def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | None, fit: Fit | None) -> LightAxes | None:
+    """Return which axes of the lights are exchanged, mirrored or turned, or None.
+
+    Args:
+        lights: the distant lights; None: other lights, whose readings are not fitted again.
+        fit: the fit of some pixels under these lights, or None.
+    """
+    if lights is not None and fit is not None and len(lights.direction) >= LEAST_LIGHTS and fit.facing < FACING:
+        return _exchanged(given, lights, fit)
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    positions = sites(estimated)
+    flat = solution.normal[:, positions.reshape(-1)]
+    normals = np.moveaxis(_toward_viewer(given.camera, flat, positions.reshape(-1)).reshape(3, *positions.shape), 1, 0)
+    found = wrong_axes(normals, strict=given.stack.light_count < MANY_LIGHTS)
+    if found is None:
+        return None
+    return _sentence(_choices(found, _map_of(given, solution.normal, estimated), np.eye(3)), found)
+
+
+def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights | None) -> LightAxes | None:
+    """Say whether the surface is inverted, as by lights that are turned by 180 degrees about the view axis.
+
+    Args:
+        lights: the distant lights; None: other lights, whose shadows are not compared.
+    """
+    estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
+    if not estimated.any():
+        return None
+    small = _map_of(given, solution.normal, estimated)
+    edge = outline(small.normal, small.mask)
+    if edge.outward >= CLEAR:
+        return None
+    inward, decided = _is_clear(edge), None
+    if lights is not None:
+        decided = _is_inverted(_Shadows(given, solution, small, lights), len(lights.direction) >= MANY_LIGHTS, alone=not inward)
+    if decided:
+        return LightAxes("the surface looks inverted: with x and y negated (turned by 180° about the view axis) it casts the shadows that "
+                         "the images show; check the axes (x right, y up, z towards the camera)", (INVERSE,))
+    if decided is not None or not inward:
+        return None
+    return LightAxes("along the outline the normals point inwards: the object is hollow there, or x and y of the lights are both negated "
+                     "(turned by 180° about the view axis); nothing else in the images decides")
+
+
+def _is_inverted(shadows: "_Shadows", many: bool, *, alone: bool) -> bool | None:
+    """Return whether cast shadows say that a surface is inverted; None where they do not decide.
+
+    Args:
+        shadows: of the surface and its inverse.
+        many: whether there are enough lights for the first to contradict the surface.
+        alone: whether there is no outline that speaks for the inversion.
+    """
+    count, lit = shadows.of_surface()
+    if count < (LEAST_SHADOWS_ALONE if alone else LEAST_SHADOWS):
+        return False if count >= LEAST_SHADOWS_HOLLOW and lit < LIT_WRONG else None
+    count_inverse, lit_inverse = shadows.of_inverse()
+    explained = count_inverse >= LEAST_SHADOWS_RIGHT and lit_inverse <= LIT_SHADOW
+    if alone:
+        return many and explained and lit >= LIT_WRONG
+    if many or explained:
+        return lit >= (LIT_WRONG if explained else LIT_INVERTED)
+    return False if lit < LIT_INVERTED else None
+
+
+def _exchanged(given: SolveInput, lights: DistantLights, fit: Fit) -> LightAxes | None:
+    """Return the signed axis that is the view axis, when most normals face away, and what then is wrong in the image plane."""
+    shares = {(axis, sign): float((sign * fit.vector[axis] > 0).mean()) for axis in (2, 1, 0) for sign in (1, -1)}
+    (axis, sign), share = max(shares.items(), key=lambda item: item[1])
+    if share < FACING_INSTEAD:
+        return None
+    exchange = np.eye(3)
+    exchange[[2, axis]] = exchange[[axis, 2]]
+    exchange[2] *= sign
+    pixels, inside = _grid(given.mask, FIT_SIZE)
+    radiance, usable = given.stack.pick_radiance(pixels[inside])
+    fitted = fit_lambertian(grey_readings(radiance, lights.irradiance), usable, lights.direction)
+    normal = np.zeros((3, *pixels.shape), dtype=np.float32)
+    normal[:, inside] = _toward_viewer(given.camera, exchange @ fitted.normal, pixels[inside])
+    small = _Map(normal, inside, pixels)
+    positions = sites(small.mask)
+    found = wrong_axes(np.moveaxis(small.normal.reshape(3, -1)[:, positions], 1, 0)) or Axes(np.eye(2), 1 - fit.facing, 1 - share)
+    matrices = _choices(found, small, exchange)
+    if len(matrices) > 1:  # nothing decides: the smaller change is the likelier mistake
+        matrices = (max(matrices, key=lambda matrix: float(np.trace(matrix))),)
+    behind = (f"all {len(lights.direction)} lights are behind the object (z ≤ 0), and yet light what the camera sees"
+              if (lights.direction[:, 2] <= 0).all() else f"{100 * (1 - fit.facing):.0f} % of the normals face away from the camera")
+    turned = np.degrees(np.arccos(np.clip(((matrices[0] @ fit.normal) * fit.normal).sum(axis=0), -1, 1)))
+    return LightAxes(f"{behind}: with {_describe(matrices[0])}, {100 * share:.0f} % face it; check the axes (x right, y up, z towards the "
+                     "camera)", matrices, float(np.median(turned)))
+
+
+def _choices(found: Axes, small: _Map, before: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the correction whose outline points outwards, of the one that was found and its inverse; both where nothing decides."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = found.matrix
+    edge = outline(np.einsum("ij,jrc->irc", matrix, small.normal), small.mask)
+    both = (matrix @ before, INVERSE @ matrix @ before)
+    return (both[0 if edge.outward > 0 else 1],) if _is_clear(edge) else both
+
+
+def _is_clear(edge: Outline) -> bool:
+    part = edge.inward_part if edge.outward < 0 else 1 - edge.inward_part
+    return abs(edge.outward) >= CLEAR and part >= CLEAR_PART
+
+
+class _Shadows:
+    """The cast shadows of a surface and of its inverse, compared with readings."""
+
+    def __init__(self, given: SolveInput, solution: Solution, small: _Map, lights: DistantLights) -> None:
+        """Integrate a small map, and read some of its pixels under some of the lights."""
+        rows, cols = small.mask.shape
+        across = (np.broadcast_to(np.arange(cols), (rows, cols)), np.broadcast_to(-np.arange(rows)[:, None], (rows, cols)))
+        self._height = integrate_normals(
+            small.normal, small.mask, *(plane.astype(np.float32) for plane in across), perspective=False, mean_z=0.0,
+            options=IntegrationOptions(discontinuities=True), device=given.device).height.numpy()
+        surface = np.flatnonzero(small.mask)
+        self._mask, self._chosen = small.mask, surface[evenly(len(surface), SHADOW_PIXELS)]
+        some = evenly(len(lights.direction), SHADOW_LIGHTS)
+        pixels = small.pixels.reshape(-1)[self._chosen]
+        radiance, usable = given.stack.pick_radiance(pixels)
+        readings = grey_readings(radiance[some], lights.irradiance[some])
+        self._direction = lights.direction[some]
+        cosine = self._direction @ solution.normal[:, pixels]
+        level = median_of(readings / np.maximum(cosine, LEVEL_COSINE), (cosine > LEVEL_COSINE) & usable[some])
+        self._compared = (cosine > LEAST_COSINE) & usable[some] & (level > 0)
+        self._lit = readings > LIT * level * cosine
+
+    def of_surface(self) -> tuple[int, float]:
+        """Return how many readings the surface puts in cast shadow, and which part of them is lit."""
+        return self._part_lit(self._height, self._direction)
+
+    def of_inverse(self) -> tuple[int, float]:
+        """Return the same of the inverse."""
+        return self._part_lit(-self._height, self._direction @ INVERSE)
+
+    def _part_lit(self, height: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
+        shadow = cast_shadows(height, self._mask, self._chosen, direction) & self._compared
+        return int(shadow.sum()), float(self._lit[shadow].mean()) if shadow.any() else 0.0
+
+
+def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return row-major positions [rows, cols] of every n-th pixel of the box around a mask, `size` across at most, and which are inside."""
+    rows, cols = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    step = max(1, -(-max(int(np.ptp(rows)), int(np.ptp(cols))) // size))
+    margin = step * (3 * size // EDGE + 2)  # of background, so that only the border of the image hides the outline
+    row, col = (np.arange(max(lines[0] - margin, 0), min(lines[-1] + margin + 1, count), step)
+                for lines, count in zip((rows, cols), mask.shape, strict=True))
+    return row[:, None] * mask.shape[1] + col, mask[np.ix_(row, col)]
+
+
+def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> _Map:
+    """Return a small map of solved normals."""
+    pixels, inside = _grid(mask, MAP_SIZE)
+    flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
+    return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)
+
+
+def _toward_viewer(camera: Camera, normal: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return normals [3, n] with the component towards each pixel's viewer as z: their slopes are those of the logarithm of depth."""
+    if camera.projection == "orthographic":
+        return normal
+    row, col = np.divmod(pixels, camera.width)
+    right, up = camera.plane_at(col + 0.5, row + 0.5)
+    turned = np.stack([normal[0], normal[1], normal[2] - normal[0] * right - normal[1] * up])
+    return np.asarray(turned / np.maximum(np.linalg.norm(turned, axis=0), 1e-12))
+
+
+def _sentence(matrices: tuple[np.ndarray, ...], found: Axes) -> LightAxes:
+    ways = ", or ".join(_describe(matrix) for matrix in matrices)
+    kind = "mirrored" if np.linalg.det(matrices[0]) < 0 else "turned"
+    return LightAxes(f"the axes look {kind}: with {ways}, the slopes of the surface are those of one height to {100 * found.left:.0f} %, "
+                     f"as declared to {100 * found.misfit:.0f} % (25 % is no order at all); check the axes (x right, y up, z towards the "
+                     "camera), and that no image is flipped", matrices)
+
+
+def _describe(matrix: np.ndarray) -> str:
+    """Return a correction of directions in words."""
+    whole = np.round(matrix)
+    if np.abs(matrix - whole).max() > 1e-6:
+        turn = np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))
+        mirrored = "y negated and then all " if np.linalg.det(matrix[:2, :2]) < 0 else "all "
+        return f"{mirrored}turned by {turn:.0f}° about the view axis (from x towards y)"
+    names = ["xyz"[int(np.argmax(np.abs(row)))] for row in whole]
+    signs = [row.sum() < 0 for row in whole]
+    if names == list("xyz"):
+        negated = [name for name, minus in zip(names, signs, strict=True) if minus]
+        if len(negated) == 3:
+            return "every direction negated (they seem to point from the light to the surface)"
+        return f"{' and '.join(negated)} negated"
+    moved = [name for name, own in zip(names, "xyz", strict=True) if name != own]
+    if len(moved) == 2 and not any(signs):
+        return f"{' and '.join(sorted(moved))} swapped"
+    return f"(x, y, z) read as ({', '.join(('-' if minus else '') + name for name, minus in zip(names, signs, strict=True))})"

@@ -1,0 +1,1 @@
+"""The methods of `relit solve`, pass by pass."""

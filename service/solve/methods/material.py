@@ -1,0 +1,302 @@
+"""Normals and reflectance by the general solver, `svbrdf`, which fits a material.
+
+It walks over the image several times: a start, the diffuse lobe that the object shares, a first search, the direct light that follows
+from the height of its normals, the materials that pixels share, and the final solve.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kernels.photometric.lambertian.lambert import solve_lambert
+from kernels.photometric.lambertian.near import NearField
+from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
+from kernels.photometric.lambertian.robust import solve_robust
+from kernels.photometric.material.material import MATT, fit_given, fit_material, fit_tinted
+from kernels.photometric.material.metal_search import Metals, metals_of
+from kernels.photometric.material.mixtures import HELD, NO_PAIRS, choose_pairs
+from kernels.photometric.material.shared_materials import choose_materials
+from kernels.photometric.model.misfit import LARGEST_ERROR
+from kernels.photometric.model.samples import Samples, evenly
+from kernels.photometric.search.diffuse_shape import choose_diffuse
+from kernels.photometric.search.hypotheses import Diffuse, Prior
+from kernels.photometric.search.light_factors import find_light_factors
+from kernels.photometric.search.normal_search import find_normals, neighbours
+from kernels.photometric.search.survey import QUICK
+from kernels.photometric.shadows.bounce import bounce_albedo
+from kernels.photometric.svbrdf import solve_svbrdf
+from kernels.status import ESTIMATED, Status
+from service.solve.height.direct_light import DirectLight, direct_light
+from service.solve.height.parts import Material
+from service.solve.methods.settling import settle
+from service.solve.methods.support import FEW_LIGHTS, supports_lobes
+from service.solve.sharing.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
+from service.solve.sharing.sharing import Results
+from service.solve.sharing.solution import Solution, SolveInput
+from stage.colour.colour import GREY_WEIGHTS
+
+SPREAD_PIXELS = 384
+"""Pixels, spread over the object, from which the shape of the diffuse lobe is chosen."""
+MATERIAL_PIXELS = 640
+"""Pixels, spread over the object, from which the shared materials are chosen: an object has more materials than diffuse lobes."""
+INTENSITY_SQUARES = 8
+"""Number of squares along the longer side of the image; intensities found in one half of them must explain the other half."""
+PRIOR_STRENGTH = 10.0
+"""Strength of the prior towards the normals of `lambert` where the general solver is not supported: a standard deviation of some degrees
+for a reading that misfits by the noise floor of the search."""
+
+
+@dataclass(frozen=True)
+class MaterialOptions:
+    """Steps of the svbrdf solver that can be left out, to measure what each contributes."""
+
+    shadows: bool = True
+    """Leave out readings in cast shadow."""
+    interreflection: bool = True
+    """Subtract the light that the object throws on itself."""
+    settling: bool = True
+    """Find that light again from the surface without it."""
+    scale: bool = True
+    """Choose the scale of albedo from the images where that of the lights is unknown."""
+    intensities: bool = True
+    """Refine the intensities of the lights where the object shows that they are wrong."""
+    sharing: bool = True
+    """Let pixels share materials."""
+    mixtures: bool = True
+    """Let a pixel have two of the shared materials."""
+    parts: bool = True
+    """Move parts of the object in depth to where their shadows agree with the images."""
+    metals: bool = True
+    """Search the normals of metals again under the lobes that they share."""
+
+
+WHOLE_SOLVER = MaterialOptions()
+
+
+def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
+                   options: MaterialOptions = WHOLE_SOLVER) -> Solution:
+    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
+
+    Args:
+        options: the steps that are left out.
+    """
+    walk = _Walk(given, lights, field, options)
+    walk.start()
+    walk.choose_shape()
+    walk.search()
+    light = walk.refine_intensities(walk.direct_light())
+    walk.fit(light, walk.choose_materials(light))
+    return walk.result
+
+
+def refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
+    """Solve again from a solution: shadows and interreflection follow from its surface, and no first search is needed.
+
+    Args:
+        field: where the lights are, and the surface point of each pixel.
+        before: of `solve_material`, or of this function.
+    """
+    walk = _Walk(given, lights, field, WHOLE_SOLVER)
+    walk.start()
+    walk.resume(before)
+    light = walk.direct_light()
+    walk.choose_shape(light)
+    walk.fit(light, walk.choose_materials(light))
+    return walk.result
+
+
+class _Walk:
+    """The state of a solve between its passes over the image."""
+
+    def __init__(self, given: SolveInput, lights: Lights, field: NearField | None, options: MaterialOptions) -> None:
+        self._given, self._lights, self._field, self._options = given, lights, field, options
+        self._view = view_directions(given.camera)
+        self._interreflection = options.interreflection
+        count = given.stack.pixel_count
+        self.result = Solution.empty(count)
+        self._specular = self.result.specular = np.zeros((3, count), np.float16)
+        self._roughness = self.result.roughness = np.zeros(count, np.float16)
+        self._lambertian = np.zeros_like(self.result.normal)
+        self._bouncing = np.zeros((3, count), np.float32)  # albedo of the light that other surfaces send
+        self._shape, self._lobe, self._supported, self._pairs = Diffuse(), Diffuse(), True, NO_PAIRS
+        self._metals: Metals | None = None
+
+    def start(self) -> None:
+        """Find the normals of `robust`, from which the search begins, and under few lights those of `lambert`."""
+        self._given.timings.stage("start", self._given.stack.shape[2])
+
+        def begin(read: ReadBand) -> None:
+            span, inside, band, readings, near = read
+            self.result.place(span, inside, solve_robust(band, readings, self._lights.direction, near))
+            if self._few:
+                grey = grey_readings(band, grey_factors(self._lights, GREY_WEIGHTS))
+                fit = solve_lambert(band, grey, self._lights.direction, near)
+                self._lambertian[:, span] = np.where(fit.status.numpy()[: len(inside)] == Status.OK, fit.normal.numpy()[:, : len(inside)],
+                                                     self.result.normal[:, span])
+
+        each_band(self._given, self._lights, self._field, begin,
+                  Results((self.result.normal, self.result.residual, self.result.status, self._lambertian)))
+        self._solvable = np.flatnonzero(self.result.status == Status.OK)
+        self._spread = self._solvable[evenly(len(self._solvable), SPREAD_PIXELS)] if len(self._solvable) else self._solvable
+
+    def resume(self, before: Solution) -> None:
+        """Take normals, albedo and roughness of the pixels that are solved from an earlier solution."""
+        solved = np.isin(before.status, ESTIMATED) & (self.result.status == Status.OK)
+        assert before.roughness is not None
+        self.result.normal[:, solved], self.result.albedo[:, solved] = before.normal[:, solved], before.albedo[:, solved]
+        self._roughness[solved] = before.roughness[solved]
+        self._bouncing[:, solved] = before.albedo[:, solved]
+
+    def choose_shape(self, light: DirectLight | None = None) -> None:
+        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all.
+
+        Args:
+            light: what the object does to its own light, as far as it is known.
+        """
+        self._given.timings.stage("shape", 1)
+        if not len(self._spread):
+            return
+        samples, normal = self._pick(self._spread), self.result.normal[:, self._spread].T
+        if light is not None:
+            light.keep(self._spread, samples)
+        if self._few:
+            self._supported = supports_lobes(self.result, samples, normal)
+        if self._supported:
+            shapes = choose_diffuse(samples, normal)
+            self._shape, self._lobe = shapes.mean, shapes.best
+            self.result.facts |= {"diffuse_roughness": None if self._lobe.rough < 0 else self._lobe.rough,
+                                  "diffuse_slope": self._lobe.slope, "shapes_tried": len(shapes.tried)}
+
+    def search(self) -> None:
+        """Search the normals a first time, and fit the material from which shadows and interreflection are told."""
+        result = self.result
+
+        def search(batch: Batch) -> None:
+            pixels, samples = batch
+            start = result.normal[:, pixels] if self._supported else self._lambertian[:, pixels]
+            found = find_normals(samples, start.T, shape=self._shape, prior=self._prior(pixels), beside=self._beside(pixels), sweep=QUICK)
+            normal = found.best.normal
+            result.normal[:, pixels] = normal.T
+            if self._interreflection:
+                first = (fit_tinted(samples, normal, shape=self._lobe) if self._supported and not self._matt else
+                         fit_given(samples, normal, MATT, shape=self._lobe))
+                result.albedo[:, pixels], self._roughness[pixels] = first.diffuse_albedo.T, first.roughness
+                self._specular[:, pixels] = first.specular.T
+                self._bouncing[:, pixels] = bounce_albedo(samples, normal, first, shape=self._lobe).T
+
+        self._batches("search", search, Results((result.normal, result.albedo, self._specular, self._roughness, self._bouncing),
+                                                (self._shape, self._lobe, self._supported)))
+
+    def direct_light(self) -> DirectLight | None:
+        """Find what the object does to its own light, from the first search; None when no pixel is solved."""
+        solved = (self.result.status == Status.OK).reshape(self._given.mask.shape)
+        material = Material(self.result.albedo.copy(), self._specular.copy(), self._roughness.copy())
+        light = direct_light(self._given, self._lights, self._field, self.result.normal, material, self._bouncing, solved,
+                             shadows=self._options.shadows, interreflection=self._interreflection,
+                             parts=self._options.parts and self._interreflection)
+        if light is None or light.arriving is None or self._field is not None or not (self._supported and self._options.settling):
+            return light  # near lights settle the light in rounds, with the surface
+        relative = self._given.relative and self._options.scale
+        settled = settle(light, self.result.normal, self._shape, self._pick, relative=relative)
+        if relative:
+            self.result.facts["albedo_scale"] = settled.report()
+        return settled.light
+
+    def refine_intensities(self, light: DirectLight | None) -> DirectLight | None:
+        """Replace the intensities of the lights where the object shows that others explain it better; returns the direct light of them."""
+        told = (self._supported and not self._few and self._field is None and self._options.intensities
+                and self._given.refine_intensities)
+        if light is None or not told:
+            return light
+        samples, count = self._pick(self._spread), self._given.stack.light_count
+        light.keep(self._spread, samples)
+        square = max(self._given.mask.shape) / INTENSITY_SQUARES
+        row, col = (np.floor(part / square).astype(int) for part in np.divmod(self._spread, self._given.camera.width))
+        start, directions = self.result.normal[:, self._spread].T, self._lights.direction[:count]
+        found = find_light_factors(samples, start, directions, row, col, shape=self._shape)
+        self.result.facts["light_factors"] = {"believed": found.believed, "left_out_gain": round(found.gain, 4)}
+        if not found.believed:
+            return light
+        self.result.facts["light_factors"] |= {"spread": round(float(np.std(np.log(found.factor))), 4),
+                                               "factors": found.factor.round(4).tolist()}
+        irradiance = self._lights.irradiance.copy()
+        irradiance[:count] *= found.factor[:, None]
+        self._lights = self._lights._replace(irradiance=irradiance)
+        return light.under(self._lights, found.factor)
+
+    def choose_materials(self, light: DirectLight | None) -> np.ndarray | None:
+        """Return [materials, 4] F0 and roughness that pixels share, or None where they share none."""
+        if light is None or not (self._options.sharing and self._supported):
+            return None
+        spread = self._solvable[evenly(len(self._solvable), MATERIAL_PIXELS)]
+        samples = self._pick(spread)
+        light.keep(spread, samples)
+        normal = self.result.normal[:, spread].T
+        materials = choose_materials(samples, normal, shape=self._lobe)
+        self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
+                                                 for material in materials.round(4).astype(float)]
+        single = fit_material(samples, normal, shape=self._lobe, shared=materials)
+        if self._options.metals:
+            self._metals = metals_of(materials, single)
+        if self._options.mixtures:
+            self._pairs = choose_pairs(samples, normal, materials, single, shape=self._lobe)
+        return materials
+
+    def fit(self, light: DirectLight | None, materials: np.ndarray | None) -> None:
+        """Fit normal and material of every pixel to its direct light."""
+        result = self.result
+        count = self._given.stack.pixel_count
+        sigma = np.full(count, LARGEST_ERROR, np.float16)
+        abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
+        light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
+
+        def fit(batch: Batch) -> None:
+            pixels, samples = batch
+            light_on[samples.device].keep(pixels, samples)
+            roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
+            found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
+                                 pairs=self._pairs,
+                                 metals=self._metals, roughness=roughness, prior=self._prior(pixels),
+                                 beside=self._beside(pixels))
+            result.normal[:, pixels] = found.normal.T
+            material = fit_given(samples, found.normal, MATT, shape=self._lobe) if self._matt else found
+            result.albedo[:, pixels] = material.diffuse_albedo.T
+            self._specular[:, pixels] = material.specular.T
+            self._roughness[pixels] = material.roughness
+            abundance[pixels], pair[pixels] = found.mixture
+            sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
+            result.residual[pixels] = found.residual
+
+        self._batches("normals", fit, Results(
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.confidence, result.residual),
+            (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
+        result.sigma, result.judged_by_surface = sigma, True
+        if (mixed := abundance > 0).any():
+            result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
+            result.facts["mixed_pixels"] = int(mixed.sum())
+
+    @property
+    def _few(self) -> bool:
+        return self._given.stack.light_count < FEW_LIGHTS
+
+    @property
+    def _matt(self) -> bool:
+        """Whether the images hold diffuse light alone, so that a specular lobe explains nothing but noise."""
+        return self._given.pairs is not None
+
+    def _beside(self, pixels: np.ndarray) -> np.ndarray:
+        return neighbours(pixels, self._given.camera.width)
+
+    def _prior(self, pixels: np.ndarray) -> Prior | None:
+        """Return what is expected of the normals of some pixels."""
+        return None if self._supported else Prior(self._lambertian[:, pixels].T, PRIOR_STRENGTH)
+
+    def _pick(self, pixels: np.ndarray) -> Samples:
+        """Return the readings of a few pixels, wherever they lie in the image."""
+        return pick_pixels(self._given, self._lights, self._view, pixels, self._field)
+
+    def _batches(self, stage: str, work: Callable[[Batch], None], results: Results) -> None:
+        """Do the solvable pixels batch by batch, and say how far the stage is."""
+        self._given.timings.stage(stage, len(self._solvable))
+        each_batch(self._given, self._lights, self._view, self._solvable, work, results, lobes=HELD, field=self._field)

@@ -1,0 +1,52 @@
+"""How far an object's Lambertian normals may be off, from pairs of its pixels."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from kernels import packs
+from kernels.photometric.lambertian.lambert import NormalFit
+from kernels.photometric.lambertian.near import NearField, see_near
+from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
+from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit
+from kernels.photometric.model.samples import evenly
+from kernels.status import Status
+from service.solve.sharing.solution import SolveInput
+from stage.colour.colour import GREY_WEIGHTS
+
+PAIRS = 1024
+"""Number of pairs, spread over the object."""
+APART = 2
+"""Pixels from the first to the second of a pair, in a row: the noise of neighbours is alike where colours are interpolated."""
+
+
+def object_misfit(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Misfit:
+    """Return the misfit of an object, from fits to pairs of its pixels.
+
+    Args:
+        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
+    """
+    first = np.zeros(given.mask.shape, dtype=bool)
+    first[:, :-APART] = given.mask[:, :-APART] & given.mask[:, APART:]
+    start = np.flatnonzero(first)
+    if not len(start):
+        return Misfit()
+    start = start[evenly(len(start), PAIRS)]
+    pixels = np.concatenate([start, start + APART])
+    band = packs.upload(*given.stack.pick(pixels), device=given.device)
+    readings = grey_readings(band, grey_factors(lights, GREY_WEIGHTS))
+    near = None if field is None else see_near(band, readings, field.at(pixels))
+    values = readings.on_host(readings.values, len(pixels))
+    fit = fit_normals(band, readings, lights.direction, near)
+    if near is None:
+        toward = np.broadcast_to(lights.direction.T[:, :, None], (3, *values.shape))
+    else:
+        toward = readings.on_host(near.toward, len(pixels))
+    solved = (fit.status.numpy()[: len(pixels)] == Status.OK).reshape(2, -1).all(axis=0)
+    weights = readings.on_host(readings.values, len(pixels))
+
+    def pairs(array: np.ndarray) -> np.ndarray:
+        return array[..., : len(pixels)].reshape(*array.shape[:-1], 2, -1)[..., solved]
+
+    return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(fit.normal.numpy()),
+                                   pairs(fit.squares.numpy()), pairs(fit.freedom.numpy())))

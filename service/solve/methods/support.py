@@ -1,0 +1,111 @@
+"""Whether few lights support the general solver: readings of lights that are left out are predicted by it and by Lambert's law.
+
+A mixture of six lobes and a normal follow a dozen readings whatever their cause, be it a highlight or a light whose direction is a few
+degrees off. What they learnt from highlights predicts further readings; what they learnt from errors does not.
+
+Source: choice of a model by the prediction of left-out data, Stone, "Cross-validatory choice and assessment of statistical predictions",
+Journal of the Royal Statistical Society B 1974.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.photometric.model.samples import Samples, device_values, host_values
+from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
+from kernels.photometric.search.normal_search import find_normals
+from kernels.photometric.search.survey import QUICK
+from service.solve.sharing.solution import Solution
+
+PARTS = 12
+"""Number of parts into which the lights are divided, each left out once; fewer lights are left out singly."""
+RIDGE = 1e-6
+"""Added to the diagonal of the normal equations, so that coplanar lights give a solution."""
+
+
+class LeftOut(NamedTuple):
+    """Mean cost of the left-out readings, as the search counts it."""
+
+    general: float
+    """As the mixture of lobes predicts them."""
+    lambert: float
+    """As Lambert's law predicts them."""
+
+    @property
+    def ratio(self) -> float:
+        """Cost of the general prediction over that of Lambert's law."""
+        return self.general / max(self.lambert, 1e-9)
+
+
+def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
+    """Predict the readings of each light from those of the others.
+
+    Args:
+        samples: some hundreds of pixels, spread over the object, under four lights or more.
+        start: [n, 3] unit normals to begin from.
+
+    Returns:
+        Costs of both predictions. Waits for the device.
+    """
+    lights = samples.light_count
+    readings = host_values(samples, samples.grey).astype(np.float64)
+    toward = np.stack([host_values(samples, samples.toward[axis]) for axis in range(3)], axis=-1).astype(np.float64)
+    parts = min(PARTS, lights)
+    costs: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for part in range(parts):
+        out = np.arange(lights) % parts == part
+        kept = np.where(out, -1.0, readings)
+        lambertian = _lambert(kept, toward)
+        rest = samples._replace(grey=device_values(samples, kept))
+        found = find_normals(rest, start, shape=Diffuse(), sweep=QUICK).best
+        general = predict(samples, found.normal, found.weights, shape=Diffuse())
+        given = readings[:, out] >= 0
+        for kept_costs, predicted in zip(costs, (general, np.einsum("nlc,nc->nl", toward, lambertian)), strict=True):
+            kept_costs.append(_cost(readings[:, out], np.maximum(predicted[:, out], 0))[given])
+    return LeftOut(*(float(np.concatenate(each).mean()) if sum(map(len, each)) else 0.0 for each in costs))
+
+
+def _lambert(readings: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """Return [n, 3] the least-squares b of b·l = reading over the readings above zero."""
+    weights = (readings > 0).astype(np.float64)
+    gram = np.einsum("nl,nli,nlj->nij", weights, toward, toward) + RIDGE * np.eye(3)
+    return np.linalg.solve(gram, np.einsum("nl,nli->ni", weights * readings, toward)[..., None])[..., 0]
+
+
+def _cost(readings: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Return the cost of each reading as the search counts it."""
+    options = SearchOptions()
+    squared = ((readings - predicted) / (options.noise_floor + options.noise_slope * np.maximum(readings, 0))) ** 2
+    dark = (readings < options.shadow_depth * predicted) & (squared > np.expm1(options.shadow_cost))
+    return np.where(dark, options.shadow_cost, np.log1p(squared))
+
+
+FEW_LIGHTS = 32
+"""Fewer lights than this, four for each of the eight unknowns of a pixel, must show that they support the general solver."""
+TESTED_LIGHTS = 6
+"""With fewer lights than this none can be left out: those that remain would not determine what is tested."""
+SUPPORTED_RATIO = 0.7
+"""Largest misfit of left-out readings, over that of Lambert's law, at which the general solver is supported: 0.28 to 0.5 on objects where
+its normals are better, real and path-traced, 0.9 and above where they follow errors of the lights."""
+
+
+def supports_lobes(result: Solution, samples: Samples, start: np.ndarray) -> bool:
+    """Return whether few lights support the general solver, and say in the solution what speaks against it.
+
+    Args:
+        result: whose facts and warnings are added to.
+        samples: some hundreds of pixels, spread over the object.
+        start: [n, 3] unit normals to begin from.
+    """
+    count = samples.light_count
+    fallback = ("normals are drawn to those of lambert and no specular lobe is estimated; capture 32 lights or more, "
+                "spread over the hemisphere, or take --method robust")
+    if count < TESTED_LIGHTS:
+        result.warnings.append(f"method svbrdf: {count} lights are fewer than the unknowns of a pixel: {fallback}.")
+        return False
+    left: LeftOut = leave_out(samples, start)
+    result.facts |= {"left_out_misfit": round(left.general, 4), "left_out_misfit_lambert": round(left.lambert, 4)}
+    if left.ratio > SUPPORTED_RATIO:
+        result.warnings.append(f"method svbrdf: the images of left-out lights are predicted hardly better with specular lobes than without "
+                               f"(misfit {left.general:.2g} against {left.lambert:.2g}): {fallback}.")
+    return left.ratio <= SUPPORTED_RATIO

@@ -1,0 +1,190 @@
+"""The input and the solution of every solver, and the judgement of a solution: pixels in doubt, lights that do not fit."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels.photometric.lambertian.lambert import NormalFit
+from kernels.photometric.lambertian.readings import Lights, channel_weights
+from kernels.photometric.model.misfit import LARGEST_ERROR
+from kernels.photometric.model.samples import evenly
+from kernels.status import Status, refuse_unsure
+from kernels.surface.integrate import Integration
+from service.light_estimation.suspects import LEAST_PIXELS, suspects
+from service.reporting.progress import Timings
+from service.solve.sharing.sharing import SharedSolve
+from stage.capture.camera import Camera
+from stage.colour.colour import GREY_WEIGHTS
+from stage.stack.stack import Stack
+
+LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
+"""Confidence of a normal whose standard error is five degrees."""
+PIXELS_AT_ONCE = 1 << 16
+"""Number of pixels that are looked at in one piece: it bounds the memory."""
+
+SUSPECT_PIXELS = 512
+"""Number of pixels, spread over the object, on which the lights are compared."""
+
+
+class SeparatedPairs(NamedTuple):
+    """The polarised images of a capture beside the diffuse ones, which are the stack of the solve."""
+
+    specular: Stack
+    whole: Stack
+    """Sums of both images of every pair: what a camera without polariser would see."""
+    facts: dict[str, Any]
+    warnings: list[str]
+
+
+@dataclass(frozen=True)
+class SolveInput:
+    """The images of a capture, and how they are worked on."""
+
+    stack: Stack
+    camera: Camera
+    mask: np.ndarray  # [rows, cols] bool: the pixels to solve
+    devices: tuple[str, ...]
+    """Where bands and batches are worked on, one or more; what looks at the whole object is done on the first."""
+    timings: Timings
+    cache: Path | None = None
+    """Folder for stack caches; None: `.relit` in the folder of each capture."""
+    relative: bool = False
+    """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
+    refine_intensities: bool = True
+    """Whether a solver may replace the intensities of the lights by those that the object asks for."""
+    sharing: SharedSolve | None = None
+    """The part of this worker in a solve that several share; None: it is alone."""
+    pairs: SeparatedPairs | None = None
+    """The other images of polarised pairs, of which the stack holds the diffuse ones; None: the images are not polarised."""
+
+    @property
+    def device(self) -> str:
+        """The first device."""
+        return self.devices[0]
+
+
+class SuspectLight(NamedTuple):
+    """A light that disagrees with the others."""
+
+    image: str
+    misfit: float
+    """That of `service.light_estimation.suspects`."""
+
+
+@dataclass
+class Solution:
+    """The solution at every pixel of the image; only pixels with a status of kernels.status.ESTIMATED have values."""
+
+    normal: np.ndarray  # [3, pixels] float32
+    albedo: np.ndarray  # [3, pixels] float16
+    confidence: np.ndarray  # [pixels] float16
+    residual: np.ndarray  # [pixels] float16
+    status: np.ndarray  # [pixels] uint8
+    specular: np.ndarray | None = None  # [3, pixels] float16, F0
+    roughness: np.ndarray | None = None  # [pixels] float16
+    abundance: np.ndarray | None = None  # [pixels] float16, share of the first of two materials; 0 where the pixel has one
+    pair: np.ndarray | None = None  # [pixels] uint8, which pair these are
+    pairs: np.ndarray | None = None  # [pairs, 2, 4] float32, F0 and roughness of both materials; None: no pixel has two
+    specular_normal: np.ndarray | None = None  # [3, pixels] float32
+    regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.reference.sampling.Regime
+    height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet
+    integration: Integration | None = None
+    """The last integration of the normals, from which the height came."""
+    suspects: list[SuspectLight] = field(default_factory=list)
+    sigma: np.ndarray | None = None  # [pixels] float16, standard error of the normal in degrees; None: that of the confidence
+    judged_by_surface: bool = False
+    """Whether confidence falls where the normals are not those of a surface."""
+    warnings: list[str] = field(default_factory=list)
+    """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
+    facts: dict[str, Any] = field(default_factory=dict)
+    """Facts for the report, under `found`."""
+    contents: dict[str, str] = field(default_factory=dict)
+    """Content hash of each capture that was read beside the images, by the name of its option."""
+
+    def standard_error(self) -> np.ndarray:
+        """Return the standard error of the normals in degrees, [pixels] float32.
+
+        Without one of its own a solver's confidence is 1 / (1 + standard error / 1°).
+        """
+        if self.sigma is not None:
+            return self.sigma.astype(np.float32)
+        return np.minimum(1 / np.maximum(self.confidence.astype(np.float32), 1e-6) - 1, LARGEST_ERROR)
+
+    @classmethod
+    def empty(cls, pixels: int) -> "Solution":
+        """Return a solution in which no pixel is solved."""
+        return cls(np.zeros((3, pixels), np.float32), np.zeros((3, pixels), np.float16), np.zeros(pixels, np.float16),
+                   np.zeros(pixels, np.float16), np.zeros(pixels, np.uint8))
+
+    def place(self, span: slice, inside: np.ndarray, fit: NormalFit) -> None:
+        """Store the normals of a band.
+
+        Args:
+            span: its pixels.
+            inside: [n] bool, which of them are inside the mask.
+            fit: normals of the band, with padding.
+        """
+        count = len(inside)
+        self.normal[:, span] = np.where(inside, fit.normal.numpy()[:, :count], 0)
+        self.residual[span] = np.where(inside, fit.residual.numpy()[:count], 0)
+        self.status[span] = np.where(inside, fit.status.numpy()[:count], int(Status.UNSOLVED))
+
+
+def mark_not_facing(camera: Camera, solution: Solution) -> None:
+    """Set the status NOT_FACING where a normal points away from its line of sight: a visible surface cannot."""
+    step = max(1, PIXELS_AT_ONCE // camera.width)
+    for first in range(0, camera.height, step):
+        rows = min(step, camera.height - first)
+        span = slice(first * camera.width, (first + rows) * camera.width)
+        x, y, toward = solution.normal[:, span]
+        if camera.projection == "perspective":
+            right, up = (plane.reshape(-1) for plane in camera.plane_views(first, rows))
+            toward = toward - x * right - y * up
+        status = solution.status[span]
+        status[(status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
+
+
+def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:
+    """Say why pixels have too few lights, and which normals are uncertain, by the status of these pixels.
+
+    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED. Solved pixels with a confidence
+    under 1/6 become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values.
+
+    Args:
+        solution: of the whole image; its status is changed.
+        max_sigma: largest standard error of a solved normal, degrees.
+        least_confidence: least confidence of a solved normal.
+    """
+    few = np.flatnonzero(solution.status == Status.TOO_FEW_LIGHTS)
+    for first in range(0, len(few), PIXELS_AT_ONCE):
+        part = few[first : first + PIXELS_AT_ONCE]
+        bits = stack.pick_saturated(part)
+        saturated = np.unpackbits(bits, axis=0, bitorder="little")[: stack.light_count].sum(axis=0)
+        solution.status[part] = np.where(saturated >= 1, int(Status.SATURATED), int(Status.SHADOWED))
+    loose = (solution.status == Status.OK) & (solution.confidence.astype(np.float32) < LOOSE_CONFIDENCE)
+    solution.status[loose] = Status.AMBIGUOUS
+    refuse_unsure(solution.status, solution.standard_error(), solution.confidence, max_sigma=max_sigma, least_confidence=least_confidence)
+
+
+def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[SuspectLight]:
+    """Return the lights whose direction or strength in the manifest the images contradict, worst first.
+
+    Args:
+        solution: normals that were solved under these lights.
+    """
+    solved = np.flatnonzero(solution.status == Status.OK)
+    if len(solved) < 2 * LEAST_PIXELS:
+        return []
+    confidence = solution.confidence[solved].astype(np.float32)
+    sure = solved[confidence >= np.median(confidence)]
+    chosen = sure[evenly(len(sure), SUSPECT_PIXELS)]
+    values, _ = stack.pick(chosen)
+    count = stack.light_count
+    weights = channel_weights(lights, GREY_WEIGHTS)
+    factor = np.divide(weights * lights.scale[:count, None], lights.irradiance[:count],
+                       out=np.zeros((count, 3)), where=lights.irradiance[:count] > 0)
+    readings = np.einsum("lc,clp->lp", factor, values[:, :count].astype(np.float64))
+    found = suspects(readings, lights.direction[:count].astype(np.float64), solution.normal[:, chosen])
+    return [SuspectLight(stack.frames[each.light], round(each.misfit, 3)) for each in found]

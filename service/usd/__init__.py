@@ -1,1 +1,0 @@
-"""USD assets from solved maps: the only place with pxr."""

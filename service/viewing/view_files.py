@@ -1,0 +1,222 @@
+"""Write what the pages of the service show of a capture and of its maps: view.json, view.bin and thumbnails.jpg (docs/view.md)."""
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.errors import DeviceError, KernelError
+from service.captures.info import standing_faults
+from service.relight.outputs import check_outputs
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import metadata
+from service.requests.view import ViewRequest
+from service.viewing.block_file import BlockFile
+from service.viewing.capture_frames import describe_frames, read_images, write_thumbnails
+from service.viewing.layers import status_codes, write_layers
+from service.viewing.points import write_points
+from service.viewing.relighting import LEAST_LIGHTS, write_relighting
+from service.viewing.result_layers import ResultLayers
+from service.viewing.samples import write_samples
+from service.viewing.solve_report import SolveReport, read_report
+from stage.capture.capture import Capture
+from stage.capture.light import DistantLight, PointLight
+from stage.capture.lighting import lights_from_centre
+from stage.capture.point_lights import DistantLights, PlacedLights, place_lights
+from stage.colour.colour_spaces import linear_space
+from stage.colour.radiance import clipping_sentences
+from stage.errors import ResultError, StageError, StorageError, storage
+from stage.files import replacing, write_text
+from stage.motion.tracking import tracking_frames
+from stage.results.depth_maps import DEPTH_FILE
+from stage.results.light_basis import numbers
+from stage.results.maps import MAPS_FILE
+from stage.results.matte import matte_of
+from stage.stack.brackets import merge_brackets, one_frame_a_light
+from stage.stack.fingerprint import digest
+from stage.stack.ingest import open_stack
+from stage.stack.stack import Stack
+
+
+class Readings(NamedTuple):
+    """The stack of a capture and its lights."""
+
+    capture: Capture
+    stack: Stack
+    """Exposures of one light are merged."""
+    lights: DistantLights | None
+    """The lights, near ones as the object's centre sees them; None: there are some of other kinds."""
+
+    def model_lights(self, factors: np.ndarray | None) -> DistantLights | PlacedLights | None:
+        """Return the lights where they are, with the intensities that the maps were solved with; None as for `lights`.
+
+        Args:
+            factors: [lights] of the solve, one for each light whatever its exposures; None: all are 1.
+        """
+        if self.lights is None:
+            return None
+        if self.capture.lit_by(PointLight):
+            return place_lights(self.capture)
+        kept = one_frame_a_light(self.stack, self.lights)[1]
+        if factors is None or len(factors) != len(kept.direction):
+            return self.lights
+        same = (self.lights.direction @ kept.direction.T).argmax(axis=1)
+        return self.lights._replace(irradiance=self.lights.irradiance * factors[same, None])
+
+
+def open_readings(capture: Capture, request: ViewRequest, timings: Timings) -> Readings:
+    """Open the stack of a capture that has light frames.
+
+    Raises:
+        StageError: an image cannot be used, near lights have no scale, or the cache cannot be written; names file and field.
+    """
+    single = all(isinstance(frame.light, DistantLight | PointLight) for frame in capture.sources())
+    lights = lights_from_centre(capture) if single else None
+    tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
+    timings.stage("ingest", len(capture.sources()))
+    stack = open_stack(capture, cache=request.cache, tracking=tracking, progress=lambda done, _: timings.advance(done))
+    return Readings(capture, stack if lights is None else merge_brackets(stack, capture.sources(), lights), lights)
+
+
+Made = TypeVar("Made")
+SCHEMA = "relit.view/1"
+VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE = "view.json", "view.bin", "thumbnails.jpg"
+MOST_FINDINGS = 100
+"""Most sentences of what is wrong with a capture, so that view.json stays small."""
+
+
+class ViewResult(NamedTuple):
+    """The files of a view, and what its user should know."""
+
+    path: Path
+    """view.json."""
+    layers: tuple[str, ...]
+    frames: int
+    terms: int
+    """Coefficient images to relight with; 0: there are too few lights, or they cannot be used."""
+    levels: tuple[float, float] | None
+    """Mean difference of relit pictures from those of `relit relight` under lights that the images were not made from, in 255ths of the
+    display's range: mean of the lights, and largest; None: there are no coefficient images."""
+    findings: tuple[str, ...]
+    """What is wrong with the capture, in sentences."""
+
+
+def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
+    """Write what a browser needs to show a capture and its maps.
+
+    Args:
+        request: the capture, the maps if there are any, and the folder of the results.
+        progress: told of every stage.
+
+    Raises:
+        RequestError: a file of the view would replace one of the capture.
+        ResultError: the maps are missing, incomplete or of another camera than the capture.
+        StageError: the capture cannot be opened; a frame that cannot be used is among the findings instead.
+        StorageError: a file cannot be written; view.json is there only if everything is.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture, request.pixels)
+    _check_outputs(request, capture)
+    result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
+    report = SolveReport([], {}, None) if result is None else read_report(result.path)
+    mask = _mask(capture)
+    images = read_images(capture, mask, timings)
+    findings = list(dict.fromkeys([*images.faults, *standing_faults(capture)]))
+    space = linear_space(capture.manifest.color_space)
+    target = request.out / VIEW_FILE
+    sections: dict[str, Any] = {"layers": [], "relight": None, "samples": None, "points": None}
+    with storage("write", target), replacing(request.out / BLOCKS_FILE) as temporary, BlockFile(temporary) as file:
+        if result is not None and result.has_depth:
+            timings.stage("points", 1)
+            sections["points"] = write_points(result, file)
+        if result is not None:
+            sections["layers"] = write_layers(result, file, timings)
+        readings = _attempt(findings, lambda: open_readings(capture, request, timings)) if capture.sources() and images.usable else None
+        if readings is not None:
+            sections["relight"] = _attempt(findings, lambda: _relight(readings, request, file, device, timings))
+            if result is not None and not result.of_depth:
+                sections["samples"] = _attempt(findings, lambda: write_samples(
+                    readings.stack, mask.shape, result, readings.model_lights(report.factors), file, doubts=findings, device=device,
+                    timings=timings))
+        timings.stage("write", 1)
+        target.unlink(missing_ok=True)  # it would describe other blocks
+    findings += clipping_sentences(capture.clipped)
+    thumbnails = write_thumbnails(request.out / THUMBNAILS_FILE, images, space)
+    findings = [*findings[:MOST_FINDINGS], *([f"and {len(findings) - MOST_FINDINGS} more"] if len(findings) > MOST_FINDINGS else [])]
+    contents = {} if result is None else {"maps": digest(result.path)}
+    write_text(target, json.dumps({
+        "schema": SCHEMA, "name": capture.name, "rows": capture.camera.height, "cols": capture.camera.width, "color_space": space,
+        "camera": capture.camera.model_dump(mode="json", exclude_none=True),
+        "exposure": numbers(1 / images.white) if images.white > 0 else 1.0,
+        "codes": status_codes(),
+        "frames": describe_frames(capture, images, thumbnails, report.suspects),
+        "findings": findings,
+        "warnings": report.warnings,
+        **sections,
+        "provenance": metadata(request, capture=capture.name, inputs="" if readings is None else readings.stack.key,
+                               contents=contents),
+    }, allow_nan=False) + "\n")
+    timings.close()
+    relight = sections["relight"]
+    levels = None if relight is None else (relight["held_out"]["mean_levels"], relight["held_out"]["largest_levels"])
+    return ViewResult(target, tuple(layer["name"] for layer in sections["layers"]), len(images.images),
+                      0 if relight is None else relight["terms"], levels, tuple(findings))
+
+
+def _attempt(findings: list[str], work: Callable[[], Made]) -> Made | None:
+    """Return what some work makes, or None where the capture does not allow it, which the findings then say."""
+    try:
+        return work()
+    except (StageError, KernelError) as error:
+        if isinstance(error, StorageError | DeviceError):
+            raise
+        findings += [str(error)] if str(error) not in findings else []
+        return None
+
+
+def _relight(readings: Readings, request: ViewRequest, file: BlockFile, device: str, timings: Timings) -> dict[str, Any] | None:
+    """Write what an object is lit with; None: it has too few lights."""
+    if readings.lights is None or len(readings.lights.direction) < LEAST_LIGHTS:
+        return None
+    timings.stage("matte", 1)
+    return write_relighting(readings.stack, readings.lights, matte_of(readings.capture, readings.stack), file, most_terms=request.terms,
+                            device=device, timings=timings)
+
+
+def _check_outputs(request: ViewRequest, capture: Capture) -> None:
+    """Refuse to write over an input, or into a folder that cannot be written to.
+
+    Raises:
+        RequestError, StorageError: as check_outputs.
+    """
+    outputs = [(f"--out {request.out}", request.out / name) for name in (VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE)]
+    check_outputs(outputs, [capture.file(name) for _, name in capture.files()])
+
+
+def result_file(maps: Path) -> Path:
+    """Return the maps.exr or depth.exr of a folder, or the file that was given.
+
+    Raises:
+        ResultError: neither is there.
+    """
+    if not maps.is_dir():
+        if maps.is_file():
+            return maps
+        raise ResultError(f"{maps}: is not there: run `relit solve` or `relit depth` first")
+    for name in (MAPS_FILE, DEPTH_FILE):
+        if (maps / name).is_file():
+            return maps / name
+    raise ResultError(f"{maps}: holds neither {MAPS_FILE} nor {DEPTH_FILE}: run `relit solve` or `relit depth` first")
+
+
+def _mask(capture: Capture) -> np.ndarray:
+    """Return the mask of a capture; all pixels where it cannot be used, which the findings say."""
+    with suppress(StageError):
+        return capture.mask()
+    return np.ones((capture.camera.height, capture.camera.width), dtype=bool)

@@ -1,0 +1,1 @@
+"""Captures as their manifests describe them: cameras, projectors, lights, sequences."""

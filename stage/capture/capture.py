@@ -1,0 +1,280 @@
+"""A capture folder: its manifest, and the checks of the files that the manifest names."""
+
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stage.capture.camera import Camera
+from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
+from stage.capture.manifest import FILE_NAME, Frame, Manifest, read_manifest
+from stage.colour import radiance as radiances
+from stage.colour.colour_spaces import is_linear
+from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
+from stage.formats import images
+from stage.formats.camera_raw import path_is_raw
+from stage.formats.exif import Exposure, exposure_times, unused_exposures
+from stage.formats.images import ImageHeader
+from stage.formats.orientation import check_agreement
+from stage.pixels import AS_RECORDED, Crop, PixelChoices
+
+SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)
+"""The types of light whose frames are measurements, from which surfaces are solved and images are relit."""
+
+HEADER_THREADS = 8
+"""The number of threads that read file headers while a capture is opened."""
+
+LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, GradientLight, EnvironmentLight, OffLight, FullLight)
+
+
+def check_same_pixels(path: Path, camera: Camera, capture: "Capture") -> None:
+    """Check that results have the pixels of a capture.
+
+    Args:
+        path: of the results, for the message.
+        camera: of the results.
+        capture: as it is read.
+
+    Raises:
+        ResultError: the results have another size, or are of another part of the images.
+    """
+    if camera.resolution != capture.camera.resolution:
+        theirs, ours = ("x".join(map(str, each.resolution)) for each in (camera, capture.camera))
+        raise ResultError(f"{path}: is {theirs}, the capture {ours}: these are not its maps (--crop gives the part of the images that was "
+                          "solved)")
+    if capture.whole is not None and camera.principal_point != capture.camera.principal_point:
+        raise ResultError(f"{path}: is of another part of the images than --crop {capture.pixels.crop}")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A folder of images that one camera took from one position, with its manifest."""
+
+    folder: Path
+    manifest: Manifest
+    pixels: PixelChoices = AS_RECORDED
+    """How the pixels of the images are read."""
+    whole: "Capture | None" = None
+    """The capture with its whole images, of which this one is a part; None: it is no part."""
+    clipped: dict[str, int] = field(default_factory=dict, compare=False)
+    """The number of pixels in which a value was set to 0, by the names of the images that were read so far."""
+
+    doubts: tuple[str, ...] = ()
+    """A sentence for each thing that the files say and the manifest does not heed, and for each that an import assumed."""
+
+    @classmethod
+    def open(cls, path: str | Path, pixels: PixelChoices = AS_RECORDED) -> "Capture":
+        """Open a capture, and check its manifest and the header of every file.
+
+        Args:
+            path: the folder, or the capture.json in it.
+            pixels: how the pixels of the images are read; with a crop, the camera and all images are those of the part.
+
+        Raises:
+            ManifestError: the manifest is wrong, or the crop leads out of the images; the message names the field.
+            ImageError: a file has the wrong size or is no image; the message names the file.
+            StorageError: a file cannot be read.
+        """
+        given = Path(path)
+        folder = given.parent if given.name == FILE_NAME else given
+        with storage("read", folder):
+            if not folder.is_dir():
+                raise ManifestError(f"{folder}: there is no such folder")
+            if not (folder / FILE_NAME).exists():
+                raise ManifestError(f"{folder}: holds no {FILE_NAME}: see `relit import` for data laid out another way")
+        capture = cls(folder, read_manifest(folder / FILE_NAME), pixels)
+        capture = capture._exposed(capture._check_files())
+        capture = replace(capture, doubts=(*capture.doubts, *capture.manifest.assumed))
+        return capture if pixels.crop is None else capture._part(pixels.crop)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the manifest."""
+        return self.manifest.camera
+
+    @property
+    def image_resolution(self) -> tuple[int, int]:
+        """The width and height of the image files, of which the camera may see a part."""
+        return (self.whole or self).camera.resolution
+
+    @property
+    def name(self) -> str:
+        """The name of the capture."""
+        return self.manifest.name
+
+    def file(self, name: str) -> Path:
+        """Return the path of a file that the manifest names, which always lies inside the folder.
+
+        Raises:
+            ManifestError: the name leads out of the folder.
+        """
+        if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+            raise ManifestError(f"{self.folder / FILE_NAME}: {name} leads out of the capture's folder")
+        return self.folder / name
+
+    def lit_by(self, *kinds: type[LightKind]) -> list[tuple[Frame, LightKind]]:
+        """Return the frames whose light is of one of these types, each with its light, in manifest order."""
+        return [(frame, frame.light) for frame in self.manifest.frames if isinstance(frame.light, kinds)]
+
+    def sources(self) -> list[Frame]:
+        """Return the frames whose light is a measurement: neither ambient light, nor a tracking frame, nor an environment.
+
+        In a capture with gradient frames a `full` frame is a measurement too, because gradient frames are compared with it.
+        """
+        kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
+        return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
+
+    @property
+    def is_polarised(self) -> bool:
+        """Whether distant or point lights have cross- and parallel-polarised frames."""
+        return any(isinstance(frame.light, DistantLight | PointLight) and frame.light.polarization != "none"
+                   for frame in self.manifest.frames)
+
+    def recorded(self, name: str, *, keep_half: bool = False) -> np.ndarray:
+        """Read the recorded values of an image that holds radiance, in the part of it that the capture is about.
+
+        Args:
+            name: of the image.
+            keep_half: True to leave half values as the file has them, too.
+
+        Returns:
+            [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
+
+        Raises:
+            ImageError: the file is unreadable, or a value is NaN, infinite or negative beyond the noise of the image and not to be
+                clipped; the message names the file.
+        """
+        return self.part_of(self.recorded_whole(name, keep_half=keep_half))
+
+    def recorded_whole(self, name: str, *, keep_half: bool = False) -> np.ndarray:
+        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have.
+
+        Args:
+            name, keep_half: as of `recorded`.
+
+        Returns:
+            [rows, cols, 3] as `recorded`.
+
+        Raises:
+            ImageError: as `recorded`.
+        """
+        path = self.file(name)
+        pixels = images.read_recorded(path)
+        if pixels.dtype.kind == "u":
+            return pixels
+        if self.pixels.clip_negative:
+            radiances.check_finite(path, pixels)
+            pixels, count = radiances.clip_negative(pixels)
+            if count:
+                self.clipped[name] = count
+        else:
+            radiances.check_radiance(path, pixels, remedy=radiances.CLIP_NEGATIVE, stray=radiances.RAW_STRAY if path_is_raw(path) else 0.0)
+        return pixels if keep_half and pixels.dtype == np.float16 else pixels.astype(np.float32, copy=False)
+
+    def part_of(self, image: np.ndarray) -> np.ndarray:
+        """Return the part of a whole image, [rows, cols, ...], that the capture is about."""
+        return image if self.pixels.crop is None else np.ascontiguousarray(self.pixels.crop.of(image))
+
+    def mask(self) -> np.ndarray:
+        """Read the mask of the object.
+
+        Returns:
+            [rows, cols] bool, True on the object; all True when the manifest names no mask.
+
+        Raises:
+            ImageError: the mask is empty or unreadable.
+        """
+        if self.manifest.mask is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=bool)
+        return images.read_mask(self.file(self.manifest.mask), self.image_resolution, self.pixels.crop)
+
+    def mask_values(self) -> np.ndarray:
+        """Read the mask of the object with its partial values.
+
+        Returns:
+            [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when the manifest names no mask.
+
+        Raises:
+            ImageError: the mask is unreadable.
+        """
+        if self.manifest.mask is None:
+            return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
+        return self.part_of(images.read_mask_values(self.file(self.manifest.mask), self.image_resolution))
+
+    def files(self) -> Iterator[tuple[str, str]]:
+        """Yield the manifest field and the name of every file that the manifest names."""
+        for key in ("mask", "dark", "flat"):
+            name = getattr(self.manifest, key)
+            if name is not None:
+                yield key, name
+        for index, frame in enumerate(self.manifest.frames):
+            yield f"frames[{index}].image", frame.image
+            if isinstance(frame.light, EnvironmentLight):
+                yield f"frames[{index}].light.image", frame.light.image
+            for number, name in enumerate(() if frame.stereo is None else frame.stereo.images):
+                yield f"frames[{index}].stereo.images[{number}]", name
+
+    def _part(self, crop: Crop) -> "Capture":
+        """Return the part of the capture inside a rectangle of its images."""
+        width, height = self.camera.resolution
+        if not crop.is_within((width, height)):
+            raise ManifestError(f"--crop {crop}: leads out of the images of {self.folder}, which are {width}x{height}: "
+                                "give the first column, the first row, the width and the height")
+        return replace(self, manifest=self.manifest.model_copy(update={"camera": self.camera.cropped(crop)}),
+                       whole=replace(self, pixels=self.pixels._replace(crop=None)))
+
+    def _exposed(self, headers: Mapping[str, ImageHeader]) -> "Capture":
+        """Return the capture with the exposure times that its files hold, where the manifest asks for them."""
+        exposures = {frame.image: headers[frame.image].exposure if frame.image in headers else Exposure() for frame in self.manifest.frames}
+        if self.manifest.exposure_from is not None:
+            times = exposure_times(str(self.folder / FILE_NAME), exposures)
+            frames = tuple(frame.model_copy(update={"exposure_s": times[frame.image]}) for frame in self.manifest.frames)
+            return replace(self, manifest=self.manifest.model_copy(update={"frames": frames, "exposure_from": None}))
+        timed = any(frame.exposure_s is not None for frame in self.manifest.frames)
+        return self if timed else replace(self, doubts=tuple(unused_exposures(exposures)))
+
+    def _check_files(self) -> dict[str, ImageHeader]:
+        """Check the header of every file, and return those of frames by the names of their images."""
+        frames = {f"frames[{index}].image" for index in range(len(self.manifest.frames))}
+        headers: dict[str, ImageHeader] = {}
+        others = {f"frames[{index}].stereo.images[{number}]": (camera.resolution, f"other_cameras[{number}].resolution")
+                  for index, frame in enumerate(self.manifest.frames) if frame.stereo is not None
+                  for number, camera in enumerate(self.manifest.other_cameras)}
+        arrays = {f"frames[{index}].image" for index, frame in enumerate(self.manifest.frames) if frame.tof is not None}
+
+        def fault(item: tuple[str, str]) -> StageError | None:
+            field, name = item
+            try:
+                path = self.file(name)
+                with storage("read", path):
+                    if not path.exists():
+                        return ManifestError(f"{self.folder / FILE_NAME}: {field}: {name} is not in the folder")
+                if field in arrays and path.suffix.lower() == ".npy":
+                    return None  # time-of-flight arrays: checked by their own reader
+                if field.endswith(".light.image"):
+                    images.read_header(path)  # an environment has a size of its own
+                else:
+                    resolution, declared = others.get(field, (self.camera.resolution, "camera.resolution"))
+                    header = images.check_resolution(path, resolution, declared=declared)
+                    if field != "mask" and path_is_raw(path) and not is_linear(self.manifest.color_space):
+                        return ManifestError(f"{self.folder / FILE_NAME}: color_space: {self.manifest.color_space} is encoded for "
+                                             f"displays, and {name} is camera raw, which is linear: give lin_rec709_scene")
+                    if field in frames:
+                        headers[name] = header
+            except StageError as error:
+                return error
+            return None
+
+        with ThreadPoolExecutor(HEADER_THREADS) as pool:
+            errors = [error for error in pool.map(fault, self.files()) if error is not None]
+        if len(errors) == 1:
+            raise errors[0]
+        if errors:
+            kind = ImageError if all(isinstance(error, ImageError) for error in errors) else ManifestError
+            raise kind(*listed(map(str, errors), f"{self.folder}: has {len(errors) - MOST_FAULTS} faults more"))
+        check_agreement(str(self.folder / FILE_NAME), {frame.image: headers[frame.image].orientation for frame in self.manifest.frames
+                                                       if frame.image in headers})
+        return headers

@@ -1,0 +1,101 @@
+"""The lights of a capture as arrays, and the check that they determine a normal."""
+
+import numpy as np
+
+from stage.capture.capture import SOURCES, Capture
+from stage.capture.extended_lights import ExtendedLights, extended_lights, lie_in_one_plane
+from stage.capture.light import PLACEHOLDER, DistantLight, ExtendedLight, GradientLight, PointLight
+from stage.capture.manifest import FILE_NAME
+from stage.capture.point_lights import DistantLights, PlacedLights, place_lights
+from stage.capture.polarised_pairs import check_pairs
+from stage.errors import ManifestError
+
+MEASURED_BY = "relit calibrate mirror-ball or light-positions measures where they are, grey-ball or intensity how strong"
+"""How placeholders are replaced."""
+
+
+def distant_lights(capture: Capture) -> DistantLights:
+    """Return the lights of the stack of a capture, all of which must be distant.
+
+    Raises:
+        ManifestError: a light is not distant, or there is none; the message names the frame.
+    """
+    where = capture.folder / FILE_NAME
+    for index, frame in enumerate(capture.manifest.frames):
+        if isinstance(frame.light, SOURCES) and not isinstance(frame.light, DistantLight):
+            hint = " (relit solve --method gradient solves gradients)" if isinstance(frame.light, GradientLight) else ""
+            raise ManifestError(f"{where}: frames[{index}].light: is {frame.light.type}: this needs distant lights{hint}")
+    lights = [light for _, light in capture.lit_by(DistantLight)]
+    if not lights:
+        raise ManifestError(f"{where}: frames: none is lit by a distant light")
+    found = DistantLights(np.array([light.direction for light in lights]), np.array([light.irradiance for light in lights]))
+    check_pairs(capture, found.direction)
+    return found
+
+
+def has_placeholders(capture: Capture) -> bool:
+    """Return whether the lights of a capture are yet to be measured: two frames or more are lit, all of them by the placeholder."""
+    lit = [frame.light for frame in capture.sources()]
+    return len(lit) > 1 and all(isinstance(light, DistantLight) and light.model_copy(update={"polarization": "none"}) == PLACEHOLDER
+                                for light in lit)
+
+
+def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
+    """Check that a normal can be solved from a capture, and return its lights.
+
+    Returns:
+        ExtendedLights when a light is extended, PlacedLights when a light is a point light, otherwise DistantLights.
+
+    Raises:
+        ManifestError: there are fewer than three lights, all lights lie in one plane through the centre of the object, a point
+            light stands at an impossible position, the image has one pixel, a channel has no light, or the lights are placeholders.
+    """
+    where = capture.folder / FILE_NAME
+    if has_placeholders(capture):
+        raise ManifestError(f"{where}: frames[].light: all are the placeholder, direction [0, 0, 1] and irradiance [1, 1, 1]: "
+                            f"{MEASURED_BY}")
+    if capture.lit_by(ExtendedLight):
+        if capture.is_polarised:
+            raise ManifestError(f"{where}: frames[].light: some are extended and others polarised: polarised pairs are of distant and "
+                                "point lights alone")
+        check_surface(capture)
+        return extended_lights(capture)
+    near = bool(capture.lit_by(PointLight))
+    lights = place_lights(capture) if near else distant_lights(capture)
+    count = len(lights.direction)
+    if count < 3:
+        raise ManifestError(f"{where}: frames: {count} lit by a {'distant or point' if near else 'distant'} light: "
+                            "a normal needs three or more")
+    if lie_in_one_plane(lights.direction):
+        raise ManifestError(f"{where}: frames[].light.{'position_m' if near else 'direction'}: all {count} lights lie in one "
+                            "plane through the object: a normal needs lights out of it")
+    strength = lights.strength if isinstance(lights, PlacedLights) else lights.irradiance
+    unlit = np.flatnonzero(~(strength > 0).any(axis=0))
+    if len(unlit):
+        raise ManifestError(f"{where}: frames[].light.{'intensity' if near else 'irradiance'}: channel {'RGB'[unlit[0]]} is 0 "
+                            "for every light")
+    check_surface(capture)
+    return lights
+
+
+def lights_from_centre(capture: Capture) -> DistantLights:
+    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object.
+
+    Raises:
+        ManifestError: a light is neither distant nor a point light, there is none, or a point light stands at an impossible
+            position.
+    """
+    if not capture.lit_by(PointLight):
+        return distant_lights(capture)
+    placed = place_lights(capture)
+    return DistantLights(placed.direction, placed.irradiance)
+
+
+def check_surface(capture: Capture) -> None:
+    """Check that the images have more than one pixel, because a surface needs two.
+
+    Raises:
+        ManifestError: the images have one pixel.
+    """
+    if capture.camera.width * capture.camera.height == 1:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: is 1x1: a surface needs two pixels or more")

@@ -1,0 +1,1 @@
+"""Colour spaces, what a pixel's radiance may be, and environment maps."""

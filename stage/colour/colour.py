@@ -1,0 +1,112 @@
+"""Conversion of pixels between colour spaces.
+
+The arithmetic is OpenColorIO's, through OpenImageIO, with the built-in ACES configuration.
+"""
+
+from functools import cache
+
+import numpy as np
+import OpenImageIO as oiio
+
+from stage.colour.colour_spaces import is_linear, linear_space
+from stage.formats.images import fractions
+
+CONFIG = "ocio://default"
+"""The OpenColorIO configuration: the newest ACES configuration that is built into the library."""
+
+LARGEST_INTEGER = 65535
+"""The full scale of 16-bit images."""
+ROUNDING = 1.2e-7
+"""Difference from the fraction of an integer that decoders leave: an ulp of one, a hundredth of the step of 16-bit integers."""
+
+GREY_WEIGHTS = (0.299, 0.587, 0.114)
+"""The luma weights of red, green and blue by ITU-R BT.601: published photometric stereo figures are computed on this grey."""
+
+
+def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
+    """Convert recorded values to scene-linear values with the same primaries.
+
+    Args:
+        pixels: [rows, cols, channels], encoded in `space`: float32, or uint8 or uint16 as `images.read_recorded` returns them.
+        space: a ColorSpaceName.
+
+    Returns:
+        [rows, cols, channels] float32; `pixels` without a copy when they are float32 and `space` is linear already.
+    """
+    if pixels.dtype.kind == "u":
+        return np.take(_linear_of_codes(space, pixels.dtype), pixels)
+    if is_linear(space):
+        return pixels
+    steps, linear = _linear_of_integers(space)
+    with np.errstate(invalid="ignore"):
+        nearest = (np.clip(pixels, 0, 1) * np.float32(LARGEST_INTEGER) + np.float32(0.5)).astype(np.uint16)
+    if np.abs(steps[nearest] - pixels).max(initial=0) <= ROUNDING:  # as in every integer image: a table is ten times as fast
+        return linear[nearest]
+    return convert(pixels, space, linear_space(space))
+
+
+@cache
+def _linear_of_codes(space: str, kind: np.dtype) -> np.ndarray:
+    """Return the scene-linear value of each integer of an image: [256] or [65536] float32."""
+    return linearise(fractions(kind)[None, :, None], space).reshape(-1)
+
+
+@cache
+def _linear_of_integers(space: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return [65536] float32, the fractions of full scale that 16-bit integers stand for, and their scene-linear values.
+
+    Fractions of 255 are among them: 65535 is a multiple of it. The primaries stay, so that each channel is converted alone.
+    """
+    steps = (np.arange(LARGEST_INTEGER + 1) / LARGEST_INTEGER).astype(np.float32)
+    return steps, convert(steps[None, :, None], space, linear_space(space))[0, :, 0]
+
+
+def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
+    """Convert pixels from one colour space to another.
+
+    Args:
+        pixels: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue.
+        source: the interchange name of the colour space of `pixels`.
+        target: the interchange name of the colour space of the result.
+
+    Returns:
+        Float32 in the shape of `pixels`; of one channel, the red channel of the converted grey.
+
+    Raises:
+        ValueError: OpenColorIO does not know one of the names.
+    """
+    if source == target:
+        return pixels
+    grey = pixels.shape[2] == 1
+    rgb = np.repeat(pixels, 3, axis=2) if grey else pixels
+    buffer = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32)), source, target,
+                                            colorconfig=CONFIG)
+    if buffer.has_error:
+        raise ValueError(f"cannot convert {source} to {target}: {buffer.geterror()}")
+    converted = pixels_of(buffer)
+    return converted[..., :1] if grey else converted
+
+
+def rgb_matrix(source: str, target: str) -> np.ndarray:
+    """Return the matrix that converts column vectors from one scene-linear space to another.
+
+    Returns:
+        [3, 3] float32: rgb in `target` = matrix @ rgb in `source`.
+
+    Raises:
+        ValueError: OpenColorIO does not know one of the names.
+    """
+    primaries = np.eye(3, dtype=np.float32)[None]  # one row of three pixels: red, green and blue
+    return np.ascontiguousarray(convert(primaries, source, target)[0].T)
+
+
+def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
+    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
+
+    Raises:
+        ValueError: OpenImageIO has put an error message in the place of the pixels.
+    """
+    pixels = buffer.get_pixels(oiio.FLOAT)
+    if pixels is None:
+        raise ValueError(buffer.geterror())
+    return np.asarray(pixels)

@@ -1,0 +1,58 @@
+"""Reading of environment maps: lat-long images of the radiance from every direction, +y at the top and +z in the middle."""
+
+from pathlib import Path
+
+import numpy as np
+
+from stage.colour.colour import convert
+from stage.colour.radiance import CLIP_NEGATIVE, check_finite, check_radiance, clip_negative
+from stage.errors import ImageError
+from stage.formats import exr, images
+
+SUFFIXES = {".exr", ".hdr"}
+
+
+def check_environment(path: Path) -> None:
+    """Check the header of an environment map.
+
+    Raises:
+        ImageError: not EXR or HDR, or not twice as wide as high.
+        StorageError: the file cannot be opened.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
+    header = images.read_header(path)
+    if header.width != 2 * header.height:
+        raise ImageError(f"{path}: is {header.width}x{header.height}: a lat-long map is twice as wide as high")
+
+
+def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None) -> np.ndarray:
+    """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
+
+    Args:
+        path: lat-long .exr or .hdr.
+        space: the scene-linear colour space of the result.
+        clipped: is given the number of pixels with values that are negative beyond the noise of the map and set to 0, by its file name;
+            None refuses such maps.
+
+    Returns:
+        [rows, cols, 3] float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has
+        a channel that is 0.
+
+    Raises:
+        ImageError: impossible values (counted), or a colour space that is not known.
+        StorageError: the file cannot be opened.
+    """
+    pixels = images.read_pixels(path).astype(np.float32)
+    if clipped is None:
+        check_radiance(path, pixels, remedy=CLIP_NEGATIVE)
+    else:
+        check_finite(path, pixels)
+        pixels, count = clip_negative(pixels)
+        clipped |= {path.name: count} if count else {}
+    try:
+        given = exr.color_space_of(exr.read_header(path).metadata) if path.suffix.lower() == ".exr" else "lin_rec709_scene"
+        converted = convert(pixels, given, space)
+    except ValueError as error:
+        raise ImageError(f"{path}: {error}") from error
+    return np.maximum(converted, 0)

@@ -1,0 +1,1 @@
+"""Image, array and point files: how each format is read and written."""

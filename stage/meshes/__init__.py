@@ -1,1 +1,0 @@
-"""Meshes of triangles: their files and their holes."""

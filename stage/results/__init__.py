@@ -1,0 +1,1 @@
+"""Result files: maps, depths, light bases and meshes, and what they record."""

@@ -1,0 +1,216 @@
+"""The image stack of a capture: a memory-mapped cache of half values, planar and light-major, which is read in pixel bands.
+
+Layout of `stack-<key>.npy`: [channel, light padded to a multiple of 8, pixel padded to a multiple of 64] half. Each light has
+a power-of-two scale of its own, so that half covers it from its brightest value down 29 stops: radiance = stored · scale[light].
+Beside it lie `stack-<key>.saturated.npy`, [light / 8, pixel] uint8, whose bit l % 8 (least significant first) is set where light l
+has no usable reading (it saturates, or alignment lost it), and the index `stack-<key>.json`, with checksums of all three. Padding is 0.
+"""
+
+import json
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stage.errors import StorageError, storage
+from stage.files import write_text
+from stage.stack import stack_checksums
+
+CHANNELS = 3
+"""Red, green and blue."""
+LIGHT_PAD = 8
+"""The count of lights is padded to this multiple, which matrix units need (docs/figures.md), and eight bits make a byte."""
+PIXEL_PAD = 64
+"""The count of pixels is padded to this multiple, so that a band divides into whole packs (32 pixels on the CPU, 4 on CUDA)."""
+BAND_BYTES = 256 << 20
+"""The bytes of the stack in one band, which bound the memory of every solver."""
+PAGE_BYTES, PICK_BYTES = 64 << 10, 64 << 20
+"""What a scattered read brings into memory, since Linux maps the 16 pages around it where they are cached, and how much of it a pick keeps
+there at one time."""
+
+
+def padded(count: int, multiple: int) -> int:
+    """Return the least multiple of `multiple` that is not below `count`."""
+    return -(-count // multiple) * multiple
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The stack of an ingested capture. Every read maps the file again, so that the pages of a finished band leave the process."""
+
+    folder: Path
+    key: str
+    frames: tuple[str, ...]
+    """The image of each light, in manifest order."""
+    scale: np.ndarray  # [lights padded] float32, radiance of a stored 1.0; 0 for padding
+    pixel_count: int
+    motion: dict[str, Any] | None = None
+    """The statistics of an aligned stack for the report, or None."""
+    clipped: dict[str, int] = field(default_factory=dict, kw_only=True)
+    """The number of pixels in which values below the noise were set to 0, by the names of the images that had any."""
+
+    @property
+    def light_count(self) -> int:
+        """The count of lights, without padding."""
+        return len(self.frames)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """The shape of the values: channels, padded count of lights, padded count of pixels."""
+        return (CHANNELS, padded(self.light_count, LIGHT_PAD), padded(self.pixel_count, PIXEL_PAD))
+
+    def bands(self, bytes_per_pixel: int = 0) -> Iterator[tuple[int, int]]:
+        """Yield pixel ranges [start, stop) that cover the padded pixel axis, each a multiple of 64 pixels.
+
+        Args:
+            bytes_per_pixel: the bytes that the caller allocates for each pixel beside the stack.
+        """
+        channels, lights, pixels = self.shape
+        per_pixel = 2 * channels * lights + bytes_per_pixel
+        step = max(PIXEL_PAD, BAND_BYTES // per_pixel // PIXEL_PAD * PIXEL_PAD)
+        for start in range(0, pixels, step):
+            yield start, min(start + step, pixels)
+
+    def band(self, start: int, stop: int) -> np.ndarray:
+        """Return the stored values of a pixel range.
+
+        Returns:
+            [3, lights padded, stop - start] float16, a view of a fresh read-only map; radiance = value · scale[light].
+
+        Raises:
+            StorageError: the cache was removed or is truncated.
+        """
+        return self._map(values_path(self.folder, self.key), self.shape)[:, :, start:stop]
+
+    def saturated(self, start: int, stop: int) -> np.ndarray:
+        """Return the saturation bits of a pixel range.
+
+        Returns:
+            [lights padded / 8, stop - start] uint8; bit l % 8 of byte l // 8 is set where light l has no usable reading.
+        """
+        path = saturated_path(self.folder, self.key)
+        shape = (self.shape[1] // 8, self.shape[2])
+        if not path.exists():
+            return np.zeros((shape[0], stop - start), dtype=np.uint8)
+        return self._map(path, shape)[:, start:stop]
+
+    def pick(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stored values and saturation bits of single pixels.
+
+        Args:
+            pixels: [n] row-major indices.
+
+        Returns:
+            [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
+        """
+        channels, lights, count = self.shape
+        values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
+        touched = max(1, min(PAGE_BYTES * len(pixels), 2 * count))
+        for number, (channel, light) in enumerate(np.ndindex(channels, lights)):
+            if number % max(1, PICK_BYTES // touched) == 0:  # scattered reads keep pages in the process as long as the map lives
+                planes = self._map(values_path(self.folder, self.key), self.shape)
+            values[channel, light] = planes[channel, light, pixels]
+        return values, self.pick_saturated(pixels)
+
+    def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radiance of single pixels, and which readings are usable.
+
+        Args:
+            pixels: [n] row-major indices.
+
+        Returns:
+            [lights, n, 3] float64 scene-linear and [lights, n] bool, without padding.
+        """
+        count = self.light_count
+        values, bits = self.pick(pixels)
+        radiance = np.moveaxis(values[:, :count].astype(np.float64), 0, -1) * self.scale[:count, None, None]
+        return radiance, np.unpackbits(bits, axis=0, bitorder="little")[:count] == 0
+
+    def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the saturation bits of single pixels.
+
+        Args:
+            pixels: [n] row-major indices.
+
+        Returns:
+            [lights padded / 8, n] uint8, a copy.
+        """
+        rows = self.shape[1] // 8
+        if not saturated_path(self.folder, self.key).exists():
+            return np.zeros((rows, len(pixels)), dtype=np.uint8)
+        return np.stack([self.saturated(0, self.shape[2])[row, pixels] for row in range(rows)])
+
+    def _map(self, path: Path, shape: tuple[int, ...]) -> np.ndarray:
+        with storage("read", path):
+            try:
+                values = np.load(path, mmap_mode="r")
+            except (ValueError, EOFError) as error:
+                raise StorageError(f"{path}: the cache is damaged: delete it and run again") from error
+        if values.shape != shape:
+            raise StorageError(f"{path}: the cache is damaged: delete it and run again")
+        return values
+
+
+def values_path(folder: Path, key: str) -> Path:
+    """Return the path of the half values of a stack."""
+    return folder / f"stack-{key}.npy"
+
+
+def saturated_path(folder: Path, key: str) -> Path:
+    """Return the path of the saturation bits of a stack; the file is absent when no reading saturates."""
+    return folder / f"stack-{key}.saturated.npy"
+
+
+def index_path(folder: Path, key: str) -> Path:
+    """Return the path of the index of a stack, which is written last: a stack without an index is incomplete."""
+    return folder / f"stack-{key}.json"
+
+
+def find(folder: Path, key: str) -> Stack | None:
+    """Return the complete and undamaged stack of a key, or None. A damaged stack is removed, so that it is made again."""
+    if not index_path(folder, key).exists():
+        return None
+    try:
+        index = json.loads(index_path(folder, key).read_text(encoding="utf-8"))
+        checksum = index.pop("checksum")
+        found = Stack(folder, key, tuple(index["frames"]), np.array(index["scale"], dtype=np.float32), int(index["pixel_count"]),
+                      index.get("motion"), clipped=index.get("clipped", {}))
+        saturated = index["checksums"]["saturated"]
+        bits = saturated_path(folder, key)
+        sound = (checksum == _checksum(index)
+                 and stack_checksums.is_sound(values_path(folder, key), found.shape, np.float16, index["checksums"]["values"])
+                 and (not bits.exists() if saturated is None else
+                      stack_checksums.is_sound(bits, (found.shape[1] // 8, found.shape[2]), np.uint8, [saturated])))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        sound = False
+    if not sound:
+        remove(folder, key)
+        return None
+    return found
+
+
+def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> None:
+    """Write the index of a stack, which completes it.
+
+    Args:
+        stack: whose values and saturation bits are in its folder.
+        values: the checksums of its planes, in the order of channels and padded lights.
+        saturated: the checksum of the saturation bits, or None where there are none.
+    """
+    index = {"frames": stack.frames, "scale": [float(scale) for scale in stack.scale], "pixel_count": stack.pixel_count,
+             "motion": stack.motion, "clipped": stack.clipped, "checksums": {"values": list(values), "saturated": saturated}}
+    write_text(index_path(stack.folder, stack.key), json.dumps(index | {"checksum": _checksum(index)}))
+
+
+def remove(folder: Path, key: str) -> None:
+    """Remove a stack from the cache, its index first, so that a partly removed stack is never found."""
+    for path in (index_path(folder, key), values_path(folder, key), saturated_path(folder, key)):
+        path.unlink(missing_ok=True)
+
+
+def _checksum(index: dict[str, Any]) -> int:
+    """Return the checksum of the content of an index."""
+    return zlib.crc32(json.dumps(index, sort_keys=True).encode())

@@ -1,0 +1,67 @@
+"""How sure the general solver is where lights are few or say little: no quiet wrong answer."""
+
+import numpy as np
+import pytest
+
+from kernels.photometric.model.candidates import rings
+from kernels.photometric.search.certainty import ring_areas
+from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.survey import CLOSE
+from kernels.photometric.svbrdf import solve_svbrdf
+from tests.kernels.photometric.test_svbrdf import COLOUR, degrees, render, sample, tilted
+from tests.kernels.scenes import cap
+from tests.reference import microfacet as twin
+
+NOISE = 0.01
+
+
+def noisy(radiance: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(11)
+    return np.maximum(radiance * (1 + NOISE * rng.normal(size=radiance.shape)), 0)
+
+
+def test_areas_of_the_rings_fill_a_cap():
+    """Together the candidates stand for the cap out to half a ring beyond the last one."""
+    areas = ring_areas(rings(*CLOSE.rings))
+    angles = CLOSE.rings[0]
+    edge = angles[-1] + (angles[-1] - angles[-2]) / 2
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(2 * np.pi * (1 - np.cos(np.radians(edge))) * np.degrees(1) ** 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [14, 10])
+def test_a_metal_under_few_lights_is_not_quietly_wrong(device, count):
+    """A pixel sees its highlight under three or four lights; the search starts 30° off, as it may after a Lambertian start on a metal.
+
+    A hundredth of the pixels may be off by more than five standard deviations and five degrees, as of every method.
+    """
+    lights = cap(count, 75.0)
+    normal = tilted(300, 60.0)
+    radiance = noisy(render(normal, albedo=np.zeros(3), alpha=0.2, f0=0.8, lights=lights))
+    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.4, -0.4, 0]), shape=Diffuse())
+    error = degrees(fit.normal, normal)
+    assert (error > 10).mean() > 0.01  # the task is hard enough to be wrong at
+    assert ((error > 10) & (fit.confidence > 0.5)).mean() < 0.005
+    assert ((error > 5 * fit.sigma) & (error > 5)).mean() <= 0.01
+
+
+def test_three_lights_are_never_sure(device):
+    """A gloss under three lights: fewer readings than unknowns, whatever normal and lobes they fit."""
+    lights = twin.unit(np.array([[0.6, 0.0, 0.8], [-0.4, 0.5, 0.8], [-0.3, -0.6, 0.75]]))
+    normal = tilted(200, 35.0)
+    radiance = noisy(render(normal, albedo=0.5 * COLOUR, alpha=0.2, f0=0.06, lights=lights))
+    fit = solve_svbrdf(sample(radiance, device, lights=lights)[0], twin.unit(normal + [0.1, 0.05, 0]), shape=Diffuse())
+    assert np.percentile(fit.confidence, 95) < 0.3
+
+
+def test_many_lights_are_as_sure_as_they_are_right(device):
+    """In the model: the median error over sigma is about one, and confidence follows."""
+    normal = tilted(200, 60.0)
+    rng = np.random.default_rng(3)
+    radiance = render(normal, alpha=0.2)
+    radiance = np.maximum(radiance * (1 + 0.03 * rng.normal(size=radiance.shape)), 0)
+    fit = solve_svbrdf(sample(radiance, device)[0], twin.unit(normal + [0.03, 0, 0]), shape=Diffuse())
+    error = degrees(fit.normal, normal)
+    assert 0.4 < np.median(error / fit.sigma) < 1.4
+    assert (error > 5 * fit.sigma).mean() < 0.01
+    assert np.median(fit.confidence) > 0.5

@@ -1,0 +1,76 @@
+"""Joint refinement on surfaces of one GGX lobe, rendered by the independent float64 model: what went in comes back."""
+
+import numpy as np
+import pytest
+
+from kernels.photometric.material.material import fit_tinted
+from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.search.refine import refine
+from kernels.photometric.svbrdf import solve_svbrdf
+from tests.kernels.photometric.test_svbrdf import VIEW, degrees, render, sample, tilted
+from tests.reference import microfacet as twin
+
+LAMBERT = Diffuse()
+GOLD = (0.9, 0.7, 0.3)
+
+
+def metal(normal: np.ndarray, roughness: float) -> np.ndarray:
+    return np.concatenate([render(normal, albedo=[0.0], alpha=roughness**2, f0=f) for f in GOLD])
+
+
+def disturbed(normal: np.ndarray, by_degrees: float) -> np.ndarray:
+    """Every normal tilted by this angle, each towards an azimuth of its own."""
+    azimuth = np.linspace(0, 40, len(normal))
+    across = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(len(normal))], axis=1)
+    across -= (across * normal).sum(axis=1, keepdims=True) * normal
+    return twin.unit(np.cos(np.radians(by_degrees)) * normal + np.sin(np.radians(by_degrees)) * twin.unit(across))
+
+
+@pytest.mark.parametrize("roughness", [0.35, 0.5, 0.7])
+def test_metals_come_back(device, roughness):
+    """From 2° off and a roughness of 0.08 off; tolerance: half rounding of the readings, and derivatives by differences."""
+    normal = tilted(61, 40.0)
+    found = refine(sample(metal(normal, roughness), device)[0], disturbed(normal, 2.0), np.full(61, roughness + 0.08), shape=LAMBERT)
+    assert np.median(degrees(found.normal, normal)) < 0.03
+    assert np.percentile(degrees(found.normal, normal), 90) < 0.3
+    np.testing.assert_allclose(np.median(found.roughness), roughness, atol=0.003)
+
+
+@pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.5, -0.1)])
+def test_dielectrics_come_back(device, rough, slope):
+    """Albedo, F0 and the diffuse shape beside the lobe; tolerance as above, the lobe being faint."""
+    normal = tilted(50, 45.0)
+    shape = Diffuse(rough=-1.0 if rough is None else rough, slope=slope)
+    samples, _ = sample(render(normal, alpha=0.2, f0=0.05, rough=rough, slope=slope), device)
+    found = refine(samples, disturbed(normal, 1.0), np.full(50, 0.5), shape=shape)
+    assert np.median(degrees(found.normal, normal)) < 0.05
+    np.testing.assert_allclose(np.median(found.roughness), np.sqrt(0.2), atol=0.01)
+
+
+def test_cost_never_rises(device):
+    """On readings that no model explains, and on dark and one-light pixels: finite, unit, facing the viewer, no dearer than the start."""
+    rng = np.random.default_rng(9)
+    normal = tilted(45, 70.0)
+    radiance = render(normal) * rng.uniform(0, 2, size=(3, 48, 45))
+    radiance[:, :, 3] = 0
+    radiance[:, 1:, 7] = 0
+    samples, _ = sample(radiance, device)
+    start = fit_tinted(samples, normal, shape=LAMBERT)
+    found = refine(samples, normal, start.roughness, shape=LAMBERT)
+    assert all(np.isfinite(values).all() for values in found)
+    np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1, atol=1e-5)
+    assert ((found.normal * VIEW).sum(axis=1) > 0).all()
+    # the linear fit starts afresh, so a start of many minima may be met a little off: the medians must not rise
+    assert np.median(found.cost - start.cost) <= 0
+
+
+def test_the_single_lobe_takes_over_on_metals_only(device):
+    """The whole solver is sharper than its lobes on a metal, and keeps to the mixture where that explains more: two lobes in one pixel."""
+    normal = tilted(40, 40.0)
+    start = disturbed(normal, 3.0)
+    brass = solve_svbrdf(sample(metal(normal, 0.45), device)[0], start, shape=LAMBERT)
+    assert np.median(degrees(brass.normal, normal)) < 0.05
+    mixed = render(normal, alpha=0.1, f0=0.03) + render(normal, alpha=0.5, f0=0.2) * 0.5
+    both = solve_svbrdf(sample(mixed, device)[0], start, shape=LAMBERT)
+    alone = refine(sample(mixed, device)[0], start, np.full(40, 0.5), shape=LAMBERT)
+    assert np.median(degrees(both.normal, normal)) <= np.median(degrees(alone.normal, normal)) + 0.02

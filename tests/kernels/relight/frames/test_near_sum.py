@@ -1,0 +1,172 @@
+"""Sums of images for near light: against a twin that tries all triangles, against the weighting of far light, and against the model."""
+
+import numpy as np
+import pytest
+
+from kernels import packs
+from kernels.errors import ArrayError
+from kernels.relight.frames.near_sum import sum_near
+from kernels.relight.model import sources
+from kernels.relight.model.captured import Captured
+from service.relight.weights.triangulation import triangles_between, triangulate_sphere
+from service.relight.weights.weighting import Weighting, integrate_discs
+from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
+from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, stored, upload
+from tests.kernels.scenes import HALF_ROUNDING, cap, colours, store
+from tests.reference import shading as reference
+
+SHARE = 5e-6
+"""Shares come from float32 directions and planes; lights here are 0.1 rad apart or more."""
+LIGHTS = cap(20, 180)
+NEAR = {
+    "point": sources.point(np.array([0.3, -0.4, 1.2]), np.array([1, 2, 3.0])),
+    "behind": sources.point(np.array([-0.3, 0.4, -1.2]), np.array([1, 2, 3.0])),
+    "spot": sources.point(np.array([0.5, 0.4, 1.2]), np.array([3, 2, 1.0]), np.array([-0.36, -0.48, -0.8]), 3.0),
+    "sphere": sources.sphere(np.array([-0.8, 0.5, 0.6]), 0.3, np.array([1, 2, 3.0]), sources.FEW),
+    "rectangle": sources.rectangle(np.array([0.2, -0.6, 1.0]), np.array([0.8, 0, 0]), np.array([0, 0.5, 0]), np.ones(3), sources.FEW),
+    "far": sources.far(scattered(30, 3), np.random.default_rng(3).random((30, 3))),
+}
+ALL = sources.join(list(NEAR.values()))
+
+
+def summed(pixels, readings, given, lights, device, *, visible=None, irradiance=None):
+    """[6, P] of sum_near, and the readings that its band holds."""
+    irradiance = 3 * colours(len(lights), seed=4) if irradiance is None else irradiance
+    stack, scale, held = stored(readings, irradiance)
+    visible = np.full((len(lights), len(pixels.normal)), 255, np.uint8) if visible is None else visible
+    got = sum_near(Captured.of(packs.upload(stack, device=device), upload(pixels, device), pack_bytes(visible, device), lights, irradiance,
+                               scale), given, triangles_between(lights))
+    return got.numpy()[:, : len(pixels.normal)], held
+
+
+def images(lights, count, seed=0):
+    return np.random.default_rng(seed).uniform(0.1, 1, (len(lights), 3, count))
+
+
+def scene(count=45, seed=0):
+    """Pixels, images and what the pixels see of the lights, all unrelated."""
+    visible = np.random.default_rng(seed).choice(np.array([0, 100, 255], np.uint8), (len(LIGHTS), count))
+    return scattered_pixels(count, seed), images(LIGHTS, count, seed), visible
+
+
+@pytest.mark.parametrize("given", [*NEAR.values(), ALL], ids=[*NEAR, "all"])
+@pytest.mark.parametrize("count", [1, 45])
+def test_it_is_the_twin(given, count, device):
+    pixels, readings, visible = scene(count)
+    got, held = summed(pixels, readings, given, LIGHTS, device, visible=visible)
+    expected, weights = reference.sum_near(held, pixels, given, LIGHTS)
+    total = weights.sum(axis=0)  # shares sum to one: all that arrives; each share is off by SHARE of it, and float32 sums by some FLOAT
+    each = 3 * SHARE + (given.count + len(LIGHTS)) * FLOAT
+    assert (np.abs(got[:3] - expected) <= each * total * held.max(axis=0)).all()
+    model = reference.readings(pixels, LIGHTS, visible)
+    expected = (weights * model).sum(axis=0)
+    assert (np.abs(got[3:] - expected) <= each * total * model.max(axis=0) + LOBE * expected).all()
+    assert count == 1 or expected.max() > 0.001
+
+
+def test_packs_of_four_are_packs_of_more(monkeypatch):
+    """As CUDA takes them, on the CPU."""
+    pixels, readings, visible = scene(30)
+    expected, _ = summed(pixels, readings, ALL, LIGHTS, "cpu", visible=visible)
+    monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
+    got, _ = summed(pixels, readings, ALL, LIGHTS, "cpu", visible=visible)
+    np.testing.assert_allclose(got, expected, rtol=1e-4)  # other orders of float32 operations, in lobes too
+
+
+LAYOUTS = {"octahedron": AXES, "icosahedron": icosahedron() @ turn(0).T, "even": LIGHTS, "many": cap(150, 180), "any": scattered(40, 2),
+           "cube": CUBE, "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "half": cap(96, 90),
+           "dome": np.concatenate([AXES[[1]], *(ring(12, e) for e in (0, 30, 60))])}
+
+
+@pytest.mark.parametrize("direction", LAYOUTS.values(), ids=LAYOUTS)
+def test_a_light_far_away_is_shared_out_as_smooth_weighting_does(direction, device):
+    """As a near light a million away and as a far one; in polygons and, below a dome, in holes too. Tolerance: SHARE, the pixels'
+    places, a millionth of the distance, and the thousandth of an imaginary light that goes to others."""
+    holes = len(triangulate_sphere(direction).vertex) > len(direction)
+    pixels, readings, toward = scattered_pixels(3), images(direction, 3, seed=2), scattered(14, 6)
+    shares = integrate_discs(toward, np.zeros(14), direction, weighting=Weighting.SMOOTH)
+    for i, share in enumerate(shares):
+        given = (sources.point(1e6 * toward[i], 1e12 * np.array([1, 2, 3])) if i % 2 else
+                 sources.far(toward[[i]], np.array([[1, 2, 3.0]])))
+        got, held = summed(pixels, readings, given, direction, device)
+        expected = np.einsum("l,lcp,c->cp", share, held, [1, 2, 3])
+        np.testing.assert_allclose(got[:3], expected, rtol=2e-3 if holes else 2e-5)
+
+
+def test_a_sample_from_a_captured_light_is_its_image(device):
+    pixels, readings, _ = scene(40)
+    for light in (0, 7, 19):
+        got, held = summed(pixels, readings, sources.far(LIGHTS[[light]], np.ones((1, 3))), LIGHTS, device)
+        np.testing.assert_allclose(got[:3], held[light], rtol=10 * SHARE)  # of the next lights, whose images are at most ten times brighter
+
+
+@pytest.mark.parametrize("given", [*NEAR.values()], ids=[*NEAR])
+def test_images_that_are_the_model_sum_to_the_model(given, device):
+    pixels, _, visible = scene(45)
+    model = reference.readings(pixels, LIGHTS, visible)
+    got, _ = summed(pixels, model, given, LIGHTS, device, visible=visible)
+    # half rounding of the images, and the steps of halves below the normal range, of readings above 1 / 8 of a stored value
+    np.testing.assert_allclose(got[:3], got[3:], rtol=HALF_ROUNDING + LOBE, atol=1e-5)
+
+
+def test_visibility_darkens_the_model_and_not_the_images(device):
+    pixels, readings, _ = scene(40)
+    seen, _ = summed(pixels, readings, ALL, LIGHTS, device)
+    hidden, _ = summed(pixels, readings, ALL, LIGHTS, device, visible=np.zeros((len(LIGHTS), 40), np.uint8))
+    np.testing.assert_array_equal(hidden[:3], seen[:3])
+    assert (hidden[3:] == 0).all() and seen[3:].min() > 0
+
+
+def test_one_image_bright_shows_what_of_the_light_it_gets(device):
+    """Every pixel sees a near light elsewhere: from under it the light is at the zenith, from beside it is not."""
+    pixels = scattered_pixels(2)._replace(position=np.float32([[0, 0, 0], [-2, 0, 0]]))
+    readings = np.zeros((6, 3, 2))
+    readings[AXES.argmax(axis=0)[2]] = 1  # of the light at +z
+    got, _ = summed(pixels, readings, sources.point(np.array([0, 0, 2.0]), np.ones(3)), AXES, device, irradiance=np.ones((6, 3)))
+    np.testing.assert_allclose(got[:3, 0], 1 / 4, rtol=2 * SHARE)
+    np.testing.assert_allclose(got[:3, 1], 0.5 / 8, rtol=2 * SHARE)  # half way between +x and +z, d² = 8
+
+
+def test_light_adds_up(device):
+    pixels, readings, visible = scene(40)
+    parts = [summed(pixels, readings, given, LIGHTS, device, visible=visible)[0].astype(float) for given in NEAR.values()]
+    got, _ = summed(pixels, readings, ALL, LIGHTS, device, visible=visible)
+    np.testing.assert_allclose(got, sum(parts), rtol=(ALL.count + len(LIGHTS)) * FLOAT)  # float32 sums in another order
+
+
+def test_no_light_is_black(device):
+    pixels, readings, _ = scene(40)
+    assert (summed(pixels, readings, sources.far(np.zeros((0, 3)), np.zeros((0, 3))), LIGHTS, device)[0] == 0).all()
+
+
+def test_of_lights_in_one_place_the_first_is_taken(device):
+    pixels, readings, _ = scene(40)
+    twice, both = np.repeat(LIGHTS, 2, axis=0), np.repeat(readings, 2, axis=0)
+    both[1::2] = 100
+    irradiance = np.ones((40, 3))
+    got, _ = summed(pixels, both, NEAR["sphere"], twice, device, irradiance=irradiance)
+    expected, _ = summed(pixels, readings, NEAR["sphere"], LIGHTS, device, irradiance=irradiance[:20])
+    np.testing.assert_allclose(got, expected, rtol=64 * FLOAT)  # float32 sums over twice as many
+
+
+def call(device, *, pixels=40, band_pixels=40, seen=(20, 40), lights=LIGHTS, stack_lights=20, channels=3, irradiance=None):
+    stack = store(np.ones((channels, stack_lights, band_pixels)))
+    irradiance = np.ones((len(lights), 3)) if irradiance is None else irradiance
+    return sum_near(Captured.of(packs.upload(stack, device=device), upload(scattered_pixels(pixels), device),
+                                pack_bytes(np.full(seen, 255, np.uint8), device), lights, irradiance, np.ones(24, np.float32)),
+                    NEAR["point"], triangles_between(LIGHTS))
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"channels": 1}, "the band has 1 channels, expected 3"),
+    ({"band_pixels": 200}, "band has .* packs of 24 lights, the surface .*: give the"),
+    ({"pixels": 200, "band_pixels": 200}, "give the same pixels and lights"),
+    ({"seen": (19, 40)}, "give the same pixels and lights"),
+    ({"stack_lights": 8}, "packs of 8 lights, .* directions are 20: give the same"),
+    ({"irradiance": np.where(np.arange(60).reshape(20, 3) == 16, 0, 1.0)}, "irradiance of light 5 is 0 in channel G"),
+    ({"irradiance": np.where(np.arange(60).reshape(20, 3) == 2, np.nan, 1.0)}, "irradiance of light 0"),
+])
+def test_bad_calls_are_refused(change, message, device):
+    call(device)
+    with pytest.raises(ArrayError, match=message):
+        call(device, **change)

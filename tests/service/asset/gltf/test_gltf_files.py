@@ -1,0 +1,71 @@
+"""The .glb as a file: the same every time, written whole or not at all, and read with care."""
+
+import dataclasses
+import errno
+
+import pytest
+
+from service.asset.gltf import container, materials
+from service.asset.gltf.asset import write_asset
+from service.asset.gltf.container import read_glb
+from service.errors import AssetError
+from stage.errors import StorageError
+from tests.service.asset.gltf.surfaces import SURFACES
+from tests.service.full_disk import files_of_at_most
+
+
+def test_the_same_maps_give_the_same_bytes(tmp_path):
+    one, two = (write_asset(SURFACES["everything"], tmp_path / folder / "a.glb", name="A").path.read_bytes() for folder in ("1", "2"))
+    assert one == two
+
+
+@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
+def test_full_disk_in_a_texture_leaves_no_trace(older, tmp_path, monkeypatch):
+    target = tmp_path / "a.glb"
+    if older:
+        write_asset(SURFACES["diffuse only"], target, name="A")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    written = materials.write_png
+
+    def fail(path, codes, *, srgb):
+        if path.name == "normal.png":  # the last
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written(path, codes, srgb=srgb)
+
+    monkeypatch.setattr(materials, "write_png", fail)
+    with pytest.raises(StorageError, match="no space left on device") as raised:
+        write_asset(SURFACES["everything"], target, name="A")
+    assert str(target) in str(raised.value)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_disk_that_really_refuses(tmp_path):
+    whole = write_asset(SURFACES["everything"], tmp_path / "whole.glb", name="A").path
+    target = tmp_path / "out" / "a.glb"
+    with files_of_at_most(whole.stat().st_size - 100), pytest.raises(StorageError, match=f"cannot write {target}: "):
+        write_asset(SURFACES["everything"], target, name="A")
+    assert list(target.parent.iterdir()) == []
+
+
+def test_more_than_the_header_can_say_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(container, "MAX_FILE_BYTES", 1000)
+    with pytest.raises(AssetError, match="4 GiB"):
+        write_asset(SURFACES["everything"], tmp_path / "a.glb", name="A")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_maps_without_height_leave_nothing(tmp_path):
+    with pytest.raises(AssetError, match="height"):
+        write_asset(dataclasses.replace(SURFACES["everything"], height=None), tmp_path / "a.glb", name="A")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage, sentence", [
+    (lambda data: data[:40], "is cut off"), (lambda data: b"PK" + data[2:], "is not a .glb file"), (lambda data: data[:7], "is not a .glb"),
+    (lambda data: data[:4] + b"\x01" + data[5:], "version 2"), (lambda data: data[:20] + b"]" + data[21:], "no glTF document")])
+def test_damaged_files_are_refused(damage, sentence, tmp_path):
+    path = write_asset(SURFACES["2x2"], tmp_path / "a.glb", name="A").path
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(AssetError, match=sentence) as raised:
+        read_glb(path)
+    assert str(path) in str(raised.value)

@@ -1,0 +1,125 @@
+"""The findings of relit inspect about a .glb, and about damaged ones."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from service.asset.content.mesh import height_mesh
+from service.asset.gltf.asset import write_asset, write_depth
+from service.asset.gltf.inspect import inspect_glb
+from service.errors import AssetError
+from service.requests.export import Geometry
+from stage.capture.camera import Camera
+from stage.results.depth_maps import DepthMaps
+from tests.scenes.surfaces import make_ball
+
+
+def written(tmp_path, **changes):
+    ball = make_ball(specular=np.full((24, 24, 3), 0.08, np.float32), **changes)
+    return write_asset(ball, tmp_path / "ball.glb", name="Eule – 梟", version="v003").path
+
+
+def chunks(path):
+    """The document of a file, and what follows it."""
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20:20 + length]), data[20 + length:]
+
+
+def with_document(path, text, rest=b""):
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest)
+    return path
+
+
+def rewritten(path, change):
+    """The same file after a change of its document."""
+    document, rest = chunks(path)
+    change(document)
+    return with_document(path, json.dumps(document).encode(), rest)
+
+
+def test_facts(tmp_path):
+    path, mesh = written(tmp_path), height_mesh(make_ball())
+    found = inspect_glb(path)
+    assert found.size_bytes == path.stat().st_size and (found.errors, found.warnings) == ((), ())
+    info = found.facts["asset_info"]
+    assert (info["identifier"], info["version"], info["glTF"]) == ("ball.glb", "v003", "2.0")
+    assert found.facts["extensions"] == ["KHR_materials_ior"] and found.provenance["relit:method"] == "svbrdf"
+    surface, material, *textures, camera = found.parts
+    assert surface[:2] == ("mesh", "Eule – 梟") and surface.facts["vertices"] == len(mesh.points)
+    assert surface.facts["faces"] == 2 * len(mesh.quads) + len(mesh.triangles) and surface.facts["material"] == "Eule – 梟"
+    assert set(surface.facts["attributes"]) == {"POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"}
+    np.testing.assert_allclose([surface.facts["low"], surface.facts["high"]], mesh.extent, atol=1e-6)
+    assert {part.name.split()[-1]: (part.facts["resolution"], part.facts["channels"], part.facts["depth"]) for part in textures} == {
+        "baseColorTexture": ([24, 24], 3, "uint8"), "metallicRoughnessTexture": ([24, 24], 3, "uint16"),
+        "normalTexture": ([24, 24], 3, "uint16")}
+    assert material.facts["doubleSided"] is True and material.facts["KHR_materials_ior.ior"] > 1.5
+    assert camera.facts == {"orthographic_m": pytest.approx([0.2, 0.2], rel=0.05)}
+
+
+def test_points(tmp_path):
+    camera = Camera(projection="perspective", resolution=(4, 4), focal_px=(4.0, 4.0))
+    depth = DepthMaps(camera=camera, mask=np.ones((4, 4), bool), depth=np.ones((4, 4), np.float32))
+    write_depth(depth, None, tmp_path / "a.glb", name="A", geometry=Geometry.POINTS)
+    points, material, lens = inspect_glb(tmp_path / "a.glb").parts
+    assert points.kind == "points" and points.facts["vertices"] == 16 and "faces" not in points.facts
+    assert material.facts["KHR_materials_unlit"] is True
+    assert lens.facts["degrees_high"] == pytest.approx(2 * np.degrees(np.arctan(0.5)))
+
+
+@pytest.mark.parametrize("change, sentence", [
+    (lambda document: document["accessors"][0].update(count=10**6), "accessor 0 reaches beyond its bufferView"),
+    (lambda document: document["bufferViews"][2].update(byteLength=10**8), "bufferView 2 reaches beyond"),
+    (lambda document: document["nodes"][0].update(children=[7]), "node 7"),
+    (lambda document: document["nodes"][1].update(mesh=5), "mesh 5"),
+    (lambda document: document["nodes"][1].update(children=[0]), "no tree"),
+    (lambda document: document["buffers"][0].update(uri="none.bin"), "none.bin is not there")])
+def test_references_beyond_the_file_are_errors(change, sentence, tmp_path):
+    assert any(sentence in error for error in inspect_glb(rewritten(written(tmp_path), change)).errors)
+
+
+@pytest.mark.parametrize("change", [lambda document: document["meshes"][0]["primitives"][0].update(material=3),
+                                    lambda document: document["accessors"][0].update(componentType=99)])
+def test_a_document_that_refers_to_nothing_is_refused(change, tmp_path):
+    path = rewritten(written(tmp_path), change)
+    with pytest.raises(AssetError, match="is damaged") as raised:
+        inspect_glb(path)
+    assert str(path) in str(raised.value)
+
+
+def test_a_file_outside_is_a_warning(tmp_path):
+    (tmp_path / "a b.bin").write_bytes(bytes(100))
+    path = rewritten(written(tmp_path), lambda document: document["buffers"].append({"uri": "a%20b.bin", "byteLength": 100}))
+    found = inspect_glb(path)
+    assert found.errors == () and "a b.bin, which lies outside of it" in found.warnings[0]
+    assert found.size_bytes == path.stat().st_size + 100
+
+
+@pytest.mark.parametrize(("place", "value", "words"), [
+    (8, 10**4, "the header says that the file has 10000 bytes"), ("chunk", 10**9, "1000000000 bytes"), ("kind", b"ZIP\0", "ZIP")])
+def test_false_lengths_are_errors(place, value, words, tmp_path):
+    path = written(tmp_path)
+    data = bytearray(path.read_bytes())
+    chunk = 20 + struct.unpack_from("<I", data, 12)[0]
+    begin = {"chunk": chunk, "kind": chunk + 4}.get(place, place)
+    data[begin:begin + 4] = value if isinstance(value, bytes) else struct.pack("<I", value)
+    path.write_bytes(data)
+    assert any(words in error for error in inspect_glb(path).errors)
+
+
+def test_brackets_without_end_are_one_sentence(relit, tmp_path):
+    path = with_document(tmp_path / "deep.glb", b"[" * 500_000)
+    outcome = relit("inspect", path)
+    assert (outcome.code, outcome.out) == (2, "") and "deep.glb" in outcome.err and outcome.err.count("\n") == 1
+
+
+def test_the_command_prints_facts_and_json(relit, tmp_path):
+    path = written(tmp_path)
+    printed = relit("inspect", path).out
+    assert "metallicRoughnessTexture: file metallic_roughness, bytes" in printed
+    assert "resolution (24, 24), channels 3, depth uint16" in printed
+    outcome = relit("inspect", "--json", path)
+    assert outcome.code == 0 and json.loads(outcome.out)["parts"] == [part._asdict() for part in inspect_glb(path).parts]

@@ -1,0 +1,146 @@
+"""Mirror ball: lights found in images rendered by an independent ray caster, and images in which there is none."""
+
+import numpy as np
+import pytest
+
+from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot, reflect
+from service.light_estimation.ball import Ball, project, view_ball
+from service.light_estimation.ball_outline import ball_from_mask
+from stage.errors import CalibrationError
+from tests.reference.balls import mirror_of_far, render
+from tests.scenes.captures import angles_degrees
+from tests.service.calibrate.solvers.balls import HEIGHT, SCENES, WIDTH, box, spread, unit
+
+
+def seen(shade, geometry, samples=8):
+    return render(shade, width=WIDTH, height=HEIGHT, samples=samples, **geometry)
+
+
+def exact(name):
+    """The true ball, for tests of the spot alone."""
+    camera, geometry = SCENES[name]
+    ball = Ball(geometry["centre"], geometry["radius"], True, 60.0, 0.0)
+    return ball, view_ball(ball, camera), geometry
+
+
+def test_reflection_is_about_the_normal():
+    light = unit(0.3, -0.5, 0.4)
+    viewer = unit(0, 0, 1)
+    half = unit(*(light + viewer))
+    np.testing.assert_allclose(reflect(viewer, half), light, atol=1e-15)
+    assert angles_degrees(half, light) == pytest.approx(angles_degrees(light, viewer) / 2)  # the normal is half way, no more
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_directions_in_front(name):
+    """A 60 px ball: 1 px is 1.9° of reflection. A spot of a dozen pixels has its centroid to 0.03 px, the outline's centre
+    from an anti-aliased mask is known to 0.02 px: together under 0.1°. Where the spot is half way to the rim, twice that."""
+    camera, geometry = SCENES[name]
+    _, mask = seen(mirror_of_far(unit(0, 0, 1)), geometry)
+    ball = ball_from_mask(camera, mask)
+    view = view_ball(ball, camera)
+    for direction in spread(8, 0.2):
+        image, _ = seen(mirror_of_far(direction), geometry)
+        spot = find_spot(box(image, view), None, ball, view)
+        assert angles_degrees(spot.direction, direction) < 0.1
+        assert spot.flags == ()
+        assert spot.uncertainty_degrees < 0.35
+        assert spot.spot_degrees == pytest.approx(1.5 * np.sqrt(2), rel=0.45)  # a lobe of 1.5° a side, cut at its foot
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_directions_behind(name):
+    """Towards the rim the ball shows more of the world in each pixel: at 115° from the view axis 1 px is 3.5°."""
+    ball, view, geometry = exact(name)
+    for direction in spread(8, -0.5)[4:]:
+        image, _ = seen(mirror_of_far(direction), geometry)
+        spot = find_spot(box(image, view), None, ball, view)
+        assert angles_degrees(spot.direction, direction) < max(0.1, spot.uncertainty_degrees)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_saturated_spot_with_noise(name):
+    """Clipped four times over: the centroid of the plateau and its foot. The plateau's edge is quantised: 0.2°."""
+    ball, view, geometry = exact(name)
+    rng = np.random.default_rng(2)
+    for direction in spread(5, 0.3):
+        image, _ = seen(mirror_of_far(direction, degrees=3), geometry)
+        image = np.clip(4 * image / image.max() + 0.003 * rng.standard_normal(image.shape), 0, 1)
+        radiance = box(image, view)
+        spot = find_spot(radiance, radiance[..., 0] >= 1, ball, view)
+        assert angles_degrees(spot.direction, direction) < 0.2
+        assert spot.flags == ()
+
+
+def test_the_centroid_lies_on_the_ball_where_the_spot_is():
+    ball, view, geometry = exact("perspective")
+    direction = unit(0.4, 0.3, 0.8)
+    image, _ = seen(mirror_of_far(direction), geometry)
+    spot = find_spot(box(image, view), None, ball, view)
+    assert np.linalg.norm(spot.point - ball.centre) == pytest.approx(ball.radius)
+    assert np.hypot(*(np.array(project(SCENES["perspective"][0], spot.point)) - spot.uv)) < 0.02
+    peak = np.unravel_index(np.argmax(image), image.shape)
+    assert np.abs(spot.uv - [peak[1] + 0.5, peak[0] + 0.5]).max() < 1
+
+
+def test_the_noise_of_a_ball_is_no_part_of_the_spot():
+    """With a level under the noise the spot would grow over the ball: the floor rises to what noise does not reach."""
+    ball, view, geometry = exact("orthographic")
+    direction = unit(0.2, 0.1, 1)
+    image, _ = seen(mirror_of_far(direction, degrees=3, floor=0.05), geometry)
+    noisy = image + 0.02 * np.random.default_rng(3).standard_normal(image.shape)
+    spot = find_spot(box(noisy, view), None, ball, view, SpotOptions(level=0.01))
+    assert spot.pixels < 60 and angles_degrees(spot.direction, direction) < 0.2
+
+
+def test_a_second_light_is_flagged():
+    ball, view, geometry = exact("orthographic")
+    one, other = unit(0.5, 0, 1), unit(-0.5, 0.2, 1)
+    for strength, flags in ((0.7, ("several spots",)), (0.2, ())):
+        image = seen(mirror_of_far(one), geometry)[0] + strength * seen(mirror_of_far(other), geometry)[0]
+        spot = find_spot(box(image, view), None, ball, view)
+        assert angles_degrees(spot.direction, one) < 0.2 and spot.flags == flags
+
+
+def test_of_two_saturated_spots_the_larger_is_the_light():
+    ball, view, geometry = exact("orthographic")
+    small, large = unit(0.5, 0, 1), unit(-0.5, 0.2, 1)
+    image = np.minimum(5 * seen(mirror_of_far(small, degrees=1), geometry)[0]
+                       + 5 * seen(mirror_of_far(large, degrees=4), geometry)[0], 1)
+    radiance = box(image, view)
+    assert angles_degrees(find_spot(radiance, radiance[..., 0] >= 1, ball, view).direction, large) < 0.3
+
+
+def test_flags_of_an_unsure_light():
+    ball, view, geometry = exact("orthographic")
+    behind = unit(0.8, 0, -0.95)  # 140 degrees from the view axis
+    image, _ = seen(mirror_of_far(behind, degrees=3), geometry)
+    assert "near the rim" in find_spot(box(image, view), None, ball, view).flags
+    image, _ = seen(mirror_of_far(unit(0.3, 0.1, 1), degrees=0.2), geometry)
+    assert "small spot" in find_spot(box(image, view), None, ball, view).flags
+
+
+def test_no_light():
+    ball, view, _ = exact("orthographic")
+    rng = np.random.default_rng(4)
+    h, w = view.inside.shape
+    for image in (np.zeros((h, w, 3)), np.full((h, w, 3), 0.3), 0.1 + 0.01 * rng.standard_normal((h, w, 3))):
+        with pytest.raises(CalibrationError, match="no bright spot"):
+            find_spot(image, None, ball, view)
+
+
+def test_a_spot_that_drowns_the_ball():
+    ball, view, geometry = exact("orthographic")
+    image, _ = seen(mirror_of_far(unit(0, 0, 1), degrees=60, floor=0.001), geometry)
+    with pytest.raises(CalibrationError, match=r"covers \d+% of the ball|no bright spot"):
+        find_spot(box(image, view), None, ball, view)
+    image, _ = seen(mirror_of_far(unit(0.3, 0, 1), degrees=25), geometry)
+    with pytest.raises(CalibrationError, match=r"covers \d+% of the ball: shorten the exposure"):
+        find_spot(box(image, view), None, ball, view)
+
+
+def test_a_light_behind_the_object():
+    ball, view, geometry = exact("orthographic")
+    image, _ = seen(mirror_of_far(unit(0.25, 0, -1), degrees=4), geometry)
+    with pytest.raises(CalibrationError, match="at the rim of the ball"):
+        find_spot(box(image, view), None, ball, view)

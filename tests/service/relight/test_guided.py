@@ -1,0 +1,139 @@
+"""relit relight --maps: guided by a model, nearer to the truth than the plain sum, and never away from it."""
+
+import numpy as np
+import pytest
+
+from service.reporting.provenance import HASHING
+from stage.formats import exr
+from stage.stack.ingest import LAYOUT
+from tests.scenes.captures import write_exr
+from tests.scenes.glossy import dome, lat_long, reflect, write_dome, write_maps
+
+SURFACE = dome()
+MIDDLE = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Capture, maps, an environment with a small sun that is no captured light, and the dome under it by the twin."""
+    folder = tmp_path_factory.mktemp("guided")
+    write_dome(folder / "cap", SURFACE)
+    write_maps(folder / "maps", SURFACE)
+    directions, solid_angle = lat_long(48)
+    sky = np.where((directions @ MIDDLE > np.cos(np.radians(4.0)))[..., None], [60.0, 50.0, 40.0], 0.1)
+    write_exr(folder / "sky.exr", sky)
+    sky = sky.astype(np.float32).astype(np.float64)  # as the file has it
+    truth = np.zeros((*SURFACE.mask.shape, 3))
+    for row in range(len(sky)):
+        lit = reflect(SURFACE.normal[:, :, None], directions[row])  # [rows, cols, texels, 3]
+        truth += np.einsum("rctk,tk->rck", lit, sky[row] * solid_angle[row])
+    return folder, truth * SURFACE.mask[..., None]
+
+
+def rgb(path, layer=""):
+    channels, _ = exr.read(path)
+    return np.stack([channels[layer + c].astype(np.float64) for c in "RGB"], axis=-1)
+
+
+def rmse(ours, truth):
+    inside = SURFACE.mask
+    return np.sqrt(((ours - truth)[inside] ** 2).mean() / (truth[inside] ** 2).mean())
+
+
+def relight(relit, folder, out, *options):
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", out / "f.#.exr", *options)
+    assert (outcome.code, outcome.err) == (0, "")
+    return rgb(out / "f.1.exr")
+
+
+def test_true_maps_make_up_for_what_lies_between_lights(relit, scene, tmp_path):
+    """Plain weights are off by the spread of the sun over 30° between lights; what guided ones leave is the widening of the
+    lobe to what such lights can tell, and 1024 samples of the map."""
+    folder, truth = scene
+    plain = rmse(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
+    kernel = rmse(relight(relit, folder, tmp_path / "b"), truth)
+    guided = rmse(relight(relit, folder, tmp_path / "c", "--maps", folder / "maps"), truth)
+    assert guided < 0.5 * min(plain, kernel)
+
+
+@pytest.mark.parametrize("wrong", ["normals", "gloss"])
+def test_wrong_maps_do_no_harm(relit, scene, tmp_path, wrong):
+    """Normals turned away, or a bright narrow lobe that no light saw: β and the widest lobe keep the result near the plain sum's."""
+    folder, truth = scene
+    if wrong == "normals":
+        turned = SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)
+        maps = write_maps(tmp_path / "maps", SURFACE, normal=turned.astype(np.float32))
+    else:
+        shape = SURFACE.mask.shape
+        maps = write_maps(tmp_path / "maps", SURFACE, specular=np.full((*shape, 3), 0.9), roughness=np.full(shape, 0.12))
+    plain = rmse(relight(relit, folder, tmp_path / "a", "--weights", "smooth"), truth)
+    guided = rmse(relight(relit, folder, tmp_path / "b", "--maps", maps), truth)
+    assert guided < 1.1 * plain
+
+
+def test_diffuse_and_specular_add_up_to_the_beauty(relit, scene, tmp_path):
+    """To the rounding of three half values; and the specular layer is that of the twin, widened as guided lobes are."""
+    folder, truth = scene
+    beauty = relight(relit, folder, tmp_path, "--maps", folder / "maps", "--aov", "diffuse,specular,normal,mask,confidence")
+    diffuse, specular = (rgb(tmp_path / "f.1.exr", layer) for layer in ("diffuse.", "specular."))
+    np.testing.assert_allclose(diffuse + specular, beauty, rtol=2e-3, atol=1e-6)
+    assert (specular >= 0).all() and (specular <= beauty * 1.001).all() and specular[SURFACE.mask].min() > 0
+    assert specular[SURFACE.mask].mean() < 0.5 * truth[SURFACE.mask].mean()
+
+
+def test_guided_frames_are_known_again(relit, scene, tmp_path):
+    folder, _ = scene
+    relight(relit, folder, tmp_path, "--maps", folder / "maps")
+    again = "relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr"
+    assert "skipped  1 of 1" in relit(*again, "--maps", folder / "maps").out
+    assert "skipped" not in relit(*again, "--weights", "smooth").out
+
+
+def test_bad_maps_are_a_sentence(relit, scene, tmp_path):
+    folder, _ = scene
+    for name, changes, words in (("height", {"height": None}, "has no layer height"),
+                                 ("space", {"color_space": "lin_ap1_scene"}, "solve it again")):
+        maps = write_maps(tmp_path / name, SURFACE, **changes)
+        outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+        assert outcome.code == 2 and outcome.err.count("\n") == 1 and words in outcome.err and str(maps) in outcome.err
+        assert not (tmp_path / "f.1.exr").exists()
+
+
+def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, tmp_path, monkeypatch):
+    """Frames of a range that are made later, among others, are the same: plain in all weightings, and guided."""
+    monkeypatch.setattr("kernels.relight.directions.latlong.SAMPLE_PITCH_DEGREES", 4.0)  # bits are compared: few samples show it as well
+    folder, _ = scene
+    for options in ((), ("--weights", "cells"), ("--weights", "smooth"), ("--maps", folder / "maps")):
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        words = ("relight", folder / "cap", "--environment", folder / "sky.exr", "--frames", "1-40", "--spin-degrees", "360", *options)
+        relit(*words, "--out", out / "f.##.exr")
+        whole = {path.name: rgb(path) for path in out.iterdir()}
+        for number in (2, 3, 7, 20, 21, 33, 40):
+            (out / f"f.{number:02d}.exr").unlink()
+        assert "skipped  33 of 40" in relit(*words, "--out", out / "f.##.exr").out
+        assert all(np.array_equal(rgb(out / name), pixels) for name, pixels in whole.items())
+
+
+def test_maps_of_other_images_are_refused(relit, scene, tmp_path):
+    folder, _ = scene
+    maps = write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "of something else", HASHING: str(LAYOUT)})
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+    assert outcome.code == 2 and "solved from other images" in outcome.err and str(maps) in outcome.err
+
+
+def test_maps_of_a_version_that_hashed_otherwise_guide_with_a_warning(relit, scene, tmp_path):
+    folder, _ = scene
+    words = ("relight", folder / "cap", "--environment", folder / "sky.exr")
+    for name, provenance in (("one", {}), ("other", {"relit:inputs": "of something else"})):
+        outcome = relit(*words, "--out", tmp_path / f"{name}.#.exr", "--maps", write_maps(tmp_path / name, SURFACE, provenance=provenance))
+        assert outcome.code == 0 and (HASHING in outcome.out) == (name == "other")
+    assert np.array_equal(rgb(tmp_path / "one.1.exr"), rgb(tmp_path / "other.1.exr"))
+
+
+def test_maps_with_holes_are_refused(relit, scene, tmp_path):
+    folder, _ = scene
+    height = SURFACE.height.astype(np.float32)
+    height[np.argwhere(SURFACE.mask)[0][0], np.argwhere(SURFACE.mask)[0][1]] = np.nan
+    maps = write_maps(tmp_path / "maps", SURFACE, height=height)
+    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", tmp_path / "f.#.exr", "--maps", maps)
+    assert outcome.code == 2 and "layer height has 1 values that are not finite" in outcome.err

@@ -1,0 +1,164 @@
+"""relit shade: near lights, area lights and environments on maps with a closed form."""
+
+import numpy as np
+import pytest
+
+from stage.capture.camera import Camera
+from stage.formats import exr
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from tests.reference import microfacet
+from tests.scenes.captures import files_in, write_exr
+from tests.scenes.glossy import ALBEDO, PIXEL_M, dome, reflect, write_dome, write_maps
+
+SURFACE = dome()
+
+
+def rgb(path, layer=""):
+    channels, _ = exr.read(path)
+    return np.stack([channels[layer + c].astype(np.float64) for c in "RGB"], axis=-1)
+
+
+def text(*numbers):
+    return ",".join(f"{number:.9g}" for number in np.ravel(np.concatenate([np.atleast_1d(n) for n in numbers])))
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    return write_maps(tmp_path_factory.mktemp("shade") / "maps", SURFACE)
+
+
+def test_a_point_light_is_the_model_pixel_by_pixel(relit, maps, tmp_path):
+    """Tolerance: half rounding of F0, albedo and the picture, and float32."""
+    place, intensity = np.array([0.01, 0.015, 0.03]), np.array([2e-3, 1e-3, 5e-4])
+    outcome = relit("shade", maps, "--light", text(place, intensity), "--out", tmp_path / "p.exr", "--exposure", "1")
+    assert (outcome.code, outcome.out, outcome.err) == (0, f"picture  {tmp_path}/p.exr\n", "")
+    toward = place - SURFACE.places
+    away = np.linalg.norm(toward, axis=-1, keepdims=True)
+    wanted = 2 * reflect(SURFACE.normal, toward / away) * intensity / away**2
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], wanted[SURFACE.mask], rtol=4e-3)
+    assert (rgb(tmp_path / "p.exr")[~SURFACE.mask] == 0).all()
+
+
+def test_two_materials_of_a_pixel_are_their_mean(relit, tmp_path):
+    """Left of the middle a share of another lobe, right of it one material. Tolerance: half rounding of two lobes and the share."""
+    place, share = np.array([0.01, 0.015, 0.03]), 0.7
+    mixed = np.arange(len(SURFACE.mask)) < 12
+    full = np.ones((*SURFACE.mask.shape, 3), np.float32)
+    lobes = {"first_specular": 0.9 * full, "first_roughness": 0.4 * full[..., 0], "second_specular": 0.05 * full,
+             "second_roughness": 0.55 * full[..., 0], "abundance": share * mixed * full[..., 0]}
+    maps = write_maps(tmp_path / "maps", SURFACE, **lobes)
+    relit("shade", maps, "--light", text(place, [1e-3] * 3), "--out", tmp_path / "p.exr")
+    toward = place - SURFACE.places
+    away = np.linalg.norm(toward, axis=-1, keepdims=True)
+    one = reflect(SURFACE.normal, toward / away)
+    shine = microfacet.specular(SURFACE.normal, toward / away, np.array([0, 0, 1.0]), 0.4**2, 0.9)[..., None]
+    matt = ALBEDO * microfacet.diffuse(SURFACE.normal, toward / away, np.array([0, 0, 1.0]))[..., None]
+    wanted = np.where(mixed[:, None], share * (matt + shine) + (1 - share) * one, one) * 1e-3 / away**2
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], wanted[SURFACE.mask], rtol=5e-3)
+
+
+def test_maps_with_the_share_of_a_material_and_not_its_lobe_are_refused(relit, tmp_path):
+    maps = write_maps(tmp_path / "maps", SURFACE, abundance=np.full(SURFACE.mask.shape, 0.5, np.float32))
+    outcome = relit("shade", maps, "--light", "0,0,1,1,1,1", "--out", tmp_path / "p.exr")
+    assert outcome.code == 2 and "no layer first_specular" in outcome.err
+
+
+def test_lights_add_up(relit, maps, tmp_path):
+    """A point with a lobe, a sphere and a rectangle together are the sum of each, to half rounding."""
+    lights = [("--light", text([0.01, 0.015, 0.03], [2e-3] * 3, [0, 0, -1], 2)), ("--sphere", text([-0.03, 0.02, 0.03], 0.01, [5, 4, 3])),
+              ("--rectangle", text([0, 0.02, 0.05], [0.02, 0, 0], [0, 0.01, 0], [3, 3, 3]))]
+    parts = []
+    for index, light in enumerate(lights):
+        assert relit("shade", maps, *light, "--out", tmp_path / f"{index}.exr").code == 0
+        parts.append(rgb(tmp_path / f"{index}.exr"))
+    relit("shade", maps, *(word for light in lights for word in light), "--out", tmp_path / "all.exr", "--aov", "diffuse,specular,mask")
+    assert all(part[SURFACE.mask].max() > 0 for part in parts)
+    np.testing.assert_allclose(rgb(tmp_path / "all.exr"), sum(parts), rtol=2e-3, atol=1e-6)
+    both = rgb(tmp_path / "all.exr", "diffuse.") + rgb(tmp_path / "all.exr", "specular.")
+    np.testing.assert_allclose(both, rgb(tmp_path / "all.exr"), rtol=2e-3, atol=1e-6)
+
+
+def test_a_wall_throws_its_shadow(relit, tmp_path):
+    """A wall of 6 pixels' height on a plane under a far point light at 45° hides the 6 pixels behind it."""
+    size, wall = 32, slice(14, 17)
+    height = np.zeros((size, size), np.float32)
+    height[:, wall] = 6 * PIXEL_M
+    camera = Camera(projection="orthographic", resolution=(size, size), pixel_size_m=PIXEL_M)
+    up = np.zeros((size, size, 3), np.float32)
+    up[..., 2] = 1
+    (tmp_path / "maps").mkdir()
+    SurfaceMaps(camera=camera, mask=np.ones((size, size), bool), normal=up, diffuse_albedo=up * 0 + 0.5, height=height).write(
+        tmp_path / "maps" / MAPS_FILE)
+    relit("shade", tmp_path / "maps", "--light", text([-100, 0, 100], [20000] * 3), "--out", tmp_path / "p.exr")
+    row = rgb(tmp_path / "p.exr")[16, :, 1]
+    lit = 0.5 / np.pi * np.cos(np.pi / 4)
+    np.testing.assert_allclose(row[:13], lit, rtol=3e-3)
+    assert (row[18:21] == 0).all()
+    np.testing.assert_allclose(row[25:], lit, rtol=3e-3)
+
+
+def test_an_even_environment_is_the_albedo(relit, tmp_path):
+    """Radiance 1 from everywhere, no gloss: every pixel has its albedo; 0.5 %: 1024 samples, and shadows of 64 directions at the rim."""
+    maps = write_maps(tmp_path / "maps", SURFACE, specular=None, roughness=None)
+    write_exr(tmp_path / "even.exr", np.ones((16, 32, 3)))
+    relit("shade", maps, "--environment", tmp_path / "even.exr", "--turn-degrees", "30", "--out", tmp_path / "p.exr")
+    middle = rgb(tmp_path / "p.exr")[10:14, 10:14]
+    np.testing.assert_allclose(middle, np.broadcast_to(ALBEDO, middle.shape), rtol=0.01)
+
+
+def test_a_far_point_light_in_the_place_of_a_captured_one_gives_its_image(relit, maps, tmp_path):
+    """With --capture the sum for light from a captured light is that light's image; 1 %: the point is at a finite distance."""
+    directions = write_dome(tmp_path / "cap", SURFACE)
+    light = int(np.argmax(directions @ [0.3, 0.3, 0.9]))
+    far = 1000.0
+    relit("shade", maps, "--capture", tmp_path / "cap", "--light", text(directions[light] * far, [2 * far**2] * 3), "--out",
+          tmp_path / "p.exr")
+    captured = rgb(tmp_path / "cap" / f"{light:03d}.exr")
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[SURFACE.mask], captured[SURFACE.mask], rtol=0.01)
+
+
+def test_maps_without_a_scale_are_lit_in_pixels_and_say_so(relit, tmp_path):
+    size = 6
+    up = np.zeros((size, size, 3), np.float32)
+    up[..., 2] = 1
+    (tmp_path / "maps").mkdir()
+    SurfaceMaps(camera=Camera(projection="orthographic", resolution=(size, size)), mask=np.ones((size, size), bool), normal=up,
+                diffuse_albedo=up * 0 + 0.5, height=np.zeros((size, size), np.float32)).write(tmp_path / "maps" / MAPS_FILE)
+    outcome = relit("shade", tmp_path / "maps", "--light", text([0.5, 0.5, 10], [100] * 3), "--out", tmp_path / "p.exr")
+    assert "places of lights are taken in pixels" in outcome.out
+    np.testing.assert_allclose(rgb(tmp_path / "p.exr")[2, 3], 0.5 / np.pi, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ((), "there is no light"),
+    (("--light", "1,2,3"), "'1,2,3' is not x,y,z,r,g,b"),
+    (("--light", "0,0,1,1,-1,1"), "light is 0 or more"),
+    (("--light", "0,0,1,1,1,1,0,0,0,2"), "the axis has no direction"),
+    (("--light", "0,0,nan,1,1,1"), "finite"),
+    (("--light", "0,0,1,1e40,1,1"), "at the most"),
+    (("--sphere", "0,0,1,0,1,1,1"), "greater than 0"),
+    (("--rectangle", "0,0,1,1,0,0,1,1,0,1,1,1"), "right angle"),
+    (("--environment", "none.exr"), "none.exr"),
+    (("--light", "0,0,1,1,1,1", "--out", "p.png"), "OpenEXR"),
+    (("--light", "0,0,1,1,1,1", "--capture", "nowhere"), "nowhere"),
+    (("--light", "0,0,1,1,1,1", "--aov", "velocity"), "velocity"),
+    (("--light", "0,0,1,1,1,1", "--aov", "lights"), "lights is a layer of relit frames"),
+])
+def test_bad_shades(relit, maps, tmp_path, options, words):
+    out = () if "--out" in options else ("--out", tmp_path / "p.exr")
+    outcome = relit("shade", maps, *options, *out)
+    assert outcome.code == 2 and outcome.err.count("\n") == 1 and words in outcome.err
+    assert files_in(tmp_path) == set()
+
+
+def test_maps_that_are_not_there(relit, tmp_path):
+    outcome = relit("shade", tmp_path / "none", "--light", "0,0,1,1,1,1", "--out", tmp_path / "p.exr")
+    assert outcome.code == 2 and "run `relit solve` first" in outcome.err
+
+
+def test_captured_images_are_not_replaced(relit, maps, tmp_path):
+    write_dome(tmp_path / "cap", SURFACE, lights=8)
+    before = (tmp_path / "cap" / "003.exr").read_bytes()
+    outcome = relit("shade", maps, "--light", "0,0,1,1,1,1", "--capture", tmp_path / "cap", "--out", tmp_path / "cap" / "003.exr")
+    assert outcome.code == 2 and "is an input" in outcome.err
+    assert (tmp_path / "cap" / "003.exr").read_bytes() == before

@@ -1,0 +1,127 @@
+"""Pairs of a cross- and a parallel-polarised image: what their sums are, with exposures too, and which pairs are refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.light_estimation.pairs import examine_pairs
+from stage.capture.capture import Capture
+from stage.capture.lighting import distant_lights, has_placeholders
+from stage.capture.polarised_pairs import Component
+from stage.errors import ManifestError
+from stage.stack.brackets import merge_brackets, one_frame_a_light
+from stage.stack.ingest import open_stack
+from tests.scenes.captures import edit_frame, edit_manifest, write_exr
+from tests.scenes.polarised import PEDESTAL, polarised_scene, write_polarised
+
+SCENE = polarised_scene(size=24, lights=12)
+HALF = 2.0**-10
+
+
+def separated(folder, component, leak=0.0):
+    capture = Capture.open(folder)
+    lights = distant_lights(capture)
+    merged = merge_brackets(open_stack(capture), capture.sources(), lights, component=component, leak=leak)
+    return one_frame_a_light(merged, lights)
+
+
+def radiance(stack):
+    """[lights, rows, cols, 3]"""
+    values = stack.band(0, stack.shape[2])[:, : stack.light_count, : stack.pixel_count].astype(float)
+    return np.moveaxis(values * stack.scale[: stack.light_count, None], 0, -1).reshape(stack.light_count, 24, 24, 3)
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.02, 0.2])
+@pytest.mark.parametrize("exposures", [(), (1.0, 0.25)])
+def test_both_parts_are_told_apart_exactly(tmp_path, leak, exposures):
+    """To half rounding of each image relative to its brightest value, which the factors of leaking polarisers multiply."""
+    write_polarised(tmp_path, SCENE, leak=leak, exposures=exposures)
+    whole = SCENE.diffuse + SCENE.specular
+    for component, expected in ((Component.DIFFUSE, SCENE.diffuse), (Component.SPECULAR, SCENE.specular), (Component.WHOLE, whole)):
+        stack, lights = separated(tmp_path, component, leak)
+        assert stack.light_count == len(SCENE.directions) == len(lights.direction)
+        gain = sum(map(abs, component.gains(leak)))
+        np.testing.assert_allclose(radiance(stack), expected, atol=2 * HALF * gain * whole.max())
+        np.testing.assert_allclose(radiance(stack).sum(), expected.sum(), rtol=1e-3)
+
+
+def test_noise_of_a_part_is_that_of_its_images_times_the_factors_and_stays_below_zero(tmp_path):
+    """Of the dark paint quarter, which has no highlight, S is noise around zero: its mean within four standard errors of zero."""
+    write_polarised(tmp_path, SCENE, noise=0.05, leak=0.02)
+    specular = radiance(separated(tmp_path, Component.SPECULAR, 0.02)[0])[:, SCENE.of("paint")]
+    crossed, along = (radiance(separated(tmp_path, part)[0])[:, SCENE.of("paint")] for part in (Component.CROSS, Component.PARALLEL))
+    truth = SCENE.diffuse[:, SCENE.of("paint")] / 2
+    expected = np.hypot((crossed - truth).std(), (along - truth).std()) / (1 - 2 * 0.02)
+    assert specular.std() == pytest.approx(expected, rel=0.05)
+    assert abs(specular.mean()) < 4 * specular.std() / np.sqrt(specular.size)
+    assert (specular < 0).mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_pair_clipped_in_one_image_is_clipped(tmp_path):
+    write_polarised(tmp_path, SCENE)
+    limit = 0.5
+    edit_manifest(tmp_path, saturation=limit + PEDESTAL)
+    bits = separated(tmp_path, Component.DIFFUSE)[0].saturated(0, 576)
+    clipped = np.unpackbits(bits, axis=0, bitorder="little")[: len(SCENE.directions), :576].reshape(-1, 24, 24).astype(bool)
+    along = SCENE.diffuse / 2 + SCENE.specular
+    sure = np.abs(along - limit).min(axis=-1) > 1e-3
+    np.testing.assert_array_equal(clipped[sure], (along >= limit).any(axis=-1)[sure])
+
+
+def examine(folder):
+    stacks = [separated(folder, part)[0] for part in (Component.CROSS, Component.PARALLEL)]
+    names = [(name, name.replace("cross", "parallel")) for name in stacks[0].frames]
+    return examine_pairs(*stacks, names, SCENE.surface.mask)
+
+
+@pytest.mark.parametrize("leak", [0.0, 0.02])
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])
+def test_pairs_that_fit_are_not_doubted_and_bound_the_leak(tmp_path, leak, noise):
+    """The metal shows the leak itself; 3 standard errors of 24 lights' sums are added."""
+    write_polarised(tmp_path, SCENE, leak=leak, noise=noise)
+    found = examine(tmp_path)
+    assert found.fault is None
+    assert found.leak_at_most is not None and leak - 1e-4 <= found.leak_at_most < leak + 0.05
+
+
+def test_one_swapped_pair_is_named(tmp_path):
+    write_polarised(tmp_path, SCENE, noise=0.01)
+    crossed, along = tmp_path / "003_0_cross.exr", tmp_path / "003_0_parallel.exr"
+    crossed.rename(tmp_path / "x.exr")
+    along.rename(crossed)
+    (tmp_path / "x.exr").rename(along)
+    assert "003_0_parallel.exr" in examine(tmp_path).fault and "swapped" in examine(tmp_path).fault
+
+
+@pytest.mark.parametrize("shift", [1, 3])
+def test_a_shifted_pair_is_named(tmp_path, shift):
+    write_polarised(tmp_path, SCENE, noise=0.01)
+    image = SCENE.diffuse[5] / 2 + SCENE.specular[5]
+    write_exr(tmp_path / "005_0_parallel.exr", np.roll(image, shift, axis=1) + PEDESTAL)
+    assert "005_0_parallel.exr" in examine(tmp_path).fault
+
+
+def test_an_image_without_its_partner_is_named(tmp_path):
+    write_polarised(tmp_path, SCENE)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    edit_manifest(tmp_path, frames=[frame for frame in data["frames"] if frame["image"] != "002_0_parallel.exr"])
+    with pytest.raises(ManifestError, match=r"frames\[4\].light.polarization: is cross, and no parallel"):
+        distant_lights(Capture.open(tmp_path))
+
+
+def test_unpolarised_lights_among_pairs_are_named(tmp_path):
+    write_polarised(tmp_path, SCENE)
+    light = json.loads((tmp_path / "capture.json").read_text())["frames"][3]["light"]
+    edit_frame(tmp_path, 3, light={**light, "polarization": "none"})
+    with pytest.raises(ManifestError, match=r"frames\[3\].light.polarization: is none where other lights"):
+        distant_lights(Capture.open(tmp_path))
+
+
+def test_polarised_placeholders_are_placeholders(tmp_path):
+    write_polarised(tmp_path, SCENE)
+    data = json.loads((tmp_path / "capture.json").read_text())
+    for frame in data["frames"]:
+        frame["light"] |= {"direction": [0, 0, 1], "irradiance": [1, 1, 1]}
+    edit_manifest(tmp_path, frames=data["frames"])
+    assert has_placeholders(Capture.open(tmp_path))

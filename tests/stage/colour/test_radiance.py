@@ -1,0 +1,127 @@
+"""What a floating-point image may hold: noise around zero is kept, and what is further below is refused, or set to zero and counted."""
+
+import numpy as np
+import pytest
+
+from stage.capture.capture import Capture
+from stage.colour.environment_maps import read_environment
+from stage.colour.radiance import check_radiance, clip_negative, noise_floor
+from stage.errors import ImageError
+from stage.pixels import PixelChoices
+from stage.stack.correction import Correction
+from stage.stack.ingest import open_stack
+from tests.scenes.captures import make_scene, write_capture, write_exr
+
+RNG = np.random.default_rng(7)
+UNIT = RNG.random((5, 7, 3))
+SIGMA = 0.004
+
+
+def dark_subtracted(size=96, seed=0, filtered=False):
+    """A shaded ball before black with normal noise; `filtered` as demosaicing leaves it, alike in neighbours."""
+    centre = (np.arange(size) + 0.5) / size * 2.4 - 1.2
+    x, y = np.meshgrid(centre, centre)
+    ball = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    noise = np.random.default_rng(seed).normal(0, SIGMA, (size + 1, size + 1, 3))
+    if filtered:
+        noise = (noise[1:, 1:] + noise[:-1, 1:] + noise[1:, :-1] + noise[:-1, :-1]) / 2  # of the same standard deviation
+    return (ball[..., None] + noise[:size, :size]).astype(np.float32)
+
+
+@pytest.mark.parametrize(("bad", "words"), [
+    (np.nan, "1 pixel is not finite (NaN or infinity), the first at row 2"),
+    (np.inf, "1 pixel is not finite (NaN or infinity), the first at row 2"),
+    (-0.001, "1 pixel is negative, the first at row 2, column 3"),
+])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_impossible_values_are_counted_and_the_first_is_named(tmp_path, bad, words, dtype):
+    pixels = UNIT.astype(dtype)
+    check_radiance("a.exr", pixels)
+    pixels[2, 3, 1] = bad
+    with pytest.raises(ImageError) as caught:
+        check_radiance("a.exr", pixels)
+    assert words in str(caught.value)
+
+
+def test_negative_zero_is_zero():
+    check_radiance("a.exr", np.full((1, 1, 3), -0.0, np.float32))
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_around_zero_is_kept(seed, filtered):
+    """The noise is measured to a tenth: on 3000 readings before the ball, and a few of its edge that shading raises."""
+    pixels = dark_subtracted(seed=seed, filtered=filtered)
+    assert (pixels < 0).sum() > 3000
+    check_radiance("a.exr", pixels)
+    assert clip_negative(pixels) == (pytest.approx(pixels), 0)
+    np.testing.assert_allclose(noise_floor(pixels), -6 * SIGMA, rtol=0.15)
+
+
+def test_the_mean_of_darkness_stays_zero():
+    """Values below zero that were set to zero would raise it by 0.4 standard deviations."""
+    pixels, _ = clip_negative(dark_subtracted())
+    corner = pixels[:12, :12]
+    assert abs(corner.mean()) < 4 * SIGMA / np.sqrt(corner.size)
+
+
+@pytest.mark.parametrize("spoil", ["pedestal", "hot pixel", "ringing"])
+def test_what_no_noise_explains_is_refused_and_counted(spoil):
+    pixels = dark_subtracted()
+    if spoil == "pedestal":  # a dark image of a longer exposure
+        pixels -= np.float32(0.05)
+    elif spoil == "hot pixel":
+        pixels[5, 6] = -0.3
+    else:  # of a sharp filter beside a bright edge, without noise
+        pixels = np.maximum(pixels, 0)
+        pixels[40, :10] = -0.02
+    low = pixels < (0 if spoil == "ringing" else -6.9 * SIGMA)  # the noise is measured to 15 %
+    count = int(low.any(axis=-1).sum())
+    with pytest.raises(ImageError, match=r"a\.exr: \d+ pixels? (is|are) negative, the first"):
+        check_radiance("a.exr", pixels)
+    clipped, found = clip_negative(pixels)
+    assert (clipped[low] == 0).all()
+    kept = pixels > -5.1 * SIGMA
+    np.testing.assert_array_equal(clipped[kept], np.maximum(pixels, 0)[kept] if spoil == "ringing" else pixels[kept])
+    assert count <= found <= int((~kept).any(axis=-1).sum()) or (spoil == "ringing" and found == count == 10)
+
+
+def test_rounding_below_zero_is_kept():
+    """Dark areas of a rendered image after a filter in single precision."""
+    pixels = np.zeros((20, 20, 3), np.float32)
+    pixels[5:15, 5:15] = 2
+    pixels[0, 0] = -1e-6
+    check_radiance("a.exr", pixels)
+    pixels[0, 0] = -1e-5
+    with pytest.raises(ImageError, match="1 pixel is negative"):
+        check_radiance("a.exr", pixels)
+
+
+def test_a_capture_clips_and_remembers_how_many(tmp_path):
+    scene = make_scene(size=12, lights=4)
+    write_capture(tmp_path, scene)
+    low = scene.images[2].copy()
+    low[3, 3:6, 1] = -0.2
+    write_exr(tmp_path / "002.exr", low)
+    with pytest.raises(ImageError, match=r"002\.exr: 3 pixels are negative.*: --clip-negative sets such"):
+        open_stack(Capture.open(tmp_path))
+    capture = Capture.open(tmp_path, PixelChoices(clip_negative=True))
+    pixels = Correction.of(capture).apply(capture.manifest.frames[2]).pixels
+    np.testing.assert_array_equal(pixels, np.maximum(low, 0).astype(np.float32))
+    assert capture.clipped == {"002.exr": 3}
+    assert open_stack(capture).clipped == {"002.exr": 3}
+    again = Capture.open(tmp_path, PixelChoices(clip_negative=True))
+    assert open_stack(again).clipped == again.clipped == {"002.exr": 3}  # from the cache
+
+
+def test_environments_with_noise_are_read_and_others_are_clipped_on_request(tmp_path):
+    sky = dark_subtracted()[:48]
+    found = read_environment(write_exr(tmp_path / "sky.exr", sky), "lin_rec709_scene")
+    np.testing.assert_array_equal(found, np.maximum(sky, 0))
+    sky[:4] = -1
+    path = write_exr(tmp_path / "low.exr", sky)
+    with pytest.raises(ImageError, match=r"low\.exr: 384 pixels are negative.*--clip-negative"):
+        read_environment(path, "lin_rec709_scene")
+    clipped = {}
+    found = read_environment(path, "lin_rec709_scene", clipped=clipped)
+    assert clipped == {"low.exr": 384} and (found[:4] == 0).all()

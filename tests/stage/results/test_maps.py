@@ -1,0 +1,134 @@
+"""maps.exr: what is written comes back, and what was not estimated is not there."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from stage.capture.camera import Camera, Distortion
+from stage.errors import ImageError, ResultError
+from stage.formats import exr
+from stage.results.maps import LAYERS, SurfaceMaps
+from tests.scenes.captures import files_in
+
+ROWS, COLS = 5, 7
+RNG = np.random.default_rng(13)
+MASK = RNG.random((ROWS, COLS)) > 0.4
+CAMERA = Camera(projection="perspective", resolution=(COLS, ROWS), focal_px=(9.0, 10.0), surface_z_m=-0.5,
+                distortion=Distortion(model="brown_conrady", k=(0.1, 0, 0)))
+
+
+def make_maps(**changes) -> SurfaceMaps:
+    three, one = (lambda: RNG.random((ROWS, COLS, 3)).astype(np.float32)), (lambda: RNG.random((ROWS, COLS)).astype(np.float32))
+    layers = {"normal": three(), "diffuse_albedo": three(), "specular": three(), "roughness": one(), "height": one() - 1,
+              "confidence": one(), "specular_normal": three(), "regime": one(), "sigma": one(),
+              "abundance": one(), "height_sigma": one(), "first_specular": three(), "first_roughness": one(), "second_specular": three(),
+              "second_roughness": one(), "part": np.ones(MASK.shape, np.uint8),
+              "status": MASK.astype(np.uint8)}
+    return SurfaceMaps(**{"camera": CAMERA, "mask": MASK, "provenance": {"relit:capture": "owl"}, **layers, **changes})
+
+
+def test_every_layer_comes_back_in_the_type_it_is_stored_as(tmp_path):
+    maps = make_maps(color_space="lin_ap1_scene")
+    maps.write(tmp_path / "maps.exr")
+    back = SurfaceMaps.read(tmp_path / "maps.exr")
+    assert (back.camera, back.color_space, back.provenance) == (CAMERA, "lin_ap1_scene", {"relit:capture": "owl"})
+    assert back.mask.dtype == bool and np.array_equal(back.mask, MASK)
+    for name, layer in maps.layers().items():
+        if name != "mask":
+            stored = layer.astype(LAYERS[name][1]).astype(np.float32)
+            assert np.array_equal(getattr(back, name)[MASK], stored[MASK]), name
+            assert not getattr(back, name)[~MASK].any(), name
+
+
+def test_the_channels_are_those_of_the_contract(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    with OpenEXR.File(str(tmp_path / "maps.exr"), separate_channels=True) as file:
+        types = {name: channel.pixels.dtype.name for name, channel in file.channels().items()}
+        header = dict(file.header())
+    half = [f"{layer}.{c}" for layer in ("diffuse_albedo", "specular", "first_specular", "second_specular") for c in "RGB"]
+    half += [f"{layer}.Y" for layer in ("roughness", "abundance", "first_roughness", "second_roughness", "regime", "part", "sigma",
+                                        "confidence", "status", "mask")]
+    floats = [f"{layer}.{c}" for layer in ("normal", "specular_normal") for c in "XYZ"] + ["height.Z", "height_sigma.Z"]
+    assert types == {**dict.fromkeys(half, "float16"), **dict.fromkeys(floats, "float32")}
+    assert header["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in header and "relit:camera" in header
+
+
+def test_nothing_is_left_outside_the_mask_not_even_nan(tmp_path):
+    normal = np.full((ROWS, COLS, 3), np.nan, np.float32)
+    normal[MASK] = (0, 0, 1)
+    make_maps(normal=normal).write(tmp_path / "maps.exr")
+    channels, _ = exr.read(tmp_path / "maps.exr")
+    for name, plane in channels.items():
+        assert not plane[~MASK].any(), name
+        assert np.isfinite(plane).all()
+
+
+@pytest.mark.parametrize("absent", [name for name in LAYERS if name != "mask"])
+def test_a_layer_that_was_not_estimated_is_absent_not_zero(tmp_path, absent):
+    make_maps(**{absent: None}).write(tmp_path / "maps.exr")
+    channels, _ = exr.read(tmp_path / "maps.exr")
+    assert {name.split(".")[0] for name in channels} == set(LAYERS) - {absent}
+    assert getattr(SurfaceMaps.read(tmp_path / "maps.exr"), absent) is None
+
+
+def test_layers_that_are_not_wanted_are_left_out(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    whole, some = SurfaceMaps.read(tmp_path / "maps.exr"), SurfaceMaps.read(tmp_path / "maps.exr", layers=("normal", "part"))
+    assert set(some.layers()) == {"normal", "part", "mask"} and some.part is not None and some.part.dtype == np.uint8
+    assert np.array_equal(some.normal, whole.normal) and np.array_equal(some.mask, whole.mask)
+
+
+def test_every_lobe_is_changed_and_nothing_else():
+    maps = make_maps(second_specular=None)
+    changed = maps.with_lobes(lambda specular, roughness: (2 * specular, roughness + 1))
+    for name, layer in maps.layers().items():
+        expected = 2 * layer if name in ("specular", "first_specular") else layer + 1 if name in ("roughness", "first_roughness") else layer
+        assert np.array_equal(getattr(changed, name), expected), name
+
+
+def test_what_is_unsure_is_kept_outside_the_mask(tmp_path):
+    unsure = ~MASK & (RNG.random((ROWS, COLS)) > 0.5)
+    status = np.where(MASK, 1, np.where(unsure, 15, 6)).astype(np.uint8)
+    maps = make_maps(estimated=MASK | unsure, status=status)
+    maps.write(tmp_path / "maps.exr")
+    back = SurfaceMaps.read(tmp_path / "maps.exr", unsure=True)
+    assert np.array_equal(back.mask, MASK) and np.array_equal(back.status, status) and np.array_equal(back.estimated, MASK | unsure)
+    assert np.array_equal(back.normal[unsure], maps.normal[unsure]) and not back.normal[~MASK & ~unsure].any()
+    plain = SurfaceMaps.read(tmp_path / "maps.exr")
+    assert not plain.normal[~MASK].any() and not plain.sigma[~MASK].any() and np.array_equal(plain.status, status)
+
+
+def write(path, channels, **metadata):
+    exr.write(path, channels, color_space="lin_rec709_scene", metadata=metadata)
+    return path
+
+
+def test_what_is_not_a_maps_file_is_named(tmp_path):
+    plane = np.ones((ROWS, COLS), np.float32)
+    camera = {"relit:camera": CAMERA.model_dump_json()}
+    with pytest.raises(ResultError, match=r"a\.exr: carries no relit:camera attribute"):
+        SurfaceMaps.read(write(tmp_path / "a.exr", {"Y": plane}))
+    with pytest.raises(ResultError, match=r"b\.exr: layer normal lacks channel normal\.Y"):
+        SurfaceMaps.read(write(tmp_path / "b.exr", {"normal.X": plane, "normal.Z": plane, "mask.Y": plane}, **camera))
+    with pytest.raises(ResultError, match=r"c\.exr: has no layer mask\.Y"):
+        SurfaceMaps.read(write(tmp_path / "c.exr", {"height.Z": plane}, **camera))
+    with pytest.raises(ResultError, match=r"d\.exr: is 3x5, its camera 7x5"):
+        SurfaceMaps.read(write(tmp_path / "d.exr", {"mask.Y": plane[:, :3].copy()}, **camera))
+    for name, text in (("e", "{"), ("f", "{}"), ("g", '{"projection": "fisheye"}')):
+        with pytest.raises(ResultError, match=rf"{name}\.exr: its relit:camera attribute is not a camera"):
+            SurfaceMaps.read(write(tmp_path / f"{name}.exr", {"mask.Y": plane}, **{"relit:camera": text}))
+
+
+def test_a_truncated_maps_file_is_named(tmp_path):
+    make_maps().write(tmp_path / "maps.exr")
+    (tmp_path / "maps.exr").write_bytes((tmp_path / "maps.exr").read_bytes()[:-10])
+    with pytest.raises(ImageError, match=r"maps\.exr: is truncated"):
+        SurfaceMaps.read(tmp_path / "maps.exr")
+    assert files_in(tmp_path) == {"maps.exr"}
+
+
+def test_two_writes_of_the_same_maps_are_the_same_file(tmp_path):
+    maps = make_maps()
+    maps.write(tmp_path / "a.exr")
+    maps.write(tmp_path / "b.exr")
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()

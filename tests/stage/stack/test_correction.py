@@ -1,0 +1,172 @@
+"""Recorded values to radiance, against the formula written out in float64."""
+
+import numpy as np
+import pytest
+
+from stage.capture.capture import Capture
+from stage.errors import ImageError
+from stage.stack.correction import CodedRadiance, Correction, Radiance
+from tests.scenes.captures import (
+    edit_frame,
+    edit_manifest,
+    make_scene,
+    manifest_of,
+    write_capture,
+    write_exr,
+    write_image,
+    write_manifest,
+)
+
+SCENE = make_scene(size=8, lights=4)
+RNG = np.random.default_rng(11)
+DARK = 0.01 + 0.01 * RNG.random((8, 8, 3)).astype(np.float32)
+FLAT = 0.5 + RNG.random((8, 8, 3)).astype(np.float32)
+ROUNDING = {"rtol": 1e-5, "atol": 1e-6}  # a handful of float32 operations on values up to one
+
+
+def corrected(folder, index=0):
+    capture = Capture.open(folder)
+    return Correction.of(capture).apply(capture.sources()[index])
+
+
+def test_nothing_declared_is_nothing_done(tmp_path):
+    radiance = corrected(write_capture(tmp_path, SCENE), 1)
+    assert np.array_equal(radiance.pixels, SCENE.images[1].astype(np.float32))
+    assert radiance.saturated is None
+
+
+def test_dark_flat_exposure_and_ambient_together(tmp_path):
+    write_capture(tmp_path, SCENE)
+    write_exr(tmp_path / "dark.exr", DARK)
+    write_exr(tmp_path / "flat.exr", FLAT)
+    edit_manifest(tmp_path, dark="dark.exr", flat="flat.exr")
+    exposures = [0.5, 0.25, 2.0, 4.0]
+    recorded = [(DARK + image * exposure).astype(np.float32) for image, exposure in zip(SCENE.images, exposures, strict=True)]
+    for index, (image, exposure) in enumerate(zip(recorded, exposures, strict=True)):
+        write_exr(tmp_path / f"{index:03d}.exr", image)
+        edit_frame(tmp_path, index, exposure_s=exposure)
+    edit_frame(tmp_path, 3, light={"type": "off"})
+    edit_frame(tmp_path, 2, light={"type": "off"})
+
+    dark, gain = DARK.astype(np.float64), FLAT.astype(np.float64) - DARK
+    gain /= gain[SCENE.mask].mean(axis=0)
+    linear = [(image - dark) / gain / exposure for image, exposure in zip(recorded, exposures, strict=True)]
+    ambient = (linear[2] + linear[3]) / 2
+    for index in (0, 1):
+        assert np.allclose(corrected(tmp_path, index).pixels, linear[index] - ambient, **ROUNDING)
+
+
+def test_the_flat_keeps_the_mean_over_the_mask_and_takes_its_shape_away(tmp_path):
+    """A scene seen through a vignette comes back as the scene."""
+    vignette = np.where(SCENE.mask[..., None], FLAT / FLAT[SCENE.mask].mean(axis=0), 0.3)
+    write_capture(tmp_path, SCENE)
+    write_exr(tmp_path / "000.exr", SCENE.images[0] * vignette)
+    write_exr(tmp_path / "flat.exr", 7 * vignette)
+    edit_manifest(tmp_path, flat="flat.exr")
+    assert np.allclose(corrected(tmp_path).pixels[SCENE.mask], SCENE.images[0][SCENE.mask], **ROUNDING)
+
+
+def test_a_flat_that_is_dark_inside_the_mask_is_named(tmp_path):
+    write_capture(tmp_path, SCENE)
+    flat = FLAT.copy()
+    flat[4, 4] = flat[4, 5] = 0
+    write_exr(tmp_path / "flat.exr", flat)
+    edit_manifest(tmp_path, flat="flat.exr")
+    with pytest.raises(ImageError, match=r"flat\.exr: flat is not above dark at 2 of the mask's pixels"):
+        Correction.of(Capture.open(tmp_path))
+    flat[4, 4] = flat[4, 5] = 1
+    flat[0, 0] = 0  # outside the mask it is nobody's business
+    write_exr(tmp_path / "flat.exr", flat)
+    assert np.isfinite(corrected(tmp_path).pixels).all()
+
+
+def test_saturation_is_judged_on_recorded_values_in_any_channel(tmp_path):
+    image = np.full((8, 8, 3), 0.5, np.float32)
+    image[1, 2, 0], image[3, 4, 2], image[5, 6, 1] = 0.9, 0.95, 0.899
+    write_capture(tmp_path, SCENE, saturation=0.9)
+    write_exr(tmp_path / "000.exr", image)
+    write_exr(tmp_path / "dark.exr", DARK)
+    edit_manifest(tmp_path, dark="dark.exr")  # dark does not move the limit
+    assert np.argwhere(corrected(tmp_path).saturated).tolist() == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(("limit", "first"), [(200 / 255, 200), (0.5, 128), (1.0, 255), (1.5, 256)])
+def test_saturation_of_integers_begins_at_the_first_that_stands_for_as_much(tmp_path, limit, first):
+    codes = np.arange(192, dtype=np.uint8).reshape(8, 8, 3) + 64
+    write_image(tmp_path / "000.png", codes)
+    data = manifest_of(SCENE, mask=None, saturation=limit)
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png"}]})
+    assert np.array_equal(corrected(tmp_path).saturated, (codes >= first).any(axis=-1))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_integers_with_the_table_of_their_radiance_are_the_corrected_pixels(tmp_path, dtype):
+    write_image(tmp_path / "000.png", RNG.integers(0, np.iinfo(dtype).max, (8, 8, 3)).astype(dtype))
+    data = manifest_of(SCENE, color_space="srgb_texture", mask=None)
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png", "exposure_s": 0.25}]})
+    capture = Capture.open(tmp_path)
+    frame, without = capture.sources()[0], Correction.of(capture)
+    coded = without.coded(frame)
+    assert isinstance(coded, CodedRadiance)
+    assert coded.codes.dtype == dtype
+    assert (np.diff(coded.values) >= 0).all()
+    flat = Correction(capture, None, np.ones((8, 8, 3), np.float32), None)  # which divides every pixel by one
+    assert isinstance(flat.coded(frame), Radiance)
+    assert np.array_equal(without.apply(frame).pixels, coded.values[coded.codes])
+    assert np.array_equal(without.apply(frame).pixels, flat.apply(frame).pixels)
+
+
+@pytest.mark.parametrize("limit", [0.0625, 0.3, 5.0])
+def test_half_values_with_the_table_of_their_radiance_are_the_corrected_pixels(tmp_path, limit):
+    image = RNG.normal(0, 0.01, (64, 64, 3)).astype(np.float16)  # noise around zero, as after the subtraction of a dark image
+    image[:32] += np.float16(0.3)
+    image[3, 5, 1] = limit
+    write_exr(tmp_path / "000.exr", image, np.float16)
+    data = manifest_of(SCENE, mask=None, saturation=limit)
+    data["camera"]["resolution"] = [64, 64]
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.exr", "exposure_s": 0.3}]})
+    capture = Capture.open(tmp_path)
+    frame, without = capture.sources()[0], Correction.of(capture)
+    coded = without.coded(frame)
+    assert isinstance(coded, CodedRadiance)
+    assert without.has_codes(frame)
+    flat = Correction(capture, None, np.ones((64, 64, 3), np.float32), None)  # which divides every pixel by one
+    assert isinstance(flat.coded(frame), Radiance)
+    assert np.array_equal(without.apply(frame).pixels, flat.apply(frame).pixels)
+    wanted = (image.astype(np.float32) >= np.float32(limit)).any(axis=-1)
+    assert np.array_equal(coded.saturated, wanted)
+    assert wanted[3, 5] == (np.float32(np.float16(limit)) >= np.float32(limit))
+
+
+def test_display_encoded_frames_are_linearised_dark_and_all(tmp_path):
+    codes = {name: RNG.integers(low, high, (8, 8, 3)).astype(np.uint8) for name, low, high in (("000", 60, 255), ("dark", 0, 30))}
+    for name, values in codes.items():
+        write_image(tmp_path / f"{name}.png", values)
+    data = manifest_of(SCENE, color_space="srgb_texture", mask=None, dark="dark.png")
+    write_manifest(tmp_path, {**data, "frames": [{**data["frames"][0], "image": "000.png"}]})
+    linear = {name: np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4) for name, v in
+              ((name, values / 255.0) for name, values in codes.items())}
+    # OpenColorIO's curve is 3e-4 off IEC's at most (tests/stage/colour/test_colour.py)
+    assert np.allclose(corrected(tmp_path).pixels, linear["000"] - linear["dark"], rtol=1e-3, atol=1e-5)
+
+
+def test_noise_below_dark_stays_negative(tmp_path):
+    write_capture(tmp_path, SCENE)
+    write_exr(tmp_path / "000.exr", np.zeros((8, 8, 3)))
+    write_exr(tmp_path / "dark.exr", DARK)
+    edit_manifest(tmp_path, dark="dark.exr")
+    assert np.array_equal(corrected(tmp_path).pixels, -DARK)
+
+
+@pytest.mark.parametrize("name", ["dark.exr", "flat.exr", "000.exr"])
+@pytest.mark.parametrize("value", [np.nan, -1.0])
+def test_impossible_values_are_named_in_every_kind_of_frame(tmp_path, name, value):
+    write_capture(tmp_path, SCENE)
+    for file in ("dark.exr", "flat.exr"):
+        write_exr(tmp_path / file, DARK if file == "dark.exr" else FLAT)
+    bad = np.full((8, 8, 3), 0.5)
+    bad[2, 3, 1] = value
+    write_exr(tmp_path / name, bad)
+    edit_manifest(tmp_path, dark="dark.exr", flat="flat.exr")
+    with pytest.raises(ImageError, match=rf"{name}: 1 pixel is .*, the first at row 2, column 3"):
+        corrected(tmp_path)
