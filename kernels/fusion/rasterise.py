@@ -1,4 +1,4 @@
-"""Which triangle of a mesh covers each texel of its texture."""
+"""Find the triangle of a mesh that covers each texel of its texture."""
 
 from typing import Any
 

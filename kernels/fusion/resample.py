@@ -49,7 +49,7 @@ MOST_LEFT = 0.3
 
 
 class Resampled(NamedTuple):
-    """What the pixels show, each [rows, cols]."""
+    """Depth, its σ and the nearest point of each pixel, each [rows, cols]."""
 
     depth: np.ndarray  # float32 metres; 0 where there is none
     sigma: np.ndarray  # float32 metres, standard deviation of the depth; 0 where there is none

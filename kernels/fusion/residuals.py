@@ -13,7 +13,7 @@ from kernels.fusion.projection import View, image_point, in_front, line_of_sight
 from kernels.fusion.views import Cell, ViewArrays, read_view
 
 ELSEWHERE, FUSED, LOST, REFUSED = 0, 1, 2, 3
-"""What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
+"""Outcomes for a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
 around it; or other views saw its place to be empty."""
 SAME_SIDE = 0.5
 """Least cosine between two normals at which two views may show the same surface: 60°."""

@@ -28,7 +28,7 @@ FOLD_THREADS = 256
 
 @wp.struct
 class Walk:
-    """Which cells thread t visits: every `step`-th of the `span` cells from start + t · apart on, below end."""
+    """The cells that thread t visits: every `step`-th of the `span` cells from start + t · apart on, below end."""
 
     start: wp.int32
     apart: wp.int32

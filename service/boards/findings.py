@@ -1,4 +1,4 @@
-"""What an inspection lists: defects, regions, and areas that were not inspected."""
+"""The rows that an inspection lists: defects, regions, and areas that were not inspected."""
 
 import csv
 import io

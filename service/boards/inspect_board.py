@@ -60,7 +60,7 @@ class InspectBoardResult(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """What the comparison with nominal heights found."""
+    """Result of the comparison with nominal heights."""
 
     nominal: Nominal
     match: Match

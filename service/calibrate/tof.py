@@ -37,7 +37,7 @@ SHARPEST_RAD = 0.3
 
 
 class TofCalibrationResult(NamedTuple):
-    """What a sweep calibrated."""
+    """The calibration from a sweep, and its errors."""
 
     calibration: TofCalibration
     path: Path

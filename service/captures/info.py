@@ -29,7 +29,7 @@ from stage.stack.correction import Correction
 from stage.tof.raw_frames import check_frames, read_frame
 
 FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
-"""What is said of near lights whose distance to the surface nobody has measured."""
+"""The remark about near lights whose distance to the surface nobody has measured."""
 
 
 class Inspection(NamedTuple):

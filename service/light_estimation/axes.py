@@ -38,7 +38,7 @@ SNAP_DEGREES = 25.0
 
 
 class Axes(NamedTuple):
-    """What corrects the axes of the lights, and so of the normals, in the image plane; or its opposite, turned by 180 degrees."""
+    """The correction of the axes of the lights, and so of the normals, in the image plane, up to a turn by 180 degrees."""
 
     matrix: np.ndarray  # [2, 2] float64, orthogonal
     misfit: float

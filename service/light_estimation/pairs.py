@@ -39,7 +39,7 @@ standard errors are added to it."""
 
 
 class PairFindings(NamedTuple):
-    """What the images say about the pairs of a capture."""
+    """Result of checking the pairs of a capture against the images."""
 
     fault: str | None
     """A sentence about the first pair that does not fit, without the name of the manifest; None: all fit."""

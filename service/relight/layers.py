@@ -17,7 +17,7 @@ from stage.stack.stack import Stack
 
 
 class Content(NamedTuple):
-    """What a layer holds, and how its channels are called."""
+    """The content of a layer, and the names of its channels."""
 
     name: str
     """The name of the layer in the file."""

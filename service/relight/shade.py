@@ -56,7 +56,7 @@ class ShadeResult(NamedTuple):
     clipped: int
     """Pixels above the largest half value, stored as that value."""
     warnings: tuple[str, ...]
-    """What does not fit, and what to try."""
+    """Sentences that say what does not fit, and what to try."""
 
 
 def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResult:

@@ -35,7 +35,7 @@ PutRows = Callable[[int, int, np.ndarray, Mapping[str, np.ndarray]], None]
 
 
 class FrameFormat(NamedTuple):
-    """What the frames of a capture have in common."""
+    """Size, colour space, compression and layers, which all frames of a capture share."""
 
     resolution: tuple[int, int]
     space: str

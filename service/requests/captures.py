@@ -1,4 +1,4 @@
-"""What `relit info` and `relit import` take: one frozen model for each layout of files."""
+"""The options of `relit info` and `relit import`: one frozen model for each layout of files."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -58,7 +58,7 @@ def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class LensOptions(Options):
-    """What is known of a camera's lens."""
+    """Focal length, principal point and distortion of a camera's lens."""
 
     focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
                         Spelling(metavar="F[,F]")] = None
@@ -71,7 +71,7 @@ class LensOptions(Options):
 
 
 class CameraOptions(LensOptions):
-    """What is known of the camera; without a focal length it is taken to be orthographic."""
+    """The camera; without a focal length it is taken to be orthographic."""
 
     pixel_size_m: Positive | None = None
     """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
@@ -81,7 +81,7 @@ class CameraOptions(LensOptions):
 
 
 class ImageOptions(Options):
-    """Which images of the folder are frames, and how they are encoded."""
+    """The images of the folder that are frames, and their encoding."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, such as 'img_*.png'; None: every image but the mask and the one of ambient light."""
@@ -101,7 +101,7 @@ class Sense(Choice):
 
 
 class Run(Choice):
-    """What a light is in a table of numbers."""
+    """The direction in which a light's numbers run in a table."""
 
     ROWS = "rows"
     COLUMNS = "columns"
@@ -128,14 +128,14 @@ class OlatImport(CameraOptions, ImageOptions, ImportRequest):
     """Where x, y and z of the table point as seen by the camera: right or left, up or down, towards the camera or away from it. relit and
     OpenGL have right,up,towards, OpenCV has right,down,away."""
     sense: Annotated[Sense, Spelling(flag="--vectors")]
-    """What the vectors of the table are."""
+    """The meaning of the vectors of the table."""
     lights: Annotated[Path | None, Role.INPUT] = None
     """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
     SRC."""
     variable: Line | None = None
     """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
     lights_in: Run | None = None
-    """What a light is in a table of numbers; None: as its shape says."""
+    """A light's numbers in the table are a row or a column; None: as its shape says."""
     strengths: Annotated[Path | None, Role.INPUT] = None
     """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
 
@@ -164,7 +164,7 @@ class RelightlabImport(ImportRequest):
 
 
 class PlaneForm(Choice):
-    """What the four coefficients of a plane mean."""
+    """The equation to which the four coefficients of a plane belong."""
 
     ZERO = "zero", "a x + b y + c z + d = 0"
     EQUALS = "equals", "a x + b y + c z = d"
@@ -179,7 +179,7 @@ class LaserImport(LensOptions, ImageOptions, ImportRequest):
     """File with the plane of each image: rows of four coefficients, or of a point and a normal (.csv, .txt, .npy, .mat), or a calibration
     file with them; None: relit calibrate laser-planes measures them."""
     form: PlaneForm | None = None
-    """What four coefficients of a plane mean."""
+    """The equation to which four coefficients of a plane belong."""
     axes: Axes | None = None
     """Where x, y and z of the planes point as seen by the camera, whose centre is their origin; OpenCV has right,down,away. Needed with
     planes."""
@@ -215,7 +215,7 @@ class ExposureOrder(Choice):
 
 
 class PatternImageOptions(Options):
-    """Which images of the folder are frames of patterns."""
+    """The images of the folder that are frames of patterns."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, such as 'phase_*.png', taken in natural order; None: every image that is not named otherwise."""
@@ -232,7 +232,7 @@ class PatternImageOptions(Options):
     exposures_s: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="S,S,…")] = None
     """Exposure times in seconds at which every pattern was taken, in the order of the images; None: one, which is not needed."""
     exposure_order: ExposureOrder = ExposureOrder.EXPOSURE
-    """What changes first from image to image where there are several exposures."""
+    """The part that changes first from image to image where there are several exposures."""
 
 
 class Inverses(Choice):
@@ -247,7 +247,7 @@ class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
     """Images of a Gray code in any order."""
 
     sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
-    """What follows what in the images: columns, rows, white and black, each once or not at all."""
+    """The order of the parts in the images: columns, rows, white and black, each once or not at all."""
     inverses: Inverses = Inverses.PAIRS
     """Where the inverse images are."""
     fine_first: bool = False
@@ -284,7 +284,7 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
     row_periods: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="P,P,…")] = None
     """Periods along the rows; None: as `periods`."""
     order: Annotated[tuple[Line, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
-    """What changes from image to image, slowest first: axis, period and step."""
+    """The order in which axis, period and step change from image to image, slowest first."""
     shift: PhaseShift = PhaseShift.MINUS
     """Direction in which the waves move from step to step."""
     offset_deg: Finite = 0.0
@@ -308,7 +308,7 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
 
 
 class Codec(Choice):
-    """What a scanning program projects, and in which order."""
+    """The patterns that a scanning program projects, and their order."""
 
     OPENCV_GRAY = "opencv-gray", "GrayCodePattern: columns and rows with inverses, white, black"
     SLSTUDIO_GRAY = "slstudio-gray", "white, black, ten bits of columns, six of rows"
@@ -323,7 +323,7 @@ class ScannerImport(ImportRequest):
     calibration: Annotated[Path, Role.INPUT]
     """Calibration of camera and projector: SLStudio's calibration.xml, or an OpenCV file (.yml, .xml, .json)."""
     codec: Codec
-    """What was projected."""
+    """The patterns that were projected."""
     unit_m: Positive
     """Metres in one unit of the translation: SLStudio has millimetres, 0.001."""
     axis: PatternAxis = PatternAxis.COLUMN

@@ -1,4 +1,4 @@
-"""What `relit register` and `relit fuse` take."""
+"""The options of `relit register` and `relit fuse`."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -11,14 +11,14 @@ from stage.model import Fraction, Line, Positive
 
 
 class GivenPoses(Choice):
-    """What the poses of the scan set are taken for."""
+    """The use of the poses of the scan set."""
 
     REFINED = "refined", "starts, right to about a sixtieth of the object; pairs that do not overlap there are not tried"
     IGNORED = "ignored", "nothing: all pairs are searched"
 
 
 class TableUse(Choice):
-    """What the turntable of the scan set is taken for."""
+    """The use of the turntable of the scan set."""
 
     START = "start", "its angles give the starts of all poses, which then move freely"
     ANGLES = "angles", "the axis is right, and only the angles are found"
@@ -36,9 +36,9 @@ class RegisterOptions(Options):
     """How scans are registered."""
 
     poses: GivenPoses = GivenPoses.REFINED
-    """What the poses of the scan set are taken for."""
+    """The use of the poses of the scan set."""
     turntable: TableUse = TableUse.START
-    """What the turntable of the scan set is taken for, where it has one."""
+    """The use of the turntable of the scan set, where it has one."""
     cell_m: Positive | None = None
     """Side of the cells whose points are averaged for the search without starts, metres. None: a sixtieth of the median extent of the
     scans."""
@@ -84,7 +84,7 @@ class RegisterRequest(RegisterOptions):
 
 
 class Misplaced(Choice):
-    """What becomes of scans that lie beside the surface of the others."""
+    """The treatment of scans that lie beside the surface of the others."""
 
     LEAVE_OUT = "leave-out", "fuse the others, and say which were left out"
     KEEP = "keep", "fuse them all the same"
@@ -96,7 +96,7 @@ class FuseOptions(Options):
     voxel_m: Positive | None = None
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
-    """What becomes of scans that lie beside the surface of the others by more than their σ explain."""
+    """The treatment of scans that lie beside the surface of the others by more than their σ explain."""
     join_normals: bool = False
     """Whether vertices are moved until the surface has the photometric normals of the maps of the scans, without their drift."""
     tiles: bool = False

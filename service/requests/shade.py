@@ -1,4 +1,4 @@
-"""What `relit shade` takes."""
+"""The options of `relit shade`."""
 
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self

@@ -32,7 +32,7 @@ POINT_BYTES = 250
 
 
 class ScanFacts(NamedTuple):
-    """What is kept of a scan that was read."""
+    """Facts of a scan that was read."""
 
     name: str
     content: str

@@ -16,7 +16,7 @@ ALBEDO_NOISE = 2.0
 LARGEST_GAIN = 0.25
 """Change of the brightness of all lights between two steps that is taken for one."""
 GAIN_SPREAD = 0.5
-"""What is left of the changes of albedo, over the change of all, in a change of the brightness of all lights."""
+"""Largest spread of the changes of albedo over their median at which they count as a change of the brightness of all lights."""
 GAIN_SIGMAS = 4.0
 """Least change of the brightness in its standard errors."""
 LEAST_GAIN_PIXELS = 256

@@ -1,4 +1,4 @@
-"""What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
+"""Make the few coefficient images with which a browser relights an object; their coefficients differ from tile to tile.
 
 The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
 captured images together do (kernels.relight.basis.basis has the method and its sources).

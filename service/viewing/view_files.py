@@ -102,7 +102,7 @@ class ViewResult(NamedTuple):
     """Mean difference of relit pictures from those of `relit relight` under lights that the images were not made from, in 255ths of the
     display's range: mean of the lights, and largest; None: there are no coefficient images."""
     findings: tuple[str, ...]
-    """What is wrong with the capture, in sentences."""
+    """Faults of the capture, in sentences."""
 
 
 def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:

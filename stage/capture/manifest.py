@@ -101,7 +101,7 @@ class Manifest(Strict):
     """The part of a highlight's light that `cross` frames still show, over what `cross` and `parallel` frames show of it together. None: 0,
     ideal polarisers."""
     assumed: Annotated[tuple[Text, ...], FirstFault] = ()
-    """What an import took for granted because the files do not say it, as sentences, which `relit info` and the reports repeat. Take a
+    """Assumptions of the import that the files do not confirm, as sentences, which `relit info` and the reports repeat. Take a
     sentence out once it is checked."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
     """The images, in the order in which they were taken if the subject moves."""

@@ -35,7 +35,7 @@ Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]
 
 
 class Emitter(Strict):
-    """What every kind of time-of-flight frame says of the light: where it comes from."""
+    """The position of the light source, which every kind of time-of-flight frame has."""
 
     source_m: Vector | None = None
     """The place of the light source in the camera frame; None: at the camera. Light then goes |p - source| + |p| to a point p and

@@ -26,7 +26,7 @@ HALF = struct.pack("<i", 1)
 
 
 class Scan(NamedTuple):
-    """What was found in the headers of all parts."""
+    """Result of reading the headers of all parts."""
 
     table: int
     """The position of the first byte behind them: of the tables of chunk offsets."""

@@ -225,7 +225,7 @@ PNG16_LEVEL = 2
 """Level at which deflate packs 16-bit images, whose lower bytes are noise: it takes two thirds of the time of the usual 6, for 0.4 % more
 bytes. Images of 8 bits keep the usual level, which saves a tenth of their bytes."""
 PNG_FILTER_NONE = 8
-"""What OpenImageIO calls rows as they are. Filtered rows of 16-bit images are larger, 1 to 30 %, and take twice the time, because a
+"""OpenImageIO's code for unfiltered rows. Filtered rows of 16-bit images are 1 to 30 % larger, and take twice the time, because a
 difference of noise is more noise; only images of 8 bits are filtered."""
 
 

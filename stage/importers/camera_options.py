@@ -75,7 +75,7 @@ def view_of_file(view: View, camera: Path | None, resolution: tuple[int, int]) -
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Which images of a folder are frames."""
+    """Names that choose the frames, the mask and the ambient image of a folder."""
 
     images: str | None = None
     """The names of the frames, as the shell matches them; None: every image that is neither mask nor ambient light."""

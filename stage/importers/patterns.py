@@ -76,7 +76,7 @@ LINEAR: ColorSpaceName = "lin_rec709_scene"
 
 @dataclass(frozen=True, kw_only=True)
 class PatternImages:
-    """Which images of a folder are frames of patterns, and the rig that took them."""
+    """Names that choose the frames of patterns in a folder, and the rig that took them."""
 
     projector: tuple[int, int]
     images: str | None = None

@@ -27,7 +27,7 @@ class GrayStack:
     """How a stack of a Gray code was taken."""
 
     sequence: tuple[str, ...] = ("columns", "rows", "white", "black")
-    """Which parts follow each other: of PARTS, each at most once."""
+    """The order of the parts: members of PARTS, each at most once."""
     inverses: str = "pairs"
     """`pairs`: each image is followed by its inverse; `blocks`: all images of an axis, then their inverses; `none`."""
     fine_first: bool = False

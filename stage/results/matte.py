@@ -60,7 +60,7 @@ PARTIAL = (0.02, 0.98)
 
 
 class MatteSource(StrEnum):
-    """What the coverage of a matte is known from."""
+    """The source of the coverage of a matte."""
 
     FULL = "full"
     """There is no mask: everything is the object."""

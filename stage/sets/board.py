@@ -112,7 +112,7 @@ class NominalMap(Strict):
 
 
 class BoardDesign(Strict):
-    """What a board should be (schema relit.board-design/1)."""
+    """Nominal heights and tolerance regions of a board (schema relit.board-design/1)."""
 
     schema_: Literal["relit.board-design/1"] = Field(alias="schema")
     name: Text

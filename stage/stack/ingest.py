@@ -60,7 +60,7 @@ class Ingest:
     folder: Path
     """The folder of the cache."""
     hint: str
-    """What an error message says about the option that names another folder."""
+    """Advice in error messages: the option that names another folder."""
     fingerprints: Fingerprints
     key: str
     """The key of the stack: a hash of everything that the stored values depend on."""

@@ -87,7 +87,7 @@ SPARE = 24
 
 
 class Sweep(NamedTuple):
-    """Which pixels are surveyed, and how closely."""
+    """The candidates of a survey, and the cost above which a pixel is surveyed."""
 
     rings: tuple[tuple[float, ...], int]
     """Radii of the rings, degrees, and the number of candidates on the last of them."""

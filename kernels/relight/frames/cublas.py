@@ -144,7 +144,7 @@ def split(weights: np.ndarray) -> list[SplitWeights]:
 
 
 class _Opened(NamedTuple):
-    """What became of opening cuBLAS on a device."""
+    """Result of opening cuBLAS on a device."""
 
     gemm: Gemm | None
     problem: str | None

@@ -1,4 +1,4 @@
-"""Which pixels see which lights, over the solved height."""
+"""Find the lights that each pixel sees over the solved height."""
 
 from functools import cache
 from typing import Any

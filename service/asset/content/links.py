@@ -1,4 +1,4 @@
-"""Which neighbouring pixels of a height map lie on one surface: the mesh has faces between these, and between no others.
+"""Find the neighbouring pixels of a height map that lie on one surface: the mesh has faces between these, and between no others.
 
 A camera sees nothing of what lies behind an edge that hides something, and so nothing of how the surface goes on there. Such a break is
 known by the layer `part`, or by a step of the height that is much steeper than the normals of both pixels say. The comparison is made in

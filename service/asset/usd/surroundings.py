@@ -23,7 +23,7 @@ _FILES = re.compile(rf"{ENVIRONMENT}\.(?:exr|usda)|{RIG}\.usda|{RIG}_\d+\.exr|{c
 
 
 class Surroundings(NamedTuple):
-    """What an asset brings along; the camera of the capture and of the frames is that of the asset."""
+    """Lights and relit frames that an asset includes; the camera of the capture and of the frames is that of the asset."""
 
     rig: Capture | None = None
     """Capture whose lights become the variant `rig` of `light`."""

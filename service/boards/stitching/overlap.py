@@ -38,7 +38,7 @@ LEAST_LOG_ODDS = 7.0
 
 
 class Evidence(StrEnum):
-    """What an overlap says about the shift."""
+    """Result of measuring the shift in an overlap."""
 
     SHIFT = "shift"
     """The shift is measured."""
@@ -51,7 +51,7 @@ class Evidence(StrEnum):
 
 
 class Overlap(NamedTuple):
-    """What the common pixels of two patches say about their motions: the difference first − second is `difference`."""
+    """The difference of the motions of two patches (first − second), estimated from their common pixels."""
 
     evidence: Evidence
     difference: np.ndarray  # [6] metres

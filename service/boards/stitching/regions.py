@@ -13,7 +13,7 @@ from stage.sets.board import Region
 
 
 class Verdict(StrEnum):
-    """What was decided about a region or a board."""
+    """The decision about a region or a board."""
 
     PASS = "pass"
     """Within the tolerance, by more than the uncertainty."""
@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 
 
 class RegionResult(NamedTuple):
-    """What was found about a region."""
+    """Verdict and measured deviation of a region."""
 
     region: Region
     verdict: Verdict

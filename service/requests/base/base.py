@@ -45,7 +45,7 @@ CropBox = tuple[NotNegativeCount, NotNegativeCount, Count, Count]
 
 
 class Role(StrEnum):
-    """What the value of a field is; written into `Annotated`, CHOICE where nothing is written."""
+    """The role of a field in a request; written into `Annotated`, CHOICE where nothing is written."""
 
     CHOICE = "choice"
     """A choice about the work: it is recorded with the results, and `relit submit` and `relit farm template` have it too, for the commands
@@ -57,7 +57,7 @@ class Role(StrEnum):
     MACHINE = "machine"
     """Where the work is done: the device, and the folder for caches."""
     RUN = "run"
-    """What one run does beside the work: all frames anew, a contact sheet, a report."""
+    """A choice about one run beside the work: all frames anew, a contact sheet, a report."""
     PART = "part"
     """The part of the work that one run does. It is recorded nowhere, so that results do not say how the work was divided."""
 

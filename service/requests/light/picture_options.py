@@ -1,4 +1,4 @@
-"""What all requests for pictures under new light have in common."""
+"""Options that all requests for pictures under new light share."""
 
 from typing import Annotated
 

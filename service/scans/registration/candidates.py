@@ -1,4 +1,4 @@
-"""Which pairs of scans are worth a registration: those that overlap at known poses, or else those whose surfaces look alike."""
+"""Choose the pairs of scans to register: those that overlap at known poses, or else those whose surfaces look alike."""
 
 from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
@@ -22,11 +22,11 @@ SAMPLE = 200
 CELL_LIMIT = 1 << 19
 """Cells of the world are numbered from minus to plus so many along each axis."""
 STEPS = np.array([1, 2 * CELL_LIMIT, 4 * CELL_LIMIT**2])
-"""What the number of a cell grows by from one to the next along each axis; six times the largest number is a 64-bit integer still."""
+"""Strides of the cell number along each axis; six times the largest number still fits a 64-bit integer."""
 
 
 class Outline(NamedTuple):
-    """What is kept in memory of every scan, to choose pairs."""
+    """Reduced points, normals and features of a scan, kept in memory to choose pairs."""
 
     points: np.ndarray  # [n, 3] float32 metres, of the rough scale
     normals: np.ndarray  # [n, 3] float32, of these points

@@ -1,4 +1,4 @@
-"""What the surfaces of scans say of poses that are not to be moved."""
+"""Compare the surfaces of scans with poses that are not to be moved."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,4 @@
-"""What the range image of one scan says of the points of another: seen, hidden behind the surface, or where the camera saw through."""
+"""Compare the points of one scan with the range image of another: seen, hidden behind the surface, or where the camera saw through."""
 
 from typing import NamedTuple
 

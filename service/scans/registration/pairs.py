@@ -60,7 +60,7 @@ SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
 
 
 class PairState(StrEnum):
-    """What became of a pair."""
+    """The outcome of registering a pair."""
 
     JOINED = "joined"
     NO_POSE = "no pose"
@@ -75,7 +75,7 @@ class PairState(StrEnum):
 
 
 class Evidence(StrEnum):
-    """What the pose of a pair was found by."""
+    """The data from which the pose of a pair was found."""
 
     SURFACES = "surfaces"
     TARGETS = "targets"
@@ -88,7 +88,7 @@ class Pair(NamedTuple):
     b: int
     state: PairState
     fit: Fit | None
-    """What the best pose leaves; None: no pose was found."""
+    """The best pose and its residuals; None: no pose was found."""
     overlap: float
     """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
     contradicted: float

@@ -28,7 +28,7 @@ STEPS = 6
 
 
 class TargetPose(NamedTuple):
-    """What the common targets of two scans say of their pose."""
+    """The pose of two scans from their common targets."""
 
     common: tuple[str, ...]
     state: PairState

@@ -1,4 +1,4 @@
-"""What the steps of a job are given: the worker that does them, and the job."""
+"""The arguments of the steps of a job: the worker that does them, and the job."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from service.server.storage.objects import Storage
 
 
 class WorkerContext(NamedTuple):
-    """What the steps of a worker need."""
+    """Services and settings that the steps of a worker need."""
 
     database: Database
     storage: Storage
