@@ -48,7 +48,7 @@ class Source:
     """The path as it was given, for messages."""
     file: BinaryIO
     confined: bool
-    """Whether it lies in a folder that `confined` names."""
+    """True if it lies in a folder that `confined` names."""
     max_pixels: int | None
 
     @contextmanager

@@ -8,7 +8,7 @@ import warp as wp
 from kernels import device as devices
 
 EDGE = 1.0e-5
-"""How far outside of a triangle a texel may lie, in barycentric coordinates, so that none is missed between two triangles."""
+"""The largest distance of a texel outside of a triangle, in barycentric coordinates, so that none is missed between two triangles."""
 
 
 @wp.func

@@ -1,5 +1,5 @@
-"""How far each pixel of a view lies from the fused surface, as the voxels of a brick tell, and how far the surfaces of two views lie apart
-where both measured the same place."""
+"""Measure the distances of the pixels of a view from the fused surface, by the voxels of a brick, and the distances between the surfaces of
+two views where both measured the same place."""
 
 from typing import Any
 

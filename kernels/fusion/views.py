@@ -23,7 +23,7 @@ SPACING = 0.29
 """Standard deviation in pixels that the weights of readings use in its place: that of a uniform distribution over a pixel, 1/√12. The chord
 between pixels cuts a bent surface short, more so at grazing angles; that error does not average out."""
 WIDER = 1.3
-"""How much longer than without distortion lines of sight are taken to be, where only their greatest length matters."""
+"""Factor by which distortion is taken to lengthen lines of sight, where only their greatest length matters."""
 LEAST_NORMAL = 2.0
 """Least length of the sum of the normals of the four pixels of a cell: shorter, they show no one surface."""
 LEAST_COSINE = 0.2
@@ -54,7 +54,7 @@ class RangeImage(NamedTuple):
     first_row: int = 0  # of the arrays in the image that `principal` is of
     first_col: int = 0
     orthographic: bool = False
-    """Whether the lines of sight are parallel; the frame then lies before everything that was measured, so that depths are above 0."""
+    """True if the lines of sight are parallel; the frame then lies before everything that was measured, so that depths are above 0."""
 
     def pixel_m(self, depth: float) -> float:
         """Return the distance of neighbouring pixels at a depth, both in metres."""

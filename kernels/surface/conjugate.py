@@ -25,7 +25,7 @@ CHECK_EVERY = 4
 
 
 class Convergence(NamedTuple):
-    """How a solve ended."""
+    """The end of a solve."""
 
     iterations: int
     residual: float  # preconditioned residual norm over that of the first guess

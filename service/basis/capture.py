@@ -105,7 +105,7 @@ class StackBand(NamedTuple):
     """A band of the stack with some pixel inside the mask."""
 
     span: slice
-    """Its pixels in the image, without padding."""
+    """The pixels of the band in the image, without padding."""
     band: packs.Band
     inside: np.ndarray  # [pixels of the band] bool
 

@@ -47,7 +47,7 @@ class InspectBoardResult(NamedTuple):
     report_path: Path
     picture_path: Path
     findings_path: Path | None
-    """None if there was nothing to compare with."""
+    """The findings.csv; None if there was nothing to compare with."""
     verdict: Verdict | None
     """The verdict on the whole board; None if there was nothing to compare with."""
     defects: list[Defect]

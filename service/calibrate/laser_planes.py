@@ -45,7 +45,7 @@ class MeasuredPlane(NamedTuple):
     normal: np.ndarray  # [3] unit
     sigma_degrees: float
     facts: dict[str, float]
-    """Its entries of the report."""
+    """Entries of the report."""
     words: tuple[str, str]
 
 

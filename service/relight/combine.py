@@ -28,7 +28,7 @@ class RowBlock(NamedTuple):
     last: int
     """Behind the last row."""
     pixels: slice
-    """Their pixels in the stack; those of the last rows include its padding."""
+    """The pixels of the rows in the stack; those of the last rows include its padding."""
 
 
 def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:

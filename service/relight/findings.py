@@ -34,7 +34,7 @@ class FrameFindings:
     """The worst of the frames that were made."""
 
     guided: bool
-    """Whether a model of solved maps guides the frames."""
+    """True if a model of solved maps guides the frames."""
     beyond: float = 0.0
     """Largest share of a frame's energy from beyond the captured lights."""
     beyond_frame: int | None = None

@@ -29,7 +29,7 @@ the work."""
 
 
 class ModelUse(Enum):
-    """Whether a model of the surface is lit too, and for how many frames."""
+    """The use of a surface model: for one frame or few, or for many."""
 
     NONE = auto()
     FRAME = auto()

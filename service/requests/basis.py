@@ -18,7 +18,7 @@ class BasisKind(Choice):
 
 
 class BasisCount(StackOptions):
-    """How many coefficients are kept."""
+    """The number of coefficients that are kept."""
 
     count: int | None = Field(default=None, ge=1)
     """Coefficients in each channel. svd: 1 to the number of lights; hsh: 4, 9 or 16; both kinds of ptm: always 6. None: svd: 16, or the

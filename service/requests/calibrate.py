@@ -103,7 +103,7 @@ class BallOptions(LightsOptions):
 
 
 class MirrorBallOptions(BallOptions):
-    """How the highlight on a mirror ball is found."""
+    """Options for finding the highlight on a mirror ball."""
 
     level: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """The highlight on the ball is what is brighter than this fraction of its peak."""
@@ -133,7 +133,7 @@ class GreyBallOptions(BallOptions):
 
 
 class IntensityOptions(LightsOptions):
-    """How many pixels of the object are looked at."""
+    """The number of pixels of the object that are used."""
 
     pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
     """Number of pixels of the mask, drawn at random, that are used: 100 to 100000."""
@@ -201,7 +201,7 @@ class FlatFieldRequest(FramesRequest):
 
 
 class WhiteBalanceOptions(Options):
-    """How colours follow from a grey or white card."""
+    """Options for white balance by a grey or white card."""
 
     region: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
     """Part of the images that the card fills: first column, first row, width and height in pixels; None: all of it."""

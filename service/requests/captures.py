@@ -84,7 +84,7 @@ class ImageOptions(Options):
     """The images of the folder that are frames, and their encoding."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the one of ambient light."""
+    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the ambient image."""
     mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image of the mask; None: the one with the word mask in its name, if there is one."""
     ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
@@ -94,21 +94,21 @@ class ImageOptions(Options):
 
 
 class Sense(Choice):
-    """Where the vectors of a table point."""
+    """The direction of the vectors of a table."""
 
     TO_LIGHT = "to-light", "directions to the light, or its position seen from the object"
     FROM_LIGHT = "from-light", "along the rays, away from the light"
 
 
 class Run(Choice):
-    """The direction in which a light's numbers run in a table."""
+    """The rows or columns of a table of numbers, each a light."""
 
     ROWS = "rows"
     COLUMNS = "columns"
 
 
 class AxisWay(Choice):
-    """Where an axis points, as seen by the camera."""
+    """The direction of an axis, as seen by the camera."""
 
     RIGHT = "right"
     LEFT = "left"
@@ -208,7 +208,7 @@ class RigOptions(Options):
 
 
 class ExposureOrder(Choice):
-    """How the images of several exposures follow each other."""
+    """The order of the images of several exposures."""
 
     EXPOSURE = "exposure", "each pattern at all exposures, then the next pattern"
     PATTERN = "pattern", "all patterns at one exposure, then at the next"
@@ -236,7 +236,7 @@ class PatternImageOptions(Options):
 
 
 class Inverses(Choice):
-    """Where the inverse images of a Gray code are."""
+    """The place of the inverse images of a Gray code."""
 
     PAIRS = "pairs", "each image is followed by its inverse"
     BLOCKS = "blocks", "all images of an axis, then their inverses"
@@ -249,7 +249,7 @@ class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
     sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
     """The order of the parts in the images: columns, rows, white and black, each once or not at all."""
     inverses: Inverses = Inverses.PAIRS
-    """Where the inverse images are."""
+    """The place of the inverse images."""
     fine_first: bool = False
     """The finest stripes come first; else the coarsest."""
     column_bits: Count | None = None
@@ -259,14 +259,14 @@ class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
 
 
 class PhaseShift(Choice):
-    """How the waves move from step to step."""
+    """The direction in which the waves move from step to step."""
 
     MINUS = "minus", "cos(2πu/P − 2πi/N), to larger columns, as relit and SLStudio do"
     PLUS = "plus", "cos(2πu/P + 2πi/N)"
 
 
 class WaveOrigin(Choice):
-    """Where the column 0 of a wave lies in the projector."""
+    """The place of column 0 of a wave in the projector."""
 
     EDGE = "edge", "at the outer edge of the first pixel, as relit has it"
     CENTRE = "centre", "at its centre, as in cos(2πx/P) with the number x of the pixel"
@@ -290,13 +290,13 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
     offset_deg: Finite = 0.0
     """Phase at `origin` in the first step, degrees. Waves that are sines have -90."""
     origin: WaveOrigin = WaveOrigin.EDGE
-    """Where the waves have column 0."""
+    """The place of column 0 of the waves."""
     gray_images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the images of a Gray code that numbers the periods."""
     gray_stripe: Positive | None = None
     """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
     gray_inverses: Inverses = Inverses.NONE
-    """Where the inverse images of the Gray code are."""
+    """The place of the inverse images of the Gray code."""
     gray_fine_first: bool = False
     """The finest stripes of the Gray code come first."""
 

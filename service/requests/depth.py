@@ -49,7 +49,7 @@ class WhichReturn(Choice):
 
 
 class TofChoices(Options):
-    """How time of flight is solved."""
+    """Options of the solver for time of flight."""
 
     filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_without_blanks), Commas, Spelling(flag="--filter")] = ()
     """Filters of time of flight, as text with commas between."""
@@ -64,7 +64,7 @@ class TofChoices(Options):
 
 
 class TofOptions(TofChoices):
-    """How time of flight is solved, with the camera's calibration."""
+    """Options of the solver for time of flight, with the camera's calibration."""
 
     calibration: Annotated[Path | None, Role.INPUT, Spelling(flag="--tof-calibration")] = None
     """Noise, wiggling, offset, drift and pulse of a time-of-flight camera: a relit.tof/1 file; None: noise and pulse are estimated from
@@ -72,7 +72,7 @@ class TofOptions(TofChoices):
 
 
 class DepthOptions(PixelOptions):
-    """How depth is decoded, and which depths are kept."""
+    """Options for decoding depth, and for the depths that are kept."""
 
     using: Ranging | None = None
     """The kind of frames to use; needed only where a capture has several kinds."""

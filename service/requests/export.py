@@ -26,7 +26,7 @@ class Geometry(Choice):
 
 
 class TextureFormat(Choice):
-    """How the textures of an asset are stored."""
+    """The file format of the textures of an asset."""
 
     PNG16 = "png16", "16 bits, which every client reads; colours as sRGB"
     PNG8 = "png8", "8 bits for colours, a fifth of the size; normals, roughness and metallic keep 16, but not in a .glb"

@@ -73,7 +73,7 @@ class HistogramImport(ArrayOptions, ImportRequest):
     first_photon_only: bool = False
     """The detector counts the first photon of a pulse alone: pile-up is corrected with `pulses`."""
     bins: End = End.LAST
-    """Where the bins are counted in the arrays."""
+    """The axis of the arrays along which the bins are counted."""
 
 
 class KinectImport(CameraOptions, ImportRequest):

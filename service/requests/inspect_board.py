@@ -17,7 +17,7 @@ class BoardForm(Choice):
 
 
 class InspectBoardOptions(Options):
-    """How tiles are stitched, and when a deviation is a defect."""
+    """Options for stitching tiles, and for the deviations that are defects."""
 
     pixel_m: Positive | None = None
     """Side of a pixel of the height map in metres, where no golden map or design gives it. None: the largest distance of neighbouring

@@ -29,7 +29,7 @@ MOST_SCANS = 500
 
 
 class CheckJob(JobRequest):
-    """Whether a capture or environment can be used: manifest, headers and the size of images. Made by the service itself."""
+    """Check that a capture or environment can be used: manifest, headers and the size of images. The service makes this job on its own."""
 
     kind: Literal["check"]
     intake: Line

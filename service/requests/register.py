@@ -33,7 +33,7 @@ class Markers(Choice):
 
 
 class RegisterOptions(Options):
-    """How scans are registered."""
+    """Options for registering scans."""
 
     poses: GivenPoses = GivenPoses.REFINED
     """The use of the poses of the scan set."""
@@ -91,19 +91,19 @@ class Misplaced(Choice):
 
 
 class FuseOptions(Options):
-    """How scans are fused."""
+    """Options for fusing scans."""
 
     voxel_m: Positive | None = None
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
     """The treatment of scans that lie beside the surface of the others by more than their σ explain."""
     join_normals: bool = False
-    """Whether vertices are moved until the surface has the photometric normals of the maps of the scans, without their drift."""
+    """Move vertices until the surface has the photometric normals of the maps of the scans, without their drift."""
     tiles: bool = False
-    """Whether the surface is written as tiles (site.usda with payloads, and PLY files) in place of mesh.ply and asset.usdc, so that memory
+    """Write the surface as tiles (site.usda with payloads, and PLY files) in place of mesh.ply and asset.usdc, so that memory
     does not grow with its size. Tiles have the colours of their vertices and no textures."""
     texture: bool = True
-    """Whether asset.usdc is made: a mesh of fewer faces with textures of what the views show."""
+    """Make asset.usdc: a mesh of fewer faces with textures of what the views show."""
     texture_faces: Annotated[int, Field(ge=100, le=2_000_000)] = 30_000
     """Most faces of the mesh of asset.usdc; mesh.ply has all."""
     texture_px: Annotated[int, Field(ge=64, le=16384)] = 2048

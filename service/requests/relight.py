@@ -13,7 +13,7 @@ later. A task of a render farm makes as many by default: with fewer, images are 
 
 
 class LightWeights(Choice):
-    """How light from a direction between the captured lights is shared out over them."""
+    """The rule that shares out light from a direction between the captured lights over them."""
 
     KERNEL = "kernel", "so that the expected error of the frame is least"
     CELLS = "cells", "all of it to the nearest light"

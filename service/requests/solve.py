@@ -18,7 +18,7 @@ little more than that the surface faces the camera."""
 
 
 class Method(Choice):
-    """How normals are solved."""
+    """The method that solves normals."""
 
     LAMBERT = "lambert", "least squares on every light that gave a reading"
     ROBUST = "robust", "least squares on the lights that are neither in shadow nor in a highlight at the pixel"
@@ -43,7 +43,7 @@ class LightsKnown(Choice):
 
 
 class SolveOptions(StackOptions):
-    """How normals, albedo and height are solved."""
+    """Options for solving normals, albedo and height."""
 
     method: Method | None = Field(default=None, description=(
         "How normals are solved; None: gradient where there are gradient frames; else svbrdf where there are extended lights, or "

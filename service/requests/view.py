@@ -12,7 +12,7 @@ MOST_TERMS = 256
 
 
 class ViewOptions(StackOptions):
-    """How a capture is shown."""
+    """Options for showing a capture."""
 
     terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] | None = None
     """Most coefficient images that the object is relit with in the browser; fewer where fewer show the object as well. More are closer to

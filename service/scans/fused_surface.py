@@ -47,7 +47,7 @@ class Surface(NamedTuple):
 
 
 class Tally:
-    """How the pixels of one scan lie to the fused surface."""
+    """Counts of the pixels of one scan by their place relative to the fused surface."""
 
     def __init__(self) -> None:
         """Begin without a pixel."""

@@ -30,7 +30,7 @@ class MapsJoiner:
     """The recursive mean of solved maps, step by step."""
 
     anchored: bool
-    """Whether the height has no place of its own, as under distant lights: the part at rest then keeps its height."""
+    """True if the height has no place of its own, as under distant lights: the part at rest then keeps its height."""
     _before: SurfaceMaps | None = None
     _gain: float = 1.0
     _normal: Track | None = None

@@ -29,7 +29,7 @@ from stage.stack.ingest import TOP_EXPONENT
 from stage.stack.stack import Stack
 
 LEAST_LIGHTS = 4
-"""With fewer lights there is nothing to relight with: they do not surround any direction."""
+"""The least number of lights for relighting: fewer do not surround any direction."""
 DEFAULT_TERMS = 32
 """Most coefficient images, unless the request says otherwise."""
 RELATIVE_RMS = 0.005

@@ -22,7 +22,7 @@ NO_TILE = 0xFFFF
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image is divided."""
+    """The division of an image into tiles."""
 
     side: int
     index: np.ndarray  # [rows of tiles, columns of tiles] uint16, row by row from 0; NO_TILE where the object is not

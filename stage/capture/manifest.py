@@ -91,7 +91,7 @@ class Manifest(Strict):
     """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
     frames of lights alone."""
     color_matrix: Annotated[ColorMatrix, AfterValidator(_invertible)] | None = None
-    """By rows, the matrix from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
+    """The matrix, by rows, from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
     of a camera raw file, as `relit calibrate white-balance` measures it. None: the colours are used as they are."""
     exposure_from: Literal["exif"] | None = None
     """`exif` where the exposure time of every frame is the one that EXIF in its file says. None: `exposure_s` of the frames."""

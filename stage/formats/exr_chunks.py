@@ -1,4 +1,4 @@
-"""Whether an OpenEXR file is whole, as its tables of chunk offsets tell; no pixel is decoded.
+"""Check that an OpenEXR file is whole, as its tables of chunk offsets tell; no pixel is decoded.
 
 Source: "OpenEXR File Layout" of the OpenEXR documentation.
 """

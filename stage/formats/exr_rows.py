@@ -27,7 +27,7 @@ BLOCK_ROWS = 32
 
 
 class _Attribute(NamedTuple):
-    """Where the value of an attribute lies in a header."""
+    """The place of an attribute's value in a header."""
 
     part: int
     name: bytes

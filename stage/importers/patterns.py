@@ -95,7 +95,7 @@ class PatternImages:
     video: VideoFrames | None = None
     """The video that the images were unpacked from; None: they are photographs."""
     patterns_first: bool = False
-    """Whether all patterns were taken at one exposure before the next; else each pattern at all exposures."""
+    """True if all patterns were taken at one exposure before the next; else each pattern at all exposures."""
 
     def exposed(self, entries: Sequence[Entry]) -> list[tuple[Entry, float | None]]:
         """Return each image's pattern and exposure time, in the order of the images."""

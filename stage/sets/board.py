@@ -105,7 +105,7 @@ class NominalMap(Strict):
     """An EXR with height.Z in metres, relative to the file; NaN, or mask.Y 0, where nothing is nominal. sigma.Z, if there, is its
     standard deviation."""
     resolution: tuple[Count, Count]
-    """Its width and height in pixels."""
+    """Width and height in pixels."""
     pixel_m: Positive
     top_left_m: Place
     """Board-frame x and y of the upper left corner of its first pixel."""

@@ -124,7 +124,7 @@ class Correction:
 
     @property
     def _is_pointwise(self) -> bool:
-        """Whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
+        """Return whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
         return self.capture.manifest.color_matrix is None and self.dark is None and self.flat is None and self.ambient is None
 
     def at(self, pixels: np.ndarray) -> "Correction":

@@ -119,7 +119,7 @@ class SplitWeights(NamedTuple):
     first: np.ndarray  # [3, GROUP, lights] float16, h; its magnitude is below 2^EXPONENTS
     second: np.ndarray  # [3, GROUP, lights] float16, r
     is_first: bool
-    """Whether no other weights of the group come before."""
+    """True if no other weights of the group come before."""
 
 
 def split(weights: np.ndarray) -> list[SplitWeights]:

@@ -1,4 +1,4 @@
-"""How well a histogram tells the time of a return: mean and standard deviation of the time's posterior.
+"""Estimate the time of a return from a histogram: mean and standard deviation of the time's posterior.
 
 The Fisher information bounds the error, and meets it where it is small beside the pulse and the bins. With few photons over some
 background the error is larger (the threshold effect), and where one bin holds the whole pulse the information about its time is zero

@@ -30,7 +30,7 @@ NEIGHBOURS = ((_ALL, _FIRST), (_ALL, _LAST)), ((_FIRST, _ALL), (_LAST, _ALL))
 
 
 class Links(NamedTuple):
-    """Where two neighbouring pixels both have a height and lie on one surface."""
+    """True where two neighbouring pixels both have a height and lie on one surface."""
 
     right: np.ndarray  # [rows, cols - 1] bool, between a pixel and the one to its right
     down: np.ndarray  # [rows - 1, cols] bool, between a pixel and the one below it

@@ -32,7 +32,7 @@ class Surroundings(NamedTuple):
     card: Mapping[int, Path] | None = None
     """Relit frames by their numbers, which become the variant `card` of `geo`."""
     clipped: dict[str, int] | None = None
-    """As in stage.colour.environment_maps.read_environment, for lat-long maps."""
+    """Counts of clipped values as in stage.colour.environment_maps.read_environment, for lat-long maps."""
 
 
 class AssetFiles(NamedTuple):

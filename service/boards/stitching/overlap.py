@@ -1,4 +1,4 @@
-"""How one patch of heights lies against another that shows the same surface: shift, rotation, offset and tilt, with their information.
+"""Register one patch of heights to another that shows the same surface: shift, rotation, offset and tilt, with their information.
 
 A motion is six numbers in metres: x, y, rotation about z, height, and the slopes along x and y; rotation and slopes are multiplied by the
 half-length L of the board. The coarse search compares the patches at every shift of whole pixels that the stage's error allows

@@ -48,7 +48,7 @@ class Scan(NamedTuple):
     threshold: float
     """σ from which on a window is significant."""
     detectable_m: dict[int, float]
-    """By the side of windows in pixels: the deviation that is found with a probability of 95 % in the median window."""
+    """By the side of windows in pixels, the deviation that is found with a probability of 95 % in the median window."""
 
 
 def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:

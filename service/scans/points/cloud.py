@@ -49,7 +49,7 @@ class Thinned(NamedTuple):
     directions: np.ndarray  # [n, 3] float64, unit, from the camera
     sigma: np.ndarray  # [n] float64 metres
     even: bool = True
-    """Whether points are as far apart on all of the surface."""
+    """True if points are as far apart on all of the surface."""
 
 
 def thinned_scan(scan: Scan) -> Thinned:

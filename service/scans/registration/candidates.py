@@ -41,7 +41,7 @@ def outline_of(ready: Prepared, cell_m: float) -> Outline:
 
 
 class Overlaps:
-    """How much scans overlap at poses, from above: by cells of the world that both are in or beside."""
+    """Upper bound of the overlap of scans at poses: by cells of the world that both are in or beside."""
 
     def __init__(self, outlines: Mapping[int, Outline], poses: Mapping[int, np.ndarray], near_cells: float) -> None:
         """Args: outlines: of the scans. poses: world_from_scan [4, 4] of those that have one. near_cells: how far points may be apart."""
@@ -66,7 +66,7 @@ class Overlaps:
         return float(inside / (min(len(own), len(self._outlines[a].points)) if alike else len(own)))
 
     def facing(self, a: int, b: int) -> float:
-        """Return about which part of the smaller scan, or of the one of smaller scale, has surface of the other around it that is turned
+        """Return about which part of the smaller scan, or of the scan of smaller scale, has surface of the other around it that is turned
         the same way, so that both can have seen it: what pairs are ordered by."""
         side = self._near * max(self._outlines[a].cell_m, self._outlines[b].cell_m)
         if self._outlines[a].cell_m < self._outlines[b].cell_m:

@@ -33,7 +33,7 @@ seen edge-on lies between its pixels."""
 
 
 class Sight(NamedTuple):
-    """How many points of one scan another scan sees, or contradicts."""
+    """Numbers of points of one scan that another scan sees, or contradicts."""
 
     agreeing: int
     """Points on the surface that the camera measured."""
@@ -54,7 +54,7 @@ class Contradiction(NamedTuple):
     points: float
     """All of them."""
     surface: float
-    """Those of a part of the surface which the other camera cannot have missed."""
+    """The contradicted points on a part of the surface which the other camera cannot have missed."""
 
 
 def depth_range(scan: Scan) -> DepthRange | None:

@@ -30,7 +30,7 @@ class PairTask(NamedTuple):
     near_cells: float
     """Points overlap at the start if they are at most this many cells apart."""
     may_search: bool
-    """Whether the pose is searched if the start does not lead to one."""
+    """True if the pose is searched if the start does not lead to one."""
 
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:

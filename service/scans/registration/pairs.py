@@ -45,13 +45,13 @@ details are large has .2 with them and 5 to 50 without, and is tried out for the
 TRIED_POINTS = 800
 """The most points of the fit that is first tried out."""
 SHIFTS = (0.1, -0.1, 0.3)
-"""By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
+"""Distances, in parts of the size of the scans, by which a scan is moved along a weak direction to try it out."""
 NEAR_SHIFT = 3.0
 """The same from a start, in spacings: a place far from the start is none."""
 KEPT = 0.3
 """The part of such a shift that is left after a fit, from which on the scan slides along the direction."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
-"""Another pose fits as well if its residual is at most this many times that of the best, its overlap that part of it at the least, and not
+"""Another pose fits as well if its residual is at most this many times that of the best, its overlap at least that part of it, and not
 this much more of it is contradicted."""
 
 

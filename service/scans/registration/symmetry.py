@@ -1,4 +1,4 @@
-"""Whether a scan looks much the same when it is turned about an axis, so that little of it tells one of its poses from another."""
+"""Test whether a scan looks much the same when it is turned about an axis, so that little of it tells one of its poses from another."""
 
 import numpy as np
 

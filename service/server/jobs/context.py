@@ -34,7 +34,7 @@ class WorkerContext(NamedTuple):
     worker: str = ""
     """Name of the worker."""
     queue: JobQueue | None = None
-    """Where other workers are asked to help; None: nobody is asked."""
+    """The queue in which other workers are asked to help; None: nobody is asked."""
 
     settings: Settings | None = None
     """The settings of the service, for its quotas and `min_free_bytes`; None: neither is looked at."""
@@ -58,7 +58,7 @@ class Job(NamedTuple):
     chunk_frames: int
     attempt: int = 1
     is_resumed: bool = False
-    """Whether it has lost a worker since it last made progress."""
+    """True if the job has lost a worker since it last made progress."""
 
     @classmethod
     def of(cls, row: sa.RowMapping | Mapping[str, Any]) -> "Job":
