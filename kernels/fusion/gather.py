@@ -109,7 +109,6 @@ def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: A
         sigma: wp.array [n] metres, standard deviation of the place of each point.
         vectors: count of the first channels that are vectors of the camera frame, three by three; they are turned to the world frame.
         slack: distance in metres by which a point may lie off its surface beside that, as on a simplified mesh.
-        device: where the arrays are.
     """
     count, channels = len(points), layers.shape[1]
     values = wp.empty((count, channels), dtype=float, device=device)

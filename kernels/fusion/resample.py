@@ -174,7 +174,6 @@ def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: 
         depths, sigmas: [n] metres, above 0; the errors of points are independent.
         shape: rows and columns of the image.
         focal: of the camera, pixels.
-        device: where to compute.
     """
     rows, cols = shape
     col, row = np.floor(places).astype(np.int64).T

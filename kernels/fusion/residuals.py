@@ -100,12 +100,10 @@ def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, va
     """Compare points that one view measured with the surfaces that others measured there; waits for the device.
 
     Args:
-        views: the range images.
         points, normals: [n, 3] metres in the coordinates of the views, and unit vectors of the world frame.
         variance: [n] square metres, of each point along its normal.
         skipped: number of the view that measured the points, which are not compared with it; −1 where it is not among the views.
         reach: metres; surfaces farther off are other surfaces.
-        device: where the arrays are.
 
     Returns:
         [n, V] float32: the distance of each point from the surface of each view along its normal, metres, and what standard deviation the

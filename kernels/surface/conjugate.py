@@ -131,7 +131,6 @@ class Solver:
     levels.
 
     Args:
-        grid: the layout.
         slopes: of all edges, and their weights.
         max_iterations: of `solve`.
         overwrite: whether the slopes may be overwritten, though not their weights: only the first residual needs them.

@@ -134,7 +134,6 @@ def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -
     Args:
         weights: of the edges of a grid; changed.
         cuts: [rows, cols] bool, edges to the right and edges down.
-        grid: the layout.
     """
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
         kept = plane.numpy()

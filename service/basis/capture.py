@@ -117,7 +117,6 @@ def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings
         source, device: the capture, and where.
         bytes_per_pixel: what the caller allocates beside the stack for each pixel.
         timings: told of the bands as one `stage` of the work.
-        stage: its name.
     """
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))

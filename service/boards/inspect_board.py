@@ -80,7 +80,6 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
 
     Args:
         request: what to inspect and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input, or tiles or heights that do not fit together; nothing is written.

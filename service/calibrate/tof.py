@@ -54,7 +54,6 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
 
     Args:
         request: the sweep, and the file to write.
-        progress: told how far the work is.
         allowed: folders of the captures that the sweep may name; None: any.
 
     Raises:

@@ -128,7 +128,6 @@ def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
     """Return what is wrong with a capture beside its frames: lights that determine no normal, the mask, the dark and flat frames.
 
     Args:
-        capture: an opened capture.
         readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
     """
     faults = []

@@ -64,7 +64,6 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
         places: the row of each frame in the full chunk, also when only some of its frames are made: cuBLAS sums may differ by row, and
             frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
             faster product is used.
-        device: where.
         pixels: of a block of rows; None: all.
     """
     channels, _, count = stack.shape

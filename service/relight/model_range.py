@@ -132,9 +132,7 @@ class ModelRange:
     """Lights a model of the surface for many frames."""
 
     def __init__(self, model: SurfaceModel, lights: DistantLights) -> None:
-        """Args:
-            model: the surface.
-            lights: the captured lights.
+        """Prepare the model for the captured lights.
 
         Raises:
             ArrayError: fewer than four lights, or all in one plane.

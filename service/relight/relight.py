@@ -66,7 +66,6 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
 
     Args:
         request: captures, light, frames and where to put them.
-        progress: told of every stage.
 
     Returns:
         The frames, and what the user should know of them.

@@ -64,7 +64,6 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
 
     Args:
         request: maps, lights and where the picture goes.
-        progress: told of every stage.
 
     Raises:
         RequestError: no light, a file that is no .exr, or one that would replace an input.

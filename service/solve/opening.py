@@ -50,7 +50,6 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
 
     Args:
         capture: that of the request with its pixels; None: it is opened here.
-        timings: told of every stage.
         sharing: the part of this process where several share the solve.
         over_time: what the captures of a sequence share.
 

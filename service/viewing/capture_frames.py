@@ -72,7 +72,6 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
     """Decode every frame of a capture once.
 
     Args:
-        capture: an opened capture.
         mask: [rows, cols] bool.
         timings: told of every frame.
     """
@@ -114,7 +113,6 @@ def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[lis
     """Return what view.json says of every frame.
 
     Args:
-        capture: an opened capture.
         found: its images.
         thumbnails: where the picture of each frame lies in the atlas.
         suspects: a sentence for each image whose light disagrees with the others.

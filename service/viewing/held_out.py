@@ -32,7 +32,6 @@ class HeldOutLights:
         """Choose the lights, and an exposure for each.
 
         Args:
-            stack: the captured images.
             lights: of the images.
             transfer: their table of directions.
             covered: [pixels padded] bool, pixels of the object.

@@ -54,13 +54,10 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     """Write basis, matte, weights and coefficients of the captured images, and return what view.json says of them.
 
     Args:
-        stack: the captured images.
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
         file: for the blocks.
         most_terms: most coefficient images; None: DEFAULT_TERMS.
-        device: where.
-        timings: told of every stage.
 
     Raises:
         ArrayError: a light gives nothing in a channel.

@@ -66,7 +66,6 @@ def tile_rows(stack: Stack, factor: np.ndarray, tiling: Tiling, step: int, timin
     """Yield the captured images row by row of tiles, without rows that hold nothing of the object.
 
     Args:
-        stack: the captured images.
         factor: [rows, cols] of the whole image, which the images are multiplied with.
         tiling: of the image that is reduced by the step.
         step: whole factor by which the images are reduced.

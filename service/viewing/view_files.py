@@ -110,7 +110,6 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
 
     Args:
         request: the capture, the maps if there are any, and the folder of the results.
-        progress: told of every stage.
 
     Raises:
         RequestError: a file of the view would replace one of the capture.

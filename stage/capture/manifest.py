@@ -139,9 +139,6 @@ class Manifest(Strict):
 def read_manifest(path: str | Path) -> Manifest:
     """Read and check a capture.json.
 
-    Args:
-        path: the file.
-
     Raises:
         StorageError: the file cannot be read.
         ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.

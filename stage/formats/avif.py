@@ -62,7 +62,6 @@ def decode(path: str | Path, stream: BinaryIO, header: AvifHeader) -> np.ndarray
 
     Args:
         path: of the file, for messages.
-        stream: the file.
         header: of `header_of`.
 
     Returns:

@@ -39,7 +39,6 @@ def scan_header(path: Path, stream: BinaryIO) -> Scan:
 
     Args:
         path: of the file, for messages.
-        stream: the file.
 
     Raises:
         ImageError: the header has too many attributes, parts or channels, is too long, or is cut short.

@@ -233,7 +233,6 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
 
     Args:
-        path: the file.
         codes: [rows, cols] or [rows, cols, 3] uint8 or uint16.
         srgb: True for colours that are encoded in sRGB, False for data that no reader should convert.
 
@@ -267,7 +266,6 @@ def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared:
     """Check that an image has the width and height that a camera declares, and return its header.
 
     Args:
-        path: the file.
         resolution: width and height.
         declared: the field that declares them, for the message.
 

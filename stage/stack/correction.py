@@ -51,7 +51,6 @@ class Correction:
         """Read the dark, flat and ambient frames of a capture and return its correction.
 
         Args:
-            capture: an opened capture.
             full_scale: True to mark the largest value of integers as saturated where the capture gives no `saturation`.
 
         Raises:

@@ -70,7 +70,6 @@ class Ingest:
         """Hash the images of the light frames of a capture.
 
         Args:
-            capture: an opened capture.
             cache: the folder for the cache; None stands for `.relit` in the folder of the capture.
             tracking: tracking frames, to the reference of which every frame is warped; None leaves the frames as recorded.
 

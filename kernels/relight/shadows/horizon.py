@@ -107,7 +107,6 @@ def height_field(height: np.ndarray, mask: np.ndarray, projection: Projection, d
         height: [rows, cols] camera-frame z.
         mask: [rows, cols] bool: where there is surface. It must be one part: no break of the height is looked for.
         projection: of the camera; the unit is that of height.
-        device: where.
     """
     solid = np.where(mask, height, NOTHING).astype(np.float32)
     rows, cols = solid.shape

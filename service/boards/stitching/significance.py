@@ -56,7 +56,6 @@ def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
 
     Args:
         false_alarm: above 0 and below 1.
-        tests: their number.
         sides: 2 where a deviation of either sign is an alarm, else 1.
     """
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))

@@ -176,7 +176,6 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, frames
     makes progress does not kill its workers.
 
     Args:
-        database: of the service.
         claim: of the worker.
         progress: of the stage under way, as users see it.
         frames: frames that the job has, where users see more; None: those of `progress`.
