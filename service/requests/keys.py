@@ -22,7 +22,7 @@ class NewKey(Options):
     project: Project
     """Project whose captures, jobs and results the key gives access to; its name is made of a-z, 0-9 and -."""
     name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
-    """Who holds the key: a person or a program."""
+    """The holder of the key: a person or a program."""
     scope: Scope
     """The rights of the key."""
     expires_days: Annotated[float | None, Field(gt=0, le=36_500)] = None

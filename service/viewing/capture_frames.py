@@ -48,7 +48,7 @@ class CaptureImages(NamedTuple):
     images: list[FrameImage | None]
     """One for each frame of the manifest; None: it cannot be read."""
     faults: list[str]
-    """Why frames cannot be read."""
+    """Reasons why frames cannot be read."""
     inside: np.ndarray  # [rows, cols] bool of the previews: blocks with a pixel of the object
     measured: list[bool]
     """True for frames that are measurements, and not ambient light, a tracking frame or a photograph under an environment."""

@@ -127,7 +127,7 @@ class GaugeRun(Strict):
     """The result folder of relit inspect-board with regions, relative to the file; in a job of the service, the job that inspected."""
     board: Text
     operator: Text = "operator"
-    """Who, or which station, measured."""
+    """The person or station that measured."""
 
 
 class GaugeRuns(Strict):

@@ -72,7 +72,7 @@ _calling = threading.Lock()
 """Held while a product is queued: the stream of a handle is set just before."""
 
 Gemm = Callable[[Product], None]
-"""Does a product."""
+"""A function that computes a matrix product."""
 
 
 def product_of(device: str) -> Gemm | None:

@@ -1,4 +1,4 @@
-"""Why a scan could not be joined: whether it fits mirrored or in another unit; and scans whose scale is not that of the others."""
+"""Find why a scan could not be joined: it fits mirrored or in another unit; and find scans whose scale differs from that of the others."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

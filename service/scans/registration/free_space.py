@@ -52,9 +52,9 @@ class Contradiction(NamedTuple):
     """The parts of the points of two scans, on or before the surface of the other, that the other contradicts."""
 
     points: float
-    """All of them."""
+    """The part of all contradicted points."""
     surface: float
-    """The contradicted points on a part of the surface which the other camera cannot have missed."""
+    """The part of the contradicted points on surface that the other camera cannot have missed."""
 
 
 def depth_range(scan: Scan) -> DepthRange | None:

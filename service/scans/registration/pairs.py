@@ -93,7 +93,7 @@ class Pair(NamedTuple):
     """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
     contradicted: float
     reason: str
-    """Why it was refused, in words; empty of a joined pair."""
+    """The reason why the pair was refused, in words; empty for a joined pair."""
     by: Evidence = Evidence.SURFACES
 
 

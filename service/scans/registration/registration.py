@@ -76,7 +76,7 @@ class Registration(NamedTuple):
     """The scan whose pose is fixed."""
     pairs: tuple[Pair, ...]
     alone: dict[int, str]
-    """Why each scan that could not be joined is not, in words after its name."""
+    """The reason for each scan that could not be joined, in words after its name."""
     scales: dict[int, float]
     """The approximate scale of each joined scan whose scale is not that of the others."""
     kept: tuple[tuple[Pair, float], ...]

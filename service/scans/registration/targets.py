@@ -37,7 +37,7 @@ class TargetPose(NamedTuple):
     used: tuple[str, ...]
     """The targets that keep their distances."""
     reason: str
-    """Why there is no pose, in words; empty where there is one."""
+    """The reason why there is no pose, in words; empty where there is one."""
 
 
 def pose_by_targets(a: Sequence[Target], b: Sequence[Target], *, first_row: tuple[int, int]) -> TargetPose:

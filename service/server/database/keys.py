@@ -30,7 +30,7 @@ and those of each request would wait for the garbage collector."""
 
 
 class Caller(NamedTuple):
-    """Who sends a request."""
+    """The sender of a request."""
 
     project: str
     scope: Scope

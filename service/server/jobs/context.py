@@ -81,4 +81,4 @@ class JobStep(NamedTuple):
     made: Callable[[], int] = lambda: 0
     """Returns how many of these frames this machine has."""
     help: Callable[[Progress], None] | None = None
-    """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""
+    """A function that does pieces of the step beside the worker that runs it; None: it cannot be divided."""

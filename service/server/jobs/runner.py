@@ -45,7 +45,7 @@ NO_MEMORY = re.compile("failed to allocate|out of memory|insufficient memory|bad
 
 
 class JobRunner:
-    """Does the jobs that the queues give to a worker."""
+    """Run the jobs that the queues give to a worker."""
 
     def __init__(self, context: WorkerContext, worker: str, *, alive: Callable[[float], None]) -> None:
         """Create a runner.
