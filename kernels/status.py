@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Status(IntEnum):
-    """Why a pixel has, or has not, a result. Only the codes of ESTIMATED carry values; an unwritten pixel is never among them."""
+    """The reason why a pixel has a result or none. Only the codes of ESTIMATED carry values; an unwritten pixel is never among them."""
 
     UNSOLVED = 0
     """Never reached by a solver (outside the mask)."""

@@ -22,7 +22,7 @@ class AssetError(ValueError):
 
 
 class DivergedError(Exception):
-    """This worker finds something else than the one that has the job, so that it cannot help."""
+    """This worker's results differ from those of the worker that has the job, so that it cannot help."""
 
 
 USER_ERRORS: tuple[type[Exception], ...] = (RequestError, ValidationError, StageError, KernelError, AssetError)

@@ -1,4 +1,4 @@
-"""The one place through which the files of captures and environments are opened for reading.
+"""Open the files of captures and environments for reading; no other module does.
 
 Whoever owns a registered folder may replace a file in it by a link at any moment. So a file below a folder that `confined` names is found
 from a descriptor of that folder, name by name, without following a link out of it (as openat2 does with RESOLVE_BENEATH), and opened once:
@@ -48,7 +48,7 @@ class Source:
     """The path as it was given, for messages."""
     file: BinaryIO
     confined: bool
-    """Whether it lies in a folder that `confined` names."""
+    """True if it lies in a folder that `confined` names."""
     max_pixels: int | None
 
     @contextmanager

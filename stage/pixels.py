@@ -1,4 +1,4 @@
-"""How the pixels of a capture are read: which part of each image, and what becomes of values below zero."""
+"""Choices for reading the pixels of a capture: the part of each image, and the treatment of values below zero."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,10 +30,10 @@ class Crop(NamedTuple):
 
 
 class PixelChoices(NamedTuple):
-    """How the pixels of a capture are read."""
+    """Choices for reading the pixels of a capture."""
 
     clip_negative: bool = False
-    """Whether values that are negative beyond the noise of their image are set to 0; else such an image is refused."""
+    """True if values that are negative beyond the noise of their image are set to 0; else such an image is refused."""
     crop: Crop | None = None
     """The part of every image that is used; None: all of it."""
 

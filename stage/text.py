@@ -1,4 +1,4 @@
-"""What no name may have: control characters, NUL among them, halves of characters, and any number of characters.
+"""Limits on names: no control characters (NUL among them), no halves of characters, and a largest length.
 
 A NUL ends a path in the system's calls and cannot be stored by PostgreSQL, half a character cannot be written as UTF-8, and control
 characters change what a terminal or a log shows.

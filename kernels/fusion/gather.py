@@ -1,4 +1,4 @@
-"""What the views show at points of the surface: colours, materials and normals, blended from the views that see each point best.
+"""Blend colours, materials and normals at points of the surface from the views that see each point best.
 
 A view counts at a point where its own measured surface is there (nothing hides the point), its pixels show one surface around it, and the
 line of sight is not grazing. Its weight falls with the angle to the view, with the distance in units of pixels, and to 0 towards the
@@ -23,7 +23,7 @@ OFF_SURFACE = 4.0
 
 
 class Gathered(NamedTuple):
-    """What the views show at points."""
+    """Blended values of the views at points."""
 
     values: Any  # wp.array [n, C] weighted means; 0 where no view counts
     weight: Any  # wp.array [n] sum of the weights; 0 where no view counts
@@ -109,7 +109,6 @@ def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: A
         sigma: wp.array [n] metres, standard deviation of the place of each point.
         vectors: count of the first channels that are vectors of the camera frame, three by three; they are turned to the world frame.
         slack: distance in metres by which a point may lie off its surface beside that, as on a simplified mesh.
-        device: where the arrays are.
     """
     count, channels = len(points), layers.shape[1]
     values = wp.empty((count, channels), dtype=float, device=device)

@@ -1,4 +1,4 @@
-"""Which triangle of a mesh covers each texel of its texture."""
+"""Find the triangle of a mesh that covers each texel of its texture."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import warp as wp
 from kernels import device as devices
 
 EDGE = 1.0e-5
-"""How far outside of a triangle a texel may lie, in barycentric coordinates, so that none is missed between two triangles."""
+"""The largest distance of a texel outside of a triangle, in barycentric coordinates, so that none is missed between two triangles."""
 
 
 @wp.func
@@ -46,7 +46,6 @@ def rasterise(texture: np.ndarray, faces: np.ndarray, rows: int, cols: int, *, d
         texture: [V, 2] u and v of the vertices in texels, from the top-left corner of the image.
         faces: [F, 3] vertex numbers.
         rows, cols: of the image.
-        device: where to compute.
 
     Returns:
         [rows, cols] int32, the face with the largest number that covers the centre, −1 where none does; and [n, 3] float64, the barycentric

@@ -49,7 +49,7 @@ MOST_LEFT = 0.3
 
 
 class Resampled(NamedTuple):
-    """What the pixels show, each [rows, cols]."""
+    """Depth, its σ and the nearest point of each pixel, each [rows, cols]."""
 
     depth: np.ndarray  # float32 metres; 0 where there is none
     sigma: np.ndarray  # float32 metres, standard deviation of the depth; 0 where there is none
@@ -174,7 +174,6 @@ def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: 
         depths, sigmas: [n] metres, above 0; the errors of points are independent.
         shape: rows and columns of the image.
         focal: of the camera, pixels.
-        device: where to compute.
     """
     rows, cols = shape
     col, row = np.floor(places).astype(np.int64).T

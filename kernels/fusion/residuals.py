@@ -1,5 +1,5 @@
-"""How far each pixel of a view lies from the fused surface, as the voxels of a brick tell, and how far the surfaces of two views lie apart
-where both measured the same place."""
+"""Measure the distances of the pixels of a view from the fused surface, by the voxels of a brick, and the distances between the surfaces of
+two views where both measured the same place."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from kernels.fusion.projection import View, image_point, in_front, line_of_sight
 from kernels.fusion.views import Cell, ViewArrays, read_view
 
 ELSEWHERE, FUSED, LOST, REFUSED = 0, 1, 2, 3
-"""What became of a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
+"""Outcomes for a pixel: it lies in another brick, or in no cell; it has a distance to the fused surface; no voxels were measured all
 around it; or other views saw its place to be empty."""
 SAME_SIDE = 0.5
 """Least cosine between two normals at which two views may show the same surface: 60°."""
@@ -100,12 +100,10 @@ def compare_views(views: ViewArrays, points: np.ndarray, normals: np.ndarray, va
     """Compare points that one view measured with the surfaces that others measured there; waits for the device.
 
     Args:
-        views: the range images.
         points, normals: [n, 3] metres in the coordinates of the views, and unit vectors of the world frame.
         variance: [n] square metres, of each point along its normal.
         skipped: number of the view that measured the points, which are not compared with it; −1 where it is not among the views.
         reach: metres; surfaces farther off are other surfaces.
-        device: where the arrays are.
 
     Returns:
         [n, V] float32: the distance of each point from the surface of each view along its normal, metres, and what standard deviation the

@@ -20,10 +20,10 @@ LATERAL = 0.1
 """Standard deviation of the place of a reading across the line of sight, in pixels, as calibrations and optics leave it. Seen at a grazing
 angle it is what limits a measurement, whatever the standard deviation of the depth."""
 SPACING = 0.29
-"""What the weights of readings assume in its place: a uniform distribution over a pixel, 1/√12. Between pixels a bent surface is cut short
-by a chord, by the more the more grazing it is seen; that error does not average out."""
+"""Standard deviation in pixels that the weights of readings use in its place: that of a uniform distribution over a pixel, 1/√12. The chord
+between pixels cuts a bent surface short, more so at grazing angles; that error does not average out."""
 WIDER = 1.3
-"""How much longer than without distortion lines of sight are taken to be, where only their greatest length matters."""
+"""Factor by which distortion is taken to lengthen lines of sight, where only their greatest length matters."""
 LEAST_NORMAL = 2.0
 """Least length of the sum of the normals of the four pixels of a cell: shorter, they show no one surface."""
 LEAST_COSINE = 0.2
@@ -54,7 +54,7 @@ class RangeImage(NamedTuple):
     first_row: int = 0  # of the arrays in the image that `principal` is of
     first_col: int = 0
     orthographic: bool = False
-    """Whether the lines of sight are parallel; the frame then lies before everything that was measured, so that depths are above 0."""
+    """True if the lines of sight are parallel; the frame then lies before everything that was measured, so that depths are above 0."""
 
     def pixel_m(self, depth: float) -> float:
         """Return the distance of neighbouring pixels at a depth, both in metres."""
@@ -236,7 +236,7 @@ def _cell_kernel(first: int, views: wp.array(dtype=View), place: wp.array(dtype=
 
 @wp.struct
 class Reading:
-    """What a view measured on the line of sight through a point."""
+    """The measurement of a view on the line of sight through a point."""
 
     known: bool
     distance: float  # metres from the measured surface along its normal, positive in front of it

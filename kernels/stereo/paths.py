@@ -33,8 +33,8 @@ class Direction(NamedTuple):
 
 
 DIRECTIONS = Direction(0, 1), Direction(0, -1), Direction(1, 0), Direction(-1, 0)
-"""Along rows and columns, both ways. Under projected texture the source's diagonals change neither the share of wrong pixels nor the error,
-and take as long again."""
+"""Directions of the paths: along rows and columns, both ways. Under projected texture the source's diagonals change neither the share of
+wrong pixels nor the error, and take as long again."""
 
 
 def gather(volume: wp.array) -> wp.array:

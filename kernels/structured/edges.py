@@ -73,7 +73,7 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
 
 @wp.struct
 class Edge:
-    """Where the stripe of a pixel ends."""
+    """The end of the stripe of a pixel."""
 
     found: int
     at: float  # camera pixels from the pixel, unsigned

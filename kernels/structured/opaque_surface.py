@@ -1,4 +1,4 @@
-"""Whether decoded depths can be those of opaque surfaces under a projector: tests of each pixel against its neighbours and the others.
+"""Test whether decoded depths can be those of opaque surfaces under a projector: tests of each pixel against its neighbours and the others.
 
 Facing. The inverse depth of a plane is linear in the image: s = α x + β y + γ along the line of sight (x, y, -1). The projector at C lies
 on the camera's side of it where E = α C_x + β C_y - γ C_z < 1. A patch with E > 1 shows the camera one face and the projector the other, so

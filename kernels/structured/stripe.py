@@ -63,7 +63,7 @@ class Stripe(NamedTuple):
 
 
 class PlaneMeeting(NamedTuple):
-    """Where lines of sight meet a plane."""
+    """The points in which lines of sight meet a plane."""
 
     depth: np.ndarray  # [n] metres, NaN where they do not in front of the camera
     per_pixel: np.ndarray  # [n] metres of depth for one unit along each line's x or y, whichever was asked for

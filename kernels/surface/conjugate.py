@@ -25,7 +25,7 @@ CHECK_EVERY = 4
 
 
 class Convergence(NamedTuple):
-    """How a solve ended."""
+    """The end of a solve."""
 
     iterations: int
     residual: float  # preconditioned residual norm over that of the first guess
@@ -131,7 +131,6 @@ class Solver:
     levels.
 
     Args:
-        grid: the layout.
         slopes: of all edges, and their weights.
         max_iterations: of `solve`.
         overwrite: whether the slopes may be overwritten, though not their weights: only the first residual needs them.

@@ -1,4 +1,4 @@
-"""How a picture lies in memory for the height solver, how a launch walks over it, and how it is summed.
+"""The layout of a picture in memory for the height solver, the walk of a launch over it, and its sums.
 
 A grid of rows × cols pixels is stored flat with a ring of spare cells, `pitch` cells a row, so that the four
 neighbours of any pixel exist and lie at i ± 1 and i ± pitch. The pitch is odd, so that the parity of i is the colour
@@ -28,7 +28,7 @@ FOLD_THREADS = 256
 
 @wp.struct
 class Walk:
-    """Which cells thread t visits: every `step`-th of the `span` cells from start + t · apart on, below end."""
+    """The cells that thread t visits: every `step`-th of the `span` cells from start + t · apart on, below end."""
 
     start: wp.int32
     apart: wp.int32

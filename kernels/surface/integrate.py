@@ -18,14 +18,14 @@ from kernels.surface.slopes import Slopes, pair_slopes
 
 @dataclass(frozen=True, kw_only=True)
 class IntegrationOptions:
-    """How to integrate."""
+    """Options of the integration."""
 
     tolerance: float = 1.0e-6
-    """Where conjugate gradients stop: residual over its first value, close to the relative error of the slopes."""
+    """The residual over its first value at which conjugate gradients stop; close to the relative error of the slopes."""
     max_iterations: int = 200
     """Seven to fifteen are usual, mazes and scattered holes take more."""
     discontinuities: bool = False
-    """Whether the surface may break where its normals contradict themselves: right for objects with parts in front of one another. On a
+    """True if the surface may break where its normals contradict themselves: right for objects with parts in front of one another. On a
     smooth surface it changes nothing but the share of noise (6 % more error at most in our trials)."""
 
 
@@ -134,7 +134,6 @@ def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -
     Args:
         weights: of the edges of a grid; changed.
         cuts: [rows, cols] bool, edges to the right and edges down.
-        grid: the layout.
     """
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
         kept = plane.numpy()

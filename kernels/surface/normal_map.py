@@ -187,7 +187,7 @@ class NormalMap:
         return PixelNormals(normal / np.maximum(np.linalg.norm(normal, axis=0), 1e-9), ray)
 
     def _floats(self, values: np.ndarray) -> wp.array:
-        """Return float32 values on the device, without a copy where they are there already."""
+        """Return float32 values on the device, without a copy where they are on it already."""
         return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=wp.float32, device=self.device, copy=False)
 
 

@@ -1,4 +1,4 @@
-"""How far the parts of a surface stand in front of one another, from the cast shadows that readings show.
+"""Estimate the distances between the parts of a surface along the view, from the cast shadows that readings show.
 
 An offset of a part is judged by the log-likelihood of all readings: log(1 + H (e^q - 1)), where q are the log odds that the reading lies in
 shadow and H is the probability that the surface at that offset hides the light: 1 where the ray passes through the visible front, and less

@@ -24,7 +24,7 @@ NO_REACH = 1.0e30
 
 
 class Projection(NamedTuple):
-    """How camera-frame points fall on the picture, without lens distortion."""
+    """The projection of camera-frame points to the picture, without lens distortion."""
 
     perspective: bool
     scale: wp.vec2  # perspective: focal lengths in pixels; orthographic: pixels per unit

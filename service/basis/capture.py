@@ -105,7 +105,7 @@ class StackBand(NamedTuple):
     """A band of the stack with some pixel inside the mask."""
 
     span: slice
-    """Its pixels in the image, without padding."""
+    """The pixels of the band in the image, without padding."""
     band: packs.Band
     inside: np.ndarray  # [pixels of the band] bool
 
@@ -117,7 +117,6 @@ def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings
         source, device: the capture, and where.
         bytes_per_pixel: what the caller allocates beside the stack for each pixel.
         timings: told of the bands as one `stage` of the work.
-        stage: its name.
     """
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))

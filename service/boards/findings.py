@@ -1,4 +1,4 @@
-"""What an inspection lists: defects, regions, and areas that were not inspected."""
+"""The rows that an inspection lists: defects, regions, and areas that were not inspected."""
 
 import csv
 import io
@@ -36,7 +36,7 @@ class Defect(NamedTuple):
     """A connected area with a significant deviation."""
 
     area: Area
-    """Where the mean of the smallest window is at least half its largest value in the area; its middle weighted by the deviation."""
+    """Pixels whose smallest window has a mean of at least half the largest in the area; the middle is weighted by the deviation."""
     deviation_m: float
     sigma_m: float
     significance: float

@@ -17,7 +17,7 @@ HEIGHT, SIGMA, NOISE, MASK = "height.Z", "sigma.Z", "noise.Z", "mask.Y"
 
 
 class Nominal(NamedTuple):
-    """What a board is compared with."""
+    """The nominal heights with which a board is compared."""
 
     path: Path
     """The file that was named."""

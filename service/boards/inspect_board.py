@@ -47,7 +47,7 @@ class InspectBoardResult(NamedTuple):
     report_path: Path
     picture_path: Path
     findings_path: Path | None
-    """None if there was nothing to compare with."""
+    """The findings.csv; None if there was nothing to compare with."""
     verdict: Verdict | None
     """The verdict on the whole board; None if there was nothing to compare with."""
     defects: list[Defect]
@@ -60,7 +60,7 @@ class InspectBoardResult(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """What the comparison with nominal heights found."""
+    """Result of the comparison with nominal heights."""
 
     nominal: Nominal
     match: Match
@@ -80,7 +80,6 @@ def inspect_board(request: InspectBoardRequest, progress: Progress | None = None
 
     Args:
         request: what to inspect and where to put it.
-        progress: told of every stage.
 
     Raises:
         StageError, KernelError: bad input, or tiles or heights that do not fit together; nothing is written.

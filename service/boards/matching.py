@@ -20,7 +20,7 @@ LEAST_MIRRORED = 0.8
 
 
 class Match(NamedTuple):
-    """How a board lies on its nominal map."""
+    """The position of a board on its nominal map."""
 
     motion: np.ndarray  # [6] of the board, metres
     evidence: Evidence

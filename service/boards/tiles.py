@@ -25,7 +25,7 @@ class BoardTiles(NamedTuple):
     scan: BoardScan
     tiles: list[TilePoints]
     contents: dict[str, str]
-    """What each tile was made from, by its path: the content hash that its depth carries."""
+    """The content hash that the depth of each tile carries, by the path of the tile."""
 
 
 def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: Progress) -> BoardTiles:

@@ -36,7 +36,7 @@ DARK = 0.05
 
 
 class _Seen(NamedTuple):
-    """What one frame shows within an outline."""
+    """The pixels of one frame within an outline."""
 
     lit: LitFrame
     radiance: np.ndarray

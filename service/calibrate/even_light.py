@@ -1,4 +1,4 @@
-"""What a target looks like without the laser: under even light, by which its stripes are divided."""
+"""Images of a target under even light, without the laser, by which the images of its stripes are divided."""
 
 import numpy as np
 

@@ -28,7 +28,7 @@ class StepPoses(NamedTuple):
 
     fit: StepFit
     poses: list[dict[str, Any]]
-    """What the report says of each capture: folder, stripes that were used, those that show the riser, the base's distance."""
+    """Facts of each capture for the report: folder, stripes that were used, those that show the riser, the base's distance."""
 
 
 def planes_on_step(captures: list[Capture], frames: list[list[Frame]], height_m: float, device: str, timings: Timings) -> StepPoses:

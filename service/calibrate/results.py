@@ -1,4 +1,4 @@
-"""What the commands of `relit calibrate` share: the captures that they read and write, and calibration.json."""
+"""Files that the commands of `relit calibrate` share: the captures that they read and write, and calibration.json."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -46,7 +46,7 @@ class MeasuredLight(NamedTuple):
     light: SingleLight | None
     """The light to write; None: its frame is left out."""
     entry: dict[str, Any]
-    """What the report says; `flags` name what to look at."""
+    """The entry in the report; `flags` name what to look at."""
     row: tuple[str, ...] = ()
     """The cells of the table."""
     doubt: float = 0.0

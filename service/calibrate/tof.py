@@ -37,7 +37,7 @@ SHARPEST_RAD = 0.3
 
 
 class TofCalibrationResult(NamedTuple):
-    """What a sweep calibrated."""
+    """The calibration from a sweep, and its errors."""
 
     calibration: TofCalibration
     path: Path
@@ -54,7 +54,6 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
 
     Args:
         request: the sweep, and the file to write.
-        progress: told how far the work is.
         allowed: folders of the captures that the sweep may name; None: any.
 
     Raises:

@@ -28,7 +28,7 @@ class WhiteBalance(NamedTuple):
     gains: tuple[float, float, float]
     """Factors of red, green and blue after which the card is grey; that of green is 1."""
     matrix: tuple[tuple[float, float, float], ...]
-    """By rows, what `color_matrix` of the manifest becomes."""
+    """The new `color_matrix` of the manifest, by rows."""
 
 
 def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None) -> WhiteBalance:

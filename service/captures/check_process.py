@@ -1,4 +1,4 @@
-"""A process that checks one capture or environment: the files are those of strangers, and their decoders may crash, hang or ask for memory.
+"""A process that checks one capture or environment: the files are untrusted, and their decoders may crash, hang or ask for memory.
 
 `check_in_process` starts it with an environment of its own, without the settings of the service (the database's password among them). It
 has limits of memory, processor time and the size of files. What becomes of it concerns only the check that it does.

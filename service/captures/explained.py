@@ -1,4 +1,4 @@
-"""What the images of a capture contradict in its manifest, from some pixels of each frame: encoding, brightness, order, single lights."""
+"""Compare some pixels of each frame with the manifest, and report contradictions: encoding, brightness, order, single lights."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -36,7 +36,7 @@ def pixels_to_look_at(capture: Capture) -> np.ndarray | None:
 
 
 class Findings(NamedTuple):
-    """What the images contradict."""
+    """Contradictions between the images and the manifest."""
 
     sentences: list[str]
     suspects: dict[str, float]

@@ -1,4 +1,4 @@
-"""What a capture cannot show whose lights all stand in front of the object: highlights on slopes, and light from its sides and from behind.
+"""Limits of captures whose lights all stand in front of the object: no highlights on slopes, no light from the sides or from behind.
 
 A surface shows the highlight of a light when its normal lies half way between the light and the view. Lights within an angle of the
 view axis show highlights on normals within half of it.
@@ -15,7 +15,7 @@ NORMALS = 2000
 
 
 class FrontLights(NamedTuple):
-    """What lights that all stand in front of the object reach."""
+    """The directions that lights in front of the object reach."""
 
     widest_deg: float
     """The largest angle of a light from the view axis."""

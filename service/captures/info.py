@@ -29,7 +29,7 @@ from stage.stack.correction import Correction
 from stage.tof.raw_frames import check_frames, read_frame
 
 FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
-"""What is said of near lights whose distance to the surface nobody has measured."""
+"""The remark about near lights whose distance to the surface nobody has measured."""
 
 
 class Inspection(NamedTuple):
@@ -128,7 +128,6 @@ def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
     """Return what is wrong with a capture beside its frames: lights that determine no normal, the mask, the dark and flat frames.
 
     Args:
-        capture: an opened capture.
         readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
     """
     faults = []

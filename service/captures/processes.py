@@ -1,4 +1,4 @@
-"""What the processes have in common that read the files of strangers: an environment without secrets, and limits."""
+"""An environment without secrets, and limits, for the processes that read untrusted files."""
 
 import os
 import resource

@@ -136,7 +136,7 @@ class Intakes:
         return self._connection.path(self._path, intake)
 
     def _create_once(self, name: str, token: str) -> IntakeView:
-        """Return the intake that was created with the token; if that has been deleted since, the one of the next token."""
+        """Return the intake that was created with the token; if that has been deleted since, the intake of the next token."""
         for number in range(GENERATIONS):
             with suppress(NotFound):
                 return self.create(name, token=f"{token}-{number}")

@@ -20,7 +20,7 @@ EVENT = "job"
 SILENCE_S = 45.0
 """A stream without a byte for this long is given up: the service sends at least a comment every 15 s."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 2.0
-"""Between two plain requests, while events bring nothing."""
+"""Seconds between two plain requests, while events bring nothing."""
 
 
 class Jobs:

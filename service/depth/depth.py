@@ -61,7 +61,7 @@ KINDS: dict[Ranging, Kind] = {
                       None),
     Ranging.STEREO: Kind(lambda frame: frame.stereo is not None, solve_stereo, "other_cameras[].camera_from_other"),
 }
-"""How depth is measured with each kind of frames."""
+"""The function that measures depth with each kind of frames."""
 
 
 class DepthResult(NamedTuple):
@@ -71,7 +71,7 @@ class DepthResult(NamedTuple):
     """CoordinateMaps where the patterns were decoded and could not be triangulated."""
     depth_path: Path
     points_path: Path | None
-    """None where there is no depth."""
+    """The file of points; None where there is no depth."""
     report_path: Path
     method: str
     points: int

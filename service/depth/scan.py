@@ -38,7 +38,7 @@ class ScanResult(NamedTuple):
     points_path: Path
     usd_path: Path
     las_path: Path | None
-    """None if it was not asked for."""
+    """The points.las; None if it was not asked for."""
     report_path: Path
     counts: dict[str, int]
     """Number of shots and points, and of those left out, by reason."""

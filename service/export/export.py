@@ -29,7 +29,7 @@ from stage.stack.fingerprint import combined, digest
 OPTIONS = ("rig", "environment", "card")
 """Options of what an asset brings along."""
 EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "part")
-"""What an asset is made of, which is half of what `svbrdf` writes: at 4096 by 4096 pixels the rest takes 0.6 GiB."""
+"""The layers that an asset needs, half of those that `svbrdf` writes: at 4096 by 4096 pixels the rest takes 0.6 GiB."""
 
 
 class Exported(NamedTuple):

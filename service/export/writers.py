@@ -32,11 +32,11 @@ class Writer(NamedTuple):
     mesh: Callable[..., None] = _refuse
     """(TriangleMesh, path, *, comments): a fused surface, or a tile of one, with colours and other values at its vertices."""
     variants: bool = False
-    """Whether `surface` takes levels and surroundings too: levels of detail, lights, an environment and relit frames."""
+    """True if `surface` takes levels and surroundings too: levels of detail, lights, an environment and relit frames."""
 
 
 USD = Writer(usd.write_asset, write_depth, write_fused, variants=True)
 GLTF = Writer(gltf.write_asset, gltf.write_depth)
 PLY = Writer(mesh=write_mesh_ply)
 WRITERS = {".usda": USD, ".usdc": USD, ".usdz": USD, ".glb": GLTF, ".ply": PLY}
-"""By the suffix of the file."""
+"""The writers by the suffix of the file."""

@@ -1,4 +1,4 @@
-"""Whether the normals of a surface fit together, or would after a mirroring or a turn of their axes.
+"""Test whether the normals of a surface fit together, or would after a mirroring or a turn of their axes.
 
 Light directions whose axes are mirrored or turned explain the images as well as the right ones: the normals are mirrored or turned
 with them. But a surface has a height, so its slopes p = dz/dx and q = dz/dy obey dp/dy = dq/dx. With M the derivatives of the
@@ -24,7 +24,7 @@ STEPS_ACROSS = 60
 LEAST_TOWARD = 0.15
 """Least n_z of a pixel whose slope is used: towards the rim slopes and their noise grow without bound."""
 STANDARD_ERRORS_MIRROR, STANDARD_ERRORS_TURN = 6.0, 8.0
-"""How many standard errors of their mean the terms must differ by. Neighbouring places are not independent: on right captures a mirroring
+"""Least difference of the terms in standard errors of their mean. Neighbouring places are not independent: on right captures a mirroring
 is ahead by 2.4 at most (a white bowl under four lights) and behind by 10 to 40 on most; a turn is ahead by 10.7, but below 21 degrees."""
 LARGEST_PART = 0.85
 """The terms of the right axes are at most this part of those of the wrong ones."""
@@ -38,7 +38,7 @@ SNAP_DEGREES = 25.0
 
 
 class Axes(NamedTuple):
-    """What corrects the axes of the lights, and so of the normals, in the image plane; or its opposite, turned by 180 degrees."""
+    """The correction of the axes of the lights, and so of the normals, in the image plane, up to a turn by 180 degrees."""
 
     matrix: np.ndarray  # [2, 2] float64, orthogonal
     misfit: float

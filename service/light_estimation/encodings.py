@@ -1,4 +1,4 @@
-"""How recorded values could be encoded otherwise than their manifest declares: linear, by sRGB, or by a power of 2.2."""
+"""Encodings that recorded values could have in place of the declared one: linear, by sRGB, or by a power of 2.2."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Whether another reading of the manifest explains the images much better than the manifest: encoding, brightness, order of lights.
+"""Test whether another reading of the manifest explains the images much better than the manifest: encoding, brightness, order of lights.
 
 Every explanation is judged by the same robust Lambertian fit of the same pixels. On a right manifest no explanation is better by more
 than a factor of 1.9 (all objects of docs/methods.md but bare metal, for which no explanation is good: those must also leave little).
@@ -53,7 +53,7 @@ PLENTY = 60
 
 
 class Cause(Enum):
-    """What is wrong with the manifest."""
+    """The fault of the manifest."""
 
     ENCODED = "the images are display-encoded, and declared linear"
     LINEAR = "the images are linear, and declared display-encoded"
@@ -66,13 +66,13 @@ class Cause(Enum):
 
 
 class Explanation(NamedTuple):
-    """What explains the images better than the manifest."""
+    """A fault that explains the images better than the manifest does."""
 
     cause: Cause
     misfit: float
-    """What the manifest leaves: robust standard deviation of the readings over |b|."""
+    """Residual of the manifest: robust standard deviation of the readings over |b|."""
     left: float
-    """What the explanation leaves."""
+    """Residual of the explanation, likewise."""
     degrees: float
     """Median angle between the normals of the two; where no normals follow, between those of every other light and the rest."""
     spread: float = 0.0

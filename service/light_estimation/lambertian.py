@@ -42,7 +42,7 @@ class Fit(NamedTuple):
 
     @property
     def spare(self) -> np.ndarray:
-        """Whether each pixel has more readings than unknowns, [pixels] bool."""
+        """Return whether each pixel has more readings than unknowns, [pixels] bool."""
         return np.asarray(self.lit.sum(axis=0) > 2 + SPARE)
 
     def misfit(self) -> float:

@@ -1,4 +1,4 @@
-"""Whether a surface is convex towards its outline, and whether cast shadows agree with its height: what tells a surface from its inverse.
+"""Tell a surface from its inverse: by whether it is convex towards its outline, and whether cast shadows agree with its height.
 
 Lights that are turned by 180 degrees about the view axis give a surface that fits together as well, with its height inverted: a bump
 becomes a hollow. At the outline of an object that stands free, normals point outwards. A hollow, a bowl or a mould, has normals
@@ -22,7 +22,7 @@ LIFT, LIFT_SLOPE = 1.0, 0.05
 
 
 class Outline(NamedTuple):
-    """Where the normals point along the outline of the mask, as far as it lies inside the image."""
+    """Directions of the normals along the outline of the mask, as far as it lies inside the image."""
 
     outward: float
     """Mean component of the unit normals along the outward direction, -1…1; 0 without an outline."""

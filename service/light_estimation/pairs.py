@@ -23,7 +23,7 @@ LEAST_DARKER, DARKER_PART = 8, 0.002
 MOVED_PART = 0.02
 """Part of the pixels that are darker from which a pair does not fit."""
 SWAPPED_TIMES = 3.0
-"""How many times more pixels are darker than brighter in a pair that is swapped."""
+"""Least ratio of darker to brighter pixels in a pair that is swapped."""
 LARGEST_SHIFT, SHIFT_SIGMAS = 0.5, 8.0
 """Shift in pixels of a pair that does not fit, and how many standard errors it is at least."""
 LEAST_PERCENT, FALLING_PART = 10.0, 0.7
@@ -39,7 +39,7 @@ standard errors are added to it."""
 
 
 class PairFindings(NamedTuple):
-    """What the images say about the pairs of a capture."""
+    """Result of checking the pairs of a capture against the images."""
 
     fault: str | None
     """A sentence about the first pair that does not fit, without the name of the manifest; None: all fit."""

@@ -20,7 +20,7 @@ class Suspect(NamedTuple):
     """A light that disagrees with the others."""
 
     light: int
-    """Its index."""
+    """Index of the light."""
     misfit: float
     """Median over pixels of |reading / (level · n·l) - 1|, the level being the pixel's own median over its lights."""
 

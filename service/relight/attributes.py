@@ -23,7 +23,7 @@ FASTEST_TIMECODE = 30
 SQUARE = 0.01
 """Pixels count as square up to this difference of the focal lengths, which is more than calibrations are wrong by."""
 TO_LEFT_HANDED = np.diag([1.0, 1.0, -1.0, 1.0])
-"""From Relit's camera frame, which looks along −z, to that of OpenEXR, which looks along +z."""
+"""Transform from Relit's camera frame, which looks along −z, to that of OpenEXR, which looks along +z."""
 
 
 def camera_attributes(camera: Camera) -> dict[str, Any]:

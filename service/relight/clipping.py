@@ -11,7 +11,7 @@ LEVEL_MARGIN = 0.999
 
 
 class Clipping(NamedTuple):
-    """What the clipped readings of a stack hold, summed over the object."""
+    """Sums of the clipped readings of a stack over the object."""
 
     level: np.ndarray  # [lights padded] radiance at which the channels of an image clip; infinite where none does
     clipped: np.ndarray  # [3, lights padded] sum of the stored values that are clipped

@@ -28,7 +28,7 @@ class RowBlock(NamedTuple):
     last: int
     """Behind the last row."""
     pixels: slice
-    """Their pixels in the stack; those of the last rows include its padding."""
+    """The pixels of the rows in the stack; those of the last rows include its padding."""
 
 
 def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:
@@ -64,7 +64,6 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
         places: the row of each frame in the full chunk, also when only some of its frames are made: cuBLAS sums may differ by row, and
             frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a
             faster product is used.
-        device: where.
         pixels: of a block of rows; None: all.
     """
     channels, _, count = stack.shape

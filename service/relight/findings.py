@@ -34,7 +34,7 @@ class FrameFindings:
     """The worst of the frames that were made."""
 
     guided: bool
-    """Whether a model of solved maps guides the frames."""
+    """True if a model of solved maps guides the frames."""
     beyond: float = 0.0
     """Largest share of a frame's energy from beyond the captured lights."""
     beyond_frame: int | None = None
@@ -71,7 +71,7 @@ class FrameFindings:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What does not fit, and what to try."""
+        """Return sentences that say what does not fit, and what to try."""
         found = []
         if self.beyond >= LEAST_BEYOND:
             found.append(f"{_percent(self.beyond)} of the light of {_picture(self.beyond_frame)} comes from directions more than "
@@ -87,7 +87,7 @@ class FrameFindings:
 
 @dataclass
 class MatteFindings:
-    """What the mattes of the captures are known from."""
+    """The sources of the mattes of the captures."""
 
     counts: dict[str, int] = field(default_factory=dict)
     """Number of captures by what the matte is known from."""
@@ -102,7 +102,7 @@ class MatteFindings:
 
     @property
     def sentence(self) -> str:
-        """What the coverage of partly covered pixels is known from; empty where there is nothing to say."""
+        """Return a sentence that names the source of the coverage of partly covered pixels; empty where there is nothing to say."""
         if MatteSource.BACKGROUND in self.counts:
             return KEPT_BACKGROUND
         if self.hard == 1:

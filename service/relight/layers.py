@@ -17,7 +17,7 @@ from stage.stack.stack import Stack
 
 
 class Content(NamedTuple):
-    """What a layer holds, and how its channels are called."""
+    """The content of a layer, and the names of its channels."""
 
     name: str
     """The name of the layer in the file."""
@@ -47,7 +47,7 @@ class StillLayer(NamedTuple):
     name: str
     channels: dict[str, np.ndarray]  # each [rows, cols] float16 or float32
     is_colour: bool
-    """Whether the channels are colours in the colour space of the frames; else they are data."""
+    """True if the channels are colours in the colour space of the frames; else they are data."""
 
     def rows(self, first: int, last: int) -> "StillLayer":
         """Return the rows from `first` until before `last`."""
@@ -173,4 +173,4 @@ def _pose(maps: SurfaceMaps) -> np.ndarray:
 DERIVED: dict[Layer, Callable[[SurfaceMaps, str], np.ndarray]] = {
     Layer.WORLD_NORMAL: _world_normal, Layer.POSITION: _position, Layer.DEPTH: _depth, Layer.ALBEDO: _albedo,
 }
-"""How layers follow from the maps, from the maps and the colour space of the frames: [rows, cols, channels]."""
+"""Functions that make layers [rows, cols, channels] from the maps and the colour space of the frames."""

@@ -1,4 +1,4 @@
-"""What lights a frame, computed once from its schedule: weights of the captured images, and the same light for a model of the surface.
+"""Compute the lighting of a frame once from its schedule: weights of the captured images, and the same light for a surface model.
 
 `far_light` reads the environment, turns it and takes discs into the working space. From its result come the weights of the captured
 images (service.relight.weights.weighting, after Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section
@@ -29,7 +29,7 @@ the work."""
 
 
 class ModelUse(Enum):
-    """Whether a model of the surface is lit too, and for how many frames."""
+    """The use of a surface model: for one frame or few, or for many."""
 
     NONE = auto()
     FRAME = auto()

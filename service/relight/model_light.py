@@ -24,7 +24,7 @@ NearLight = PointLight | SphereLight | RectangleLight
 
 
 class CapturedEnergy(NamedTuple):
-    """What a frame takes of the captured images, as energy of their lights."""
+    """The weights of the captured images in a frame, as energy of their lights."""
 
     given: np.ndarray  # [lights, 3] in place of the environment and the discs
     added: np.ndarray | None  # [lights, 3] of images that light keys of type captured add; None: the frame adds none
@@ -50,7 +50,7 @@ class LightBeyond(NamedTuple):
     wanted: Sources
     """The light; what hides it is what hides the captured lights nearest to it, because no image shows shadows of such light."""
     captured: Sources
-    """What stands in for it in the weighted sum of images."""
+    """The captured lights that represent it in the weighted sum of images."""
 
 
 def model_light(samples: FarSamples, beyond: np.ndarray, energy: CapturedEnergy, directions: np.ndarray,

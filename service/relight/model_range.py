@@ -46,7 +46,7 @@ class LitModel(NamedTuple):
     ratio: np.ndarray  # [3, n] of image to model that the gloss has there (kernels.relight.model.gloss_ratio)
     added: "np.ndarray | None"  # [2, 3, n] diffuse and specular part of the captured images that the frame adds
     beyond: "LitBeyond | None"
-    """Under the light from beyond the captured lights; None: there is none."""
+    """The surface under the light from beyond the captured lights; None: there is none."""
 
 
 class LitBeyond(NamedTuple):
@@ -123,7 +123,7 @@ class Portion(NamedTuple):
     band: Band
     visible: wp.array  # [lights, P] of the captured lights
     horizons: tuple[Horizons | None, ...]
-    """For each group of small lights; None where it has none."""
+    """Horizons for each group of small lights; None where it has none."""
     normal: np.ndarray  # [n, 3]
     albedo: np.ndarray  # [3, n]
 
@@ -132,9 +132,7 @@ class ModelRange:
     """Lights a model of the surface for many frames."""
 
     def __init__(self, model: SurfaceModel, lights: DistantLights) -> None:
-        """Args:
-            model: the surface.
-            lights: the captured lights.
+        """Prepare the model for the captured lights.
 
         Raises:
             ArrayError: fewer than four lights, or all in one plane.

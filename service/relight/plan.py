@@ -28,7 +28,7 @@ class PlannedFrame(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What a relight will make."""
+    """The frames that a relight will make."""
 
     folders: tuple[Path, ...]
     """One capture, or one a time step."""

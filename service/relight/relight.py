@@ -56,9 +56,9 @@ class RelightResult(NamedTuple):
     near_lights: int
     """Point lights that were taken as distant ones, as the object's centre sees them; in a sequence the largest number of one capture."""
     matte: str
-    """What the coverage of partly covered pixels is known from, in words; empty where there is nothing to say."""
+    """A sentence that names the source of the coverage of partly covered pixels; empty where there is nothing to say."""
     warnings: tuple[str, ...]
-    """What does not fit in the frames made now, and what to try."""
+    """Sentences that say what does not fit in the frames made now, and what to try."""
 
 
 def relight(request: RelightRequest, progress: Progress | None = None) -> RelightResult:
@@ -66,7 +66,6 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
 
     Args:
         request: captures, light, frames and where to put them.
-        progress: told of every stage.
 
     Returns:
         The frames, and what the user should know of them.

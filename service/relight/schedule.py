@@ -1,4 +1,4 @@
-"""What lights each frame, as options and light keys say: environment map and its turn, discs, captured images, exposure."""
+"""Schedule the lighting of each frame from options and light keys: environment map and its turn, discs, captured images, exposure."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,7 +37,7 @@ class Disc(NamedTuple):
 
 
 class ScheduledFrame(NamedTuple):
-    """What lights one frame."""
+    """The lighting of one frame."""
 
     number: int
     environment: TurnedEnvironment | None

@@ -56,7 +56,7 @@ class ShadeResult(NamedTuple):
     clipped: int
     """Pixels above the largest half value, stored as that value."""
     warnings: tuple[str, ...]
-    """What does not fit, and what to try."""
+    """Sentences that say what does not fit, and what to try."""
 
 
 def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResult:
@@ -64,7 +64,6 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
 
     Args:
         request: maps, lights and where the picture goes.
-        progress: told of every stage.
 
     Raises:
         RequestError: no light, a file that is no .exr, or one that would replace an input.

@@ -35,7 +35,7 @@ PutRows = Callable[[int, int, np.ndarray, Mapping[str, np.ndarray]], None]
 
 
 class FrameFormat(NamedTuple):
-    """What the frames of a capture have in common."""
+    """Size, colour space, compression and layers, which all frames of a capture share."""
 
     resolution: tuple[int, int]
     space: str
@@ -47,7 +47,7 @@ class FrameFormat(NamedTuple):
     parts: tuple[Layer, ...]
     """The wanted ones of the two layers diffuse and specular, which add up to the frame."""
     in_parts: bool
-    """Whether each layer lies in a part of the file."""
+    """True if each layer lies in a part of the file."""
     alpha: np.ndarray | None  # [rows, cols] float16; None: no alpha is wanted
     factor: np.ndarray | None  # [pixels] float32 that makes frames premultiplied; None: they are
     attributes: dict[str, Any]
@@ -258,6 +258,6 @@ def _half(frame: np.ndarray, form: FrameFormat, prefix: str) -> dict[str, np.nda
 
 
 def _bounded(frame: np.ndarray) -> np.ndarray:
-    """Return a frame within the range of half: itself where no value is beyond it, which takes less than to clip it."""
+    """Return a frame within the range of half: the same array where no value is beyond it, which takes less than to clip it."""
     beyond = bool(frame.max() > exr.HALF_MAX or frame.min() < -exr.HALF_MAX)
     return np.clip(frame, -exr.HALF_MAX, exr.HALF_MAX) if beyond else frame

@@ -1,1 +1,1 @@
-"""What a run says about itself: its progress, and where its results came from."""
+"""Progress of a run, and the provenance of its results."""

@@ -1,4 +1,4 @@
-"""How a command or a job tells how far its work is, and how long each stage of it took."""
+"""Report the progress of a command or a job, and the time that each stage of it took."""
 
 import time
 from collections.abc import Iterator

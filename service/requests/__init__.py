@@ -1,1 +1,1 @@
-"""What can be asked of Relit: one frozen model for each kind of work, of which the command line, the API and farm templates are made."""
+"""Requests to Relit: one frozen model for each kind of work, from which the command line, the API and farm templates are made."""

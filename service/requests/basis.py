@@ -1,4 +1,4 @@
-"""What `relit basis` takes."""
+"""The options of `relit basis`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from service.requests.base.base import CAPTURE, Choice, Request, Role, StackOpti
 
 
 class BasisKind(Choice):
-    """What a capture is reduced to."""
+    """The kind of basis to which a capture is reduced."""
 
     SVD = "svd", "singular value decomposition, which loses least with so many coefficients (.exr)"
     PTM = "ptm", "polynomial texture map, six coefficients in each channel (.ptm)"
@@ -18,7 +18,7 @@ class BasisKind(Choice):
 
 
 class BasisCount(StackOptions):
-    """How many coefficients are kept."""
+    """The number of coefficients that are kept."""
 
     count: int | None = Field(default=None, ge=1)
     """Coefficients in each channel. svd: 1 to the number of lights; hsh: 4, 9 or 16; both kinds of ptm: always 6. None: svd: 16, or the
@@ -26,10 +26,10 @@ class BasisCount(StackOptions):
 
 
 class BasisOptions(BasisCount):
-    """What a job of the service reduces a capture to."""
+    """The basis to which a job of the service reduces a capture."""
 
     basis: BasisKind = BasisKind.SVD
-    """What the capture is reduced to."""
+    """The kind of basis to which the capture is reduced."""
 
 
 class BasisRequest(BasisCount, Request):
@@ -40,4 +40,4 @@ class BasisRequest(BasisCount, Request):
     out: Annotated[Path, Role.OUTPUT]
     """The file: .exr, .ptm or .rti; a .json that describes it is written beside it."""
     kind: BasisKind | None = None
-    """What the capture is reduced to; None: the first kind with the suffix of `out`."""
+    """The kind of basis to which the capture is reduced; None: the first kind with the suffix of `out`."""

@@ -1,4 +1,4 @@
-"""What `relit calibrate` takes: one frozen model for each kind."""
+"""The options of `relit calibrate`: one frozen model for each kind."""
 
 from functools import partial
 from pathlib import Path
@@ -103,14 +103,14 @@ class BallOptions(LightsOptions):
 
 
 class MirrorBallOptions(BallOptions):
-    """How the highlight on a mirror ball is found."""
+    """Options for finding the highlight on a mirror ball."""
 
     level: Annotated[float, Field(gt=0, lt=1)] = 0.1
     """The highlight on the ball is what is brighter than this fraction of its peak."""
 
 
 class LightPositionsOptions(MirrorBallOptions):
-    """What is known of the mirror balls."""
+    """Radii and distances of the mirror balls."""
 
     ball_radius_m: tuple[Positive, ...] = ()
     """Radius in metres, one for all balls or one for each; an orthographic camera with pixel_size_m needs none."""
@@ -119,7 +119,7 @@ class LightPositionsOptions(MirrorBallOptions):
 
 
 class GreyBallOptions(BallOptions):
-    """What is known of the grey ball."""
+    """Albedo, radius and distance of the grey ball."""
 
     albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(_albedo), Spelling(metavar="R,G,B")] = None
     """Albedo of the ball, one number or three; None: only ratios of irradiance are measured, and their mean is set to 1."""
@@ -133,7 +133,7 @@ class GreyBallOptions(BallOptions):
 
 
 class IntensityOptions(LightsOptions):
-    """How many pixels of the object are looked at."""
+    """The number of pixels of the object that are used."""
 
     pixels: Annotated[int, Field(ge=100, le=100_000)] = 2000
     """Number of pixels of the mask, drawn at random, that are used: 100 to 100000."""
@@ -201,7 +201,7 @@ class FlatFieldRequest(FramesRequest):
 
 
 class WhiteBalanceOptions(Options):
-    """How colours follow from a grey or white card."""
+    """Options for white balance by a grey or white card."""
 
     region: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
     """Part of the images that the card fills: first column, first row, width and height in pixels; None: all of it."""
@@ -223,7 +223,7 @@ class SaturationRequest(ManifestRequest):
 
 
 class BoardOptions(Options):
-    """What is known of the chessboard."""
+    """Corners and squares of the chessboard."""
 
     board: Annotated[tuple[Corners, Corners], BeforeValidator(board_corners), Spelling(metavar="9x6")]
     """Inner corners of the chessboard, across and down."""
@@ -232,7 +232,7 @@ class BoardOptions(Options):
 
 
 class ProcamOptions(BoardOptions):
-    """What is known of the chessboard and the projector."""
+    """The chessboard, the size of the projector, and the treatment of outliers."""
 
     projector: Annotated[tuple[Count, Count] | None, WidthHeight, Spelling(metavar="1280x800")] = None
     """Width and height of the projector in pixels; None: as in the manifests."""
@@ -259,7 +259,7 @@ class StereoRequest(BoardOptions):
 
 
 class LaserPlanesOptions(Options):
-    """What the stripes of the laser fall on: a chessboard, or a step."""
+    """The target under the stripes of the laser: a chessboard, or a step."""
 
     board: Annotated[tuple[Corners, Corners] | None, BeforeValidator(board_corners), Spelling(metavar="9x6")] = None
     """Inner corners of the chessboard, across and down."""
@@ -289,7 +289,7 @@ class LaserPlanesRequest(LaserPlanesOptions, DeviceRequest):
 
 
 class ResponseOptions(Options):
-    """What the images of evenly grey projections show."""
+    """The levels of the images of evenly grey projections."""
 
     levels: Annotated[tuple[Annotated[float, Field(ge=0, le=1)], ...], BeforeValidator(_levels), Commas, Spelling(metavar="0,0.25,…")] = ()
     """Level of each image, 0 to 1; without it even steps from 0 to 1 in the order of the images."""

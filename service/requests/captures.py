@@ -1,4 +1,4 @@
-"""What `relit info` and `relit import` take: one frozen model for each layout of files."""
+"""The options of `relit info` and `relit import`: one frozen model for each layout of files."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -58,7 +58,7 @@ def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class LensOptions(Options):
-    """What is known of a camera's lens."""
+    """Focal length, principal point and distortion of a camera's lens."""
 
     focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
                         Spelling(metavar="F[,F]")] = None
@@ -71,7 +71,7 @@ class LensOptions(Options):
 
 
 class CameraOptions(LensOptions):
-    """What is known of the camera; without a focal length it is taken to be orthographic."""
+    """The camera; without a focal length it is taken to be orthographic."""
 
     pixel_size_m: Positive | None = None
     """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
@@ -81,10 +81,10 @@ class CameraOptions(LensOptions):
 
 
 class ImageOptions(Options):
-    """Which images of the folder are frames, and how they are encoded."""
+    """The images of the folder that are frames, and their encoding."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the one of ambient light."""
+    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the ambient image."""
     mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image of the mask; None: the one with the word mask in its name, if there is one."""
     ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
@@ -94,21 +94,21 @@ class ImageOptions(Options):
 
 
 class Sense(Choice):
-    """Where the vectors of a table point."""
+    """The direction of the vectors of a table."""
 
     TO_LIGHT = "to-light", "directions to the light, or its position seen from the object"
     FROM_LIGHT = "from-light", "along the rays, away from the light"
 
 
 class Run(Choice):
-    """What a light is in a table of numbers."""
+    """The rows or columns of a table of numbers, each a light."""
 
     ROWS = "rows"
     COLUMNS = "columns"
 
 
 class AxisWay(Choice):
-    """Where an axis points, as seen by the camera."""
+    """The direction of an axis, as seen by the camera."""
 
     RIGHT = "right"
     LEFT = "left"
@@ -128,14 +128,14 @@ class OlatImport(CameraOptions, ImageOptions, ImportRequest):
     """Where x, y and z of the table point as seen by the camera: right or left, up or down, towards the camera or away from it. relit and
     OpenGL have right,up,towards, OpenCV has right,down,away."""
     sense: Annotated[Sense, Spelling(flag="--vectors")]
-    """What the vectors of the table are."""
+    """The meaning of the vectors of the table."""
     lights: Annotated[Path | None, Role.INPUT] = None
     """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
     SRC."""
     variable: Line | None = None
     """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
     lights_in: Run | None = None
-    """What a light is in a table of numbers; None: as its shape says."""
+    """A light's numbers in the table are a row or a column; None: as its shape says."""
     strengths: Annotated[Path | None, Role.INPUT] = None
     """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
 
@@ -164,7 +164,7 @@ class RelightlabImport(ImportRequest):
 
 
 class PlaneForm(Choice):
-    """What the four coefficients of a plane mean."""
+    """The equation to which the four coefficients of a plane belong."""
 
     ZERO = "zero", "a x + b y + c z + d = 0"
     EQUALS = "equals", "a x + b y + c z = d"
@@ -179,7 +179,7 @@ class LaserImport(LensOptions, ImageOptions, ImportRequest):
     """File with the plane of each image: rows of four coefficients, or of a point and a normal (.csv, .txt, .npy, .mat), or a calibration
     file with them; None: relit calibrate laser-planes measures them."""
     form: PlaneForm | None = None
-    """What four coefficients of a plane mean."""
+    """The equation to which four coefficients of a plane belong."""
     axes: Axes | None = None
     """Where x, y and z of the planes point as seen by the camera, whose centre is their origin; OpenCV has right,down,away. Needed with
     planes."""
@@ -208,14 +208,14 @@ class RigOptions(Options):
 
 
 class ExposureOrder(Choice):
-    """How the images of several exposures follow each other."""
+    """The order of the images of several exposures."""
 
     EXPOSURE = "exposure", "each pattern at all exposures, then the next pattern"
     PATTERN = "pattern", "all patterns at one exposure, then at the next"
 
 
 class PatternImageOptions(Options):
-    """Which images of the folder are frames of patterns."""
+    """The images of the folder that are frames of patterns."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, such as 'phase_*.png', taken in natural order; None: every image that is not named otherwise."""
@@ -232,11 +232,11 @@ class PatternImageOptions(Options):
     exposures_s: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="S,S,…")] = None
     """Exposure times in seconds at which every pattern was taken, in the order of the images; None: one, which is not needed."""
     exposure_order: ExposureOrder = ExposureOrder.EXPOSURE
-    """What changes first from image to image where there are several exposures."""
+    """The part that changes first from image to image where there are several exposures."""
 
 
 class Inverses(Choice):
-    """Where the inverse images of a Gray code are."""
+    """The place of the inverse images of a Gray code."""
 
     PAIRS = "pairs", "each image is followed by its inverse"
     BLOCKS = "blocks", "all images of an axis, then their inverses"
@@ -247,9 +247,9 @@ class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
     """Images of a Gray code in any order."""
 
     sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
-    """What follows what in the images: columns, rows, white and black, each once or not at all."""
+    """The order of the parts in the images: columns, rows, white and black, each once or not at all."""
     inverses: Inverses = Inverses.PAIRS
-    """Where the inverse images are."""
+    """The place of the inverse images."""
     fine_first: bool = False
     """The finest stripes come first; else the coarsest."""
     column_bits: Count | None = None
@@ -259,14 +259,14 @@ class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
 
 
 class PhaseShift(Choice):
-    """How the waves move from step to step."""
+    """The direction in which the waves move from step to step."""
 
     MINUS = "minus", "cos(2πu/P − 2πi/N), to larger columns, as relit and SLStudio do"
     PLUS = "plus", "cos(2πu/P + 2πi/N)"
 
 
 class WaveOrigin(Choice):
-    """Where the column 0 of a wave lies in the projector."""
+    """The place of column 0 of a wave in the projector."""
 
     EDGE = "edge", "at the outer edge of the first pixel, as relit has it"
     CENTRE = "centre", "at its centre, as in cos(2πx/P) with the number x of the pixel"
@@ -284,19 +284,19 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
     row_periods: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="P,P,…")] = None
     """Periods along the rows; None: as `periods`."""
     order: Annotated[tuple[Line, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
-    """What changes from image to image, slowest first: axis, period and step."""
+    """The order in which axis, period and step change from image to image, slowest first."""
     shift: PhaseShift = PhaseShift.MINUS
     """Direction in which the waves move from step to step."""
     offset_deg: Finite = 0.0
     """Phase at `origin` in the first step, degrees. Waves that are sines have -90."""
     origin: WaveOrigin = WaveOrigin.EDGE
-    """Where the waves have column 0."""
+    """The place of column 0 of the waves."""
     gray_images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the images of a Gray code that numbers the periods."""
     gray_stripe: Positive | None = None
     """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
     gray_inverses: Inverses = Inverses.NONE
-    """Where the inverse images of the Gray code are."""
+    """The place of the inverse images of the Gray code."""
     gray_fine_first: bool = False
     """The finest stripes of the Gray code come first."""
 
@@ -308,7 +308,7 @@ class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
 
 
 class Codec(Choice):
-    """What a scanning program projects, and in which order."""
+    """The patterns that a scanning program projects, and their order."""
 
     OPENCV_GRAY = "opencv-gray", "GrayCodePattern: columns and rows with inverses, white, black"
     SLSTUDIO_GRAY = "slstudio-gray", "white, black, ten bits of columns, six of rows"
@@ -323,7 +323,7 @@ class ScannerImport(ImportRequest):
     calibration: Annotated[Path, Role.INPUT]
     """Calibration of camera and projector: SLStudio's calibration.xml, or an OpenCV file (.yml, .xml, .json)."""
     codec: Codec
-    """What was projected."""
+    """The patterns that were projected."""
     unit_m: Positive
     """Metres in one unit of the translation: SLStudio has millimetres, 0.001."""
     axis: PatternAxis = PatternAxis.COLUMN

@@ -1,4 +1,4 @@
-"""What `relit demo` and `relit bench` take."""
+"""The options of `relit demo` and `relit bench`."""
 
 from pathlib import Path
 from typing import Annotated

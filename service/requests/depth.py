@@ -1,4 +1,4 @@
-"""What `relit depth`, `relit scan` and `relit separate` take."""
+"""The options of `relit depth`, `relit scan` and `relit separate`."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +25,7 @@ def _without_blanks(given: Any) -> Any:
 
 
 class Ranging(Choice):
-    """What a depth is measured with."""
+    """The technique that measures a depth."""
 
     PATTERN = "pattern", "structured light: frames under projected patterns"
     LASER = "laser", "frames under spots or stripes of a laser"
@@ -41,7 +41,7 @@ class TofFilter(Choice):
 
 
 class WhichReturn(Choice):
-    """Which of several returns is the depth."""
+    """The return that is taken as the depth where there are several."""
 
     STRONGEST = "strongest"
     FIRST = "first"
@@ -49,7 +49,7 @@ class WhichReturn(Choice):
 
 
 class TofChoices(Options):
-    """How time of flight is solved."""
+    """Options of the solver for time of flight."""
 
     filters: Annotated[tuple[TofFilter, ...], BeforeValidator(_without_blanks), Commas, Spelling(flag="--filter")] = ()
     """Filters of time of flight, as text with commas between."""
@@ -64,7 +64,7 @@ class TofChoices(Options):
 
 
 class TofOptions(TofChoices):
-    """How time of flight is solved, with the camera's calibration."""
+    """Options of the solver for time of flight, with the camera's calibration."""
 
     calibration: Annotated[Path | None, Role.INPUT, Spelling(flag="--tof-calibration")] = None
     """Noise, wiggling, offset, drift and pulse of a time-of-flight camera: a relit.tof/1 file; None: noise and pulse are estimated from
@@ -72,10 +72,10 @@ class TofOptions(TofChoices):
 
 
 class DepthOptions(PixelOptions):
-    """How depth is decoded, and which depths are kept."""
+    """Options for decoding depth, and for the depths that are kept."""
 
     using: Ranging | None = None
-    """Which frames to use; needed only where a capture has several kinds."""
+    """The kind of frames to use; needed only where a capture has several kinds."""
     near_m: Positive | None = None
     """Nearest depth in metres; pixels below have the status out of range."""
     far_m: Positive | None = None
@@ -116,7 +116,7 @@ class DepthRequest(DepthOptions, SequenceRequest):
 
 
 class ScanOptions(Options):
-    """Which returns count, and what is written."""
+    """The range of returns that count, and the files that are written."""
 
     near_m: Positive | None = None
     """Returns nearer than this, in metres, are left out."""
@@ -136,7 +136,7 @@ class ScanRequest(ScanOptions, DeviceRequest):
 
 
 class SeparateOptions(PixelOptions):
-    """Which frames are used, and how."""
+    """The frames that are used, and the black level of the projector."""
 
     period_px: Positive | None = None
     """Period of the phase frames to use, in projector pixels; None: the shortest of the capture, which must not exceed 64."""

@@ -1,4 +1,4 @@
-"""What `relit export` and `relit inspect` take."""
+"""The options of `relit export` and `relit inspect`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -19,14 +19,14 @@ MOST_LEVELS = 4
 
 
 class Geometry(Choice):
-    """What an asset of a depth is made of."""
+    """The geometry of an asset of a depth."""
 
     MESH = "mesh", "faces between neighbouring pixels of one surface"
     POINTS = "points", "the measured points"
 
 
 class TextureFormat(Choice):
-    """How the textures of an asset are stored."""
+    """The file format of the textures of an asset."""
 
     PNG16 = "png16", "16 bits, which every client reads; colours as sRGB"
     PNG8 = "png8", "8 bits for colours, a fifth of the size; normals, roughness and metallic keep 16, but not in a .glb"
@@ -34,14 +34,14 @@ class TextureFormat(Choice):
 
 
 class ExportOptions(PixelOptions):
-    """What an asset is called and made of."""
+    """Name, version, geometry and textures of an asset."""
 
     name: Line | None = None
     """Name of the asset; None: the name that the maps have, else the stem of the file's name."""
     version: Annotated[Line, Field(min_length=1)] = FIRST_VERSION
     """Version of the asset, written into its assetInfo: what a pipeline counts, as in 3 or v003."""
     geometry: Geometry | None = None
-    """What an asset of a depth (depth.exr in place of maps.exr) is made of; None: mesh."""
+    """The geometry of an asset of a depth (depth.exr in place of maps.exr); None: mesh."""
     textures: TextureFormat = TextureFormat.PNG16
     """How textures are stored."""
     levels: Annotated[int, Field(ge=0, le=MOST_LEVELS)] = 0

@@ -1,4 +1,4 @@
-"""What `relit import tof`, `histogram` and `kinect` take."""
+"""The options of `relit import tof`, `histogram` and `kinect`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,7 @@ class Signal(Choice):
 
 
 class TofOrder(Choice):
-    """What changes from image to image, slowest first."""
+    """The order in which frequency and phase change from image to image, slowest first."""
 
     FREQUENCY_PHASE = "frequency,phase"
     PHASE_FREQUENCY = "phase,frequency"
@@ -30,7 +30,7 @@ class End(Choice):
 
 
 class ArrayOptions(CameraOptions):
-    """Which files hold arrays, and what the files do not say."""
+    """The files that hold arrays, and their layout where the files do not state it."""
 
     arrays: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the files, such as 'phase*.npy', taken in natural order; None: every .npy, .npz, .mat, .json, .bin, .raw and .dat file."""
@@ -54,7 +54,7 @@ class TofImport(ArrayOptions, ImportRequest):
     signal: Signal
     """Sign of δ: with the other one ranges run backwards."""
     order: TofOrder = TofOrder.FREQUENCY_PHASE
-    """What changes slowest first."""
+    """The order in which frequency and phase change, slowest first."""
     planes: End | None = None
     """Where images are counted in arrays of three dimensions; None: as their shape says."""
 
@@ -73,7 +73,7 @@ class HistogramImport(ArrayOptions, ImportRequest):
     first_photon_only: bool = False
     """The detector counts the first photon of a pulse alone: pile-up is corrected with `pulses`."""
     bins: End = End.LAST
-    """Where the bins are counted in the arrays."""
+    """The axis of the arrays along which the bins are counted."""
 
 
 class KinectImport(CameraOptions, ImportRequest):

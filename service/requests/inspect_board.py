@@ -1,4 +1,4 @@
-"""What `relit inspect-board` and `relit gauge-board` take."""
+"""The options of `relit inspect-board` and `relit gauge-board`."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -10,14 +10,14 @@ from stage.model import Fraction, NotNegative, Positive
 
 
 class BoardForm(Choice):
-    """What is removed from the deviations before they are judged."""
+    """The form of the board that is removed from the deviations before they are judged."""
 
     PLANE = "plane", "offset and tilt of the board"
     QUADRATIC = "quadratic", "offset, tilt, bow and twist of the board"
 
 
 class InspectBoardOptions(Options):
-    """How tiles are stitched, and when a deviation is a defect."""
+    """Options for stitching tiles, and for the deviations that are defects."""
 
     pixel_m: Positive | None = None
     """Side of a pixel of the height map in metres, where no golden map or design gives it. None: the largest distance of neighbouring
@@ -25,7 +25,7 @@ class InspectBoardOptions(Options):
     placement_m: Positive | None = None
     """Standard deviation of the place of a board in its fixture along x and y, metres. None: 5 pixels."""
     remove: BoardForm = BoardForm.PLANE
-    """What is removed from the deviations before they are judged."""
+    """The form of the board that is removed from the deviations before they are judged."""
     tolerance_m: NotNegative = 0.0
     """Deviation in metres up to which a place is no defect; in a region of the design, the wider of its limits counts if it is larger."""
     smallest_defect_m: Positive | None = None

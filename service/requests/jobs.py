@@ -29,7 +29,7 @@ MOST_SCANS = 500
 
 
 class CheckJob(JobRequest):
-    """Whether a capture or environment can be used: manifest, headers and the size of images. Made by the service itself."""
+    """Check that a capture or environment can be used: manifest, headers and the size of images. The service makes this job on its own."""
 
     kind: Literal["check"]
     intake: Line
@@ -144,7 +144,7 @@ class FuseJob(JobRequest):
 
 
 class ViewJob(JobRequest):
-    """What a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
+    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
 
     kind: Literal["view"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
@@ -205,7 +205,7 @@ class ScanJob(JobRequest):
 
 
 class InspectBoardJob(JobRequest):
-    """What is wrong with a board that was measured in tiles: board.exr, deviation.exr, findings.csv, inspection.png, report.json."""
+    """Find the defects of a board that was measured in tiles: board.exr, deviation.exr, findings.csv, inspection.png, report.json."""
 
     kind: Literal["inspect-board"]
     capture: Annotated[CaptureId, Role.INPUT, Spelling(argument=True, metavar="BOARD")]
@@ -228,7 +228,7 @@ class GaugeBoardJob(JobRequest):
 
     kind: Literal["gauge-board"]
     study: Annotated[GaugeRuns, Role.INPUT, Spelling(argument=True, metavar="STUDY")]
-    """Which job inspected which board for which operator (JSON, schema relit.gauge-study/1; docs/inspection.md)."""
+    """The job, board and operator of each inspection (JSON, schema relit.gauge-study/1; docs/inspection.md)."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

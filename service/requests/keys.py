@@ -1,4 +1,4 @@
-"""What `relit keys create` takes."""
+"""The options of `relit keys create`."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from service.requests.base.identifiers import Project
 
 
 class Scope(Choice):
-    """What a key allows; each scope allows what those before it do."""
+    """The rights of a key; each scope includes those before it."""
 
     READ = "read", "see captures, jobs and results"
     WRITE = "write", "also upload, submit, cancel and retry jobs, and delete what belongs to the project"
@@ -22,8 +22,8 @@ class NewKey(Options):
     project: Project
     """Project whose captures, jobs and results the key gives access to; its name is made of a-z, 0-9 and -."""
     name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
-    """Who holds the key: a person or a program."""
+    """The holder of the key: a person or a program."""
     scope: Scope
-    """What the key allows."""
+    """The rights of the key."""
     expires_days: Annotated[float | None, Field(gt=0, le=36_500)] = None
     """Days after which requests with the key are refused; without it never."""

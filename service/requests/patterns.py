@@ -1,4 +1,4 @@
-"""What `relit patterns` takes: the request for images to project, and that for the planner's table."""
+"""The options of `relit patterns`: the request for images to project, and that for the planner's table."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 
 
 class PatternCode(Choice):
-    """What to project."""
+    """The code to project."""
 
     BINARY = "binary", "binary numbers of stripes"
     GRAY = "gray", "Gray code: at each edge of a stripe only one image changes"
@@ -30,7 +30,7 @@ class PatternCode(Choice):
 
 
 class PatternAxis(Choice):
-    """Which projector coordinate is coded."""
+    """The projector coordinate that is coded."""
 
     COLUMN = "column"
     ROW = "row"
@@ -38,7 +38,7 @@ class PatternAxis(Choice):
 
 
 class CodeOptions(Options):
-    """What the images and the planner's table have in common."""
+    """Options that the images and the planner's table share."""
 
     projector: Annotated[tuple[Side, Side], WidthHeight, Spelling(metavar="WxH")]
     """Width and height of the projector in pixels; as text 1280x800."""
@@ -56,10 +56,10 @@ class CodeOptions(Options):
 
 
 class PatternsOptions(CodeOptions):
-    """What is drawn; each option belongs to the codes that its line names."""
+    """The images to draw; each option belongs to the codes that its line names."""
 
     code: Annotated[PatternCode, Spelling(argument=True, metavar="CODE")]
-    """What to project; not needed with --plan."""
+    """The code to project; not needed with --plan."""
     bits: int = Field(default=8, ge=8, le=16, multiple_of=8)
     """Bits of a channel in the PNG files, 8 or 16."""
     gamma: Positive = 1.0

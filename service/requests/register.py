@@ -1,4 +1,4 @@
-"""What `relit register` and `relit fuse` take."""
+"""The options of `relit register` and `relit fuse`."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -11,14 +11,14 @@ from stage.model import Fraction, Line, Positive
 
 
 class GivenPoses(Choice):
-    """What the poses of the scan set are taken for."""
+    """The use of the poses of the scan set."""
 
     REFINED = "refined", "starts, right to about a sixtieth of the object; pairs that do not overlap there are not tried"
     IGNORED = "ignored", "nothing: all pairs are searched"
 
 
 class TableUse(Choice):
-    """What the turntable of the scan set is taken for."""
+    """The use of the turntable of the scan set."""
 
     START = "start", "its angles give the starts of all poses, which then move freely"
     ANGLES = "angles", "the axis is right, and only the angles are found"
@@ -33,12 +33,12 @@ class Markers(Choice):
 
 
 class RegisterOptions(Options):
-    """How scans are registered."""
+    """Options for registering scans."""
 
     poses: GivenPoses = GivenPoses.REFINED
-    """What the poses of the scan set are taken for."""
+    """The use of the poses of the scan set."""
     turntable: TableUse = TableUse.START
-    """What the turntable of the scan set is taken for, where it has one."""
+    """The use of the turntable of the scan set, where it has one."""
     cell_m: Positive | None = None
     """Side of the cells whose points are averaged for the search without starts, metres. None: a sixtieth of the median extent of the
     scans."""
@@ -84,26 +84,26 @@ class RegisterRequest(RegisterOptions):
 
 
 class Misplaced(Choice):
-    """What becomes of scans that lie beside the surface of the others."""
+    """The treatment of scans that lie beside the surface of the others."""
 
     LEAVE_OUT = "leave-out", "fuse the others, and say which were left out"
     KEEP = "keep", "fuse them all the same"
 
 
 class FuseOptions(Options):
-    """How scans are fused."""
+    """Options for fusing scans."""
 
     voxel_m: Positive | None = None
     """Side of a voxel, metres. None: half the distance between neighbouring pixels, or the noise of a pixel if that is larger."""
     misplaced: Misplaced = Misplaced.LEAVE_OUT
-    """What becomes of scans that lie beside the surface of the others by more than their σ explain."""
+    """The treatment of scans that lie beside the surface of the others by more than their σ explain."""
     join_normals: bool = False
-    """Whether vertices are moved until the surface has the photometric normals of the maps of the scans, without their drift."""
+    """Move vertices until the surface has the photometric normals of the maps of the scans, without their drift."""
     tiles: bool = False
-    """Whether the surface is written as tiles (site.usda with payloads, and PLY files) in place of mesh.ply and asset.usdc, so that memory
+    """Write the surface as tiles (site.usda with payloads, and PLY files) in place of mesh.ply and asset.usdc, so that memory
     does not grow with its size. Tiles have the colours of their vertices and no textures."""
     texture: bool = True
-    """Whether asset.usdc is made: a mesh of fewer faces with textures of what the views show."""
+    """Make asset.usdc: a mesh of fewer faces with textures of what the views show."""
     texture_faces: Annotated[int, Field(ge=100, le=2_000_000)] = 30_000
     """Most faces of the mesh of asset.usdc; mesh.ply has all."""
     texture_px: Annotated[int, Field(ge=64, le=16384)] = 2048

@@ -1,4 +1,4 @@
-"""What `relit relight` takes."""
+"""The options of `relit relight`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ later. A task of a render farm makes as many by default: with fewer, images are 
 
 
 class LightWeights(Choice):
-    """How light from a direction between the captured lights is shared out over them."""
+    """The rule that shares out light from a direction between the captured lights over them."""
 
     KERNEL = "kernel", "so that the expected error of the frame is least"
     CELLS = "cells", "all of it to the nearest light"
@@ -21,7 +21,7 @@ class LightWeights(Choice):
 
 
 class RelightOptions(PictureOptions, StackOptions):
-    """Which frames, and how light is shared out over the captured lights."""
+    """The frames to relight, and how light is shared out over the captured lights."""
 
     frames: Line | None = None
     """A number, or first-last; None: 1, or for a sequence 1 to the number of its time steps."""

@@ -1,4 +1,4 @@
-"""What `relit shade` takes."""
+"""The options of `relit shade`."""
 
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
@@ -11,7 +11,7 @@ from stage.model import Finite, FirstFault
 
 Vector = tuple[float, float, float]
 RIGHT_ANGLE = 1e-3
-"""How far the cosine between the edges of a rectangle may be from 0."""
+"""The largest absolute cosine between the edges of a rectangle."""
 
 
 BRIGHTEST = 1e15

@@ -1,4 +1,4 @@
-"""What `relit simulate` takes: one frozen model for each kind of camera."""
+"""The options of `relit simulate`: one frozen model for each kind of camera."""
 
 from pathlib import Path
 from typing import Annotated

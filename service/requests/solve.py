@@ -1,4 +1,4 @@
-"""What `relit solve` and `relit join` take."""
+"""The options of `relit solve` and `relit join`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ little more than that the surface faces the camera."""
 
 
 class Method(Choice):
-    """How normals are solved."""
+    """The method that solves normals."""
 
     LAMBERT = "lambert", "least squares on every light that gave a reading"
     ROBUST = "robust", "least squares on the lights that are neither in shadow nor in a highlight at the pixel"
@@ -28,14 +28,14 @@ class Method(Choice):
 
 
 class Intensities(Choice):
-    """Which intensities of distant lights a solve uses."""
+    """The intensities of distant lights that a solve uses."""
 
     CHOSEN = "chosen", "those that the images ask for where they explain left-out pixels much better than those of the manifest"
     DECLARED = "declared", "those of the manifest"
 
 
 class LightsKnown(Choice):
-    """What is known of the lights of a solve."""
+    """How far a solve trusts the lights of the manifest."""
 
     DECLARED = "declared", "the lights of the manifest"
     REFINED = "refined", "the lights of the manifest, whose directions are only rough and are refined by the images"
@@ -43,15 +43,15 @@ class LightsKnown(Choice):
 
 
 class SolveOptions(StackOptions):
-    """How normals, albedo and height are solved."""
+    """Options for solving normals, albedo and height."""
 
     method: Method | None = Field(default=None, description=(
         "How normals are solved; None: gradient where there are gradient frames; else svbrdf where there are extended lights, or "
         f"{SVBRDF_LIGHTS} lights or more; else robust."))
     lights: LightsKnown = LightsKnown.DECLARED
-    """What is known of the lights."""
+    """How far the lights of the manifest are trusted."""
     intensities: Intensities = Intensities.CHOSEN
-    """Which intensities of distant lights are used; the report says what was found."""
+    """The intensities of distant lights that are used; the report says what was found."""
     max_sigma: Positive | None = Field(default=None, description=(
         "Largest standard error, in degrees, of a normal that counts as solved; less certain ones are kept outside the mask, with the "
         f"status unsure. None: {MAX_SIGMA:g}; 180 refuses none."))

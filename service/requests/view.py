@@ -1,4 +1,4 @@
-"""What `relit view` takes."""
+"""The options of `relit view`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ MOST_TERMS = 256
 
 
 class ViewOptions(StackOptions):
-    """How a capture is shown."""
+    """Options for showing a capture."""
 
     terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] | None = None
     """Most coefficient images that the object is relit with in the browser; fewer where fewer show the object as well. More are closer to
@@ -20,7 +20,7 @@ class ViewOptions(StackOptions):
 
 
 class ViewRequest(ViewOptions, Request):
-    """What a browser needs to show a capture, its maps, its object under new light, and its depth as points."""
+    """Write the files that a browser needs to show a capture, its maps, its object under new light, and its depth as points."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
     """Folder with a capture.json."""

@@ -29,7 +29,7 @@ from stage.sets.scan_set import read_scan_set
 
 
 class FusedBricks(NamedTuple):
-    """What the phases have made."""
+    """Results of the finished phases."""
 
     summaries: list[ScanSummary]
     placings: list[Placing]

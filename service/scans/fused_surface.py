@@ -47,7 +47,7 @@ class Surface(NamedTuple):
 
 
 class Tally:
-    """How the pixels of one scan lie to the fused surface."""
+    """Counts of the pixels of one scan by their place relative to the fused surface."""
 
     def __init__(self) -> None:
         """Begin without a pixel."""
@@ -127,7 +127,6 @@ def fuse_brick(places: np.ndarray, outlines: list[PreparedScan], scan: Callable[
         names: the layers of the scans.
         voxel: side of a voxel, metres.
         origin: of the lattice, [3] metres.
-        device: where to compute.
 
     Convention:
         The surface lies at the mean of the measured distances weighted by the inverse of their variances.

@@ -32,7 +32,7 @@ POINT_BYTES = 250
 
 
 class ScanFacts(NamedTuple):
-    """What is kept of a scan that was read."""
+    """Facts of a scan that was read."""
 
     name: str
     content: str
@@ -48,7 +48,7 @@ class ScanFacts(NamedTuple):
     found: int
     """Targets that were found in its image."""
     missed: str | None
-    """Why none was, in words after its name; None: some were, or none were looked for."""
+    """The reason why none was, in words after its name; None: some were, or none were looked for."""
 
 
 def facts_of(scan: Scan, file: Path, listed: ScanSet, number: int, options: RegisterOptions) -> ScanFacts:
@@ -170,7 +170,7 @@ class Looked(NamedTuple):
     targets: tuple[Target, ...]
     found: int
     missed: str | None
-    """Why it shows none, in words after its name; None: it shows some, or none was looked for."""
+    """The reason why it shows none, in words after its name; None: it shows some, or none was looked for."""
 
 
 def with_found_targets(scan: Scan, entry: ScanEntry, options: RegisterOptions, file: Path, where: str) -> Looked:

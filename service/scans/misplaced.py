@@ -27,7 +27,7 @@ ROUNDS = 5
 
 
 class Placing(NamedTuple):
-    """How a scan lies to the others."""
+    """The place of a scan relative to the others."""
 
     compared: int  # pixels that another scan sees too
     displacement_m: float  # RMS over the compared pixels along their normals, of the small motion that fits best

@@ -74,7 +74,7 @@ class SharedPieces:
 
     @property
     def leads(self) -> bool:
-        """Whether this worker has the job."""
+        """Return whether this worker has the job."""
         return self._leads
 
     def identify(self, *given: object) -> None:

@@ -26,7 +26,7 @@ LEAST_PIXELS = 100
 
 
 class ScanSummary(NamedTuple):
-    """What a fusion needs to know of every scan."""
+    """Facts of a scan that a fusion needs of every scan."""
 
     name: str
     names: tuple[str, ...]  # its layers

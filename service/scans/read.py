@@ -23,7 +23,7 @@ NORMAL_RADIUS_PX = 2
 FLOAT_STEP = 2.0**-22
 """A float32 resolves a coordinate to this part of it: no σ is smaller."""
 ORTHOGRAPHIC_RANGE_M = 1e3
-"""How far above its image the camera position of an orthographic camera is put, in extents of the scan."""
+"""Distance of the position of an orthographic camera above its image, in extents of the scan."""
 
 
 class _Sigma(NamedTuple):

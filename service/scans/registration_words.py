@@ -1,4 +1,4 @@
-"""What the report of a registration says: facts of scans, pairs and targets, and warnings in sentences."""
+"""Compose the report of a registration: facts of scans, pairs and targets, and warnings in sentences."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from service.scans.registration.registration import Registration
 from service.scans.registration.target_pairs import TargetPlace
 
 LOOSE = 2.0
-"""What loops leave, in units of what the pairs say, from which it is said."""
+"""Residual of loops, in units of the noise of the pairs, above which the report warns of it."""
 SYSTEMATIC = 3.0
 """Residuals of pairs in units of σ from which it is said."""
 

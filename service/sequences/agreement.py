@@ -1,4 +1,4 @@
-"""Whether two estimates of a pixel, taken one after the other, are of one surface at rest, and how much of their error is noise.
+"""Test whether two estimates of a pixel, taken one after the other, are of one surface at rest, and how much of their error is noise.
 
 Nothing is known of the motion of a subject, so that nothing is carried along it. Two estimates agree where their difference is no more
 than noise explains: at the pixel, and in the mean over the pixels around it, which shows a motion of a fraction of the noise. A mean of
@@ -16,7 +16,7 @@ import numpy as np
 MEDIANS = {1: 0.4549, 2: 0.6931, 3: 0.7887}
 """Median of χ² over its degrees of freedom, by these."""
 LIMITS = {1: 12.12, 2: 7.60, 3: 5.91}
-"""Its quantile of 99.95 %, over the degrees of freedom."""
+"""Quantile of 99.95 % of χ² over its degrees of freedom, by these."""
 RADII = (1, 3, 7)
 """Radii in pixels of the squares over which differences are averaged."""
 LEAST_AROUND = 0.5

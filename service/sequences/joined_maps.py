@@ -16,7 +16,7 @@ ALBEDO_NOISE = 2.0
 LARGEST_GAIN = 0.25
 """Change of the brightness of all lights between two steps that is taken for one."""
 GAIN_SPREAD = 0.5
-"""What is left of the changes of albedo, over the change of all, in a change of the brightness of all lights."""
+"""Largest spread of the changes of albedo over their median at which they count as a change of the brightness of all lights."""
 GAIN_SIGMAS = 4.0
 """Least change of the brightness in its standard errors."""
 LEAST_GAIN_PIXELS = 256
@@ -30,7 +30,7 @@ class MapsJoiner:
     """The recursive mean of solved maps, step by step."""
 
     anchored: bool
-    """Whether the height has no place of its own, as under distant lights: the part at rest then keeps its height."""
+    """True if the height has no place of its own, as under distant lights: the part at rest then keeps its height."""
     _before: SurfaceMaps | None = None
     _gain: float = 1.0
     _normal: Track | None = None

@@ -24,16 +24,16 @@ from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 
 FIGURES = re.compile(r"\d[\d.]*")
-"""What differs between sentences of steps that say the same."""
+"""The numbers in a sentence, which may differ between steps whose sentences say the same."""
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
-"""What the report says of a sequence without a file."""
+"""The warning in the report about a sequence without a file."""
 
 OF_LIGHTS = ("found", "suspect_lights")
-"""What the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
+"""Entries that the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
 
 
 class SequenceResult(NamedTuple):
-    """What was made of a sequence."""
+    """Files and statistics of a solved sequence."""
 
     sequence_path: Path
     report_path: Path
@@ -48,7 +48,7 @@ class SequenceResult(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What one step has come to."""
+    """The result of one step."""
 
     facts: dict[str, Any]
     solved: int

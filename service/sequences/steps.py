@@ -21,7 +21,7 @@ from stage.stack.ingest import CACHE_FOLDER
 ALONE = "alone"
 """The folder, in that of a step, of what was found from the step alone."""
 DONE_FILE = "step.json"
-"""What says that a step is done, and from what; written last."""
+"""The file that marks a step as done, and names its inputs; written last."""
 DONE_SCHEMA = "relit.step/1"
 
 

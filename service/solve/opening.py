@@ -31,17 +31,17 @@ class Opened(NamedTuple):
     capture: Capture
     method: Method
     lights: Any
-    """With the intensities that the solve uses."""
+    """The lights with the intensities that the solve uses."""
     declared: Any
-    """As the manifest has them."""
+    """The lights as the manifest has them."""
     solver: Solver
     given: SolveInput
     facts: dict[str, Any]
     """Facts about the lights for the report."""
     found: "UnknownLights | RefinedLights | None" = None
-    """How the lights were found, where they are those of the images."""
+    """The way in which the lights were found, where they are those of the images."""
     distance: Distance | None = None
-    """How the distance of the surface was found, where the manifest does not say it."""
+    """The way in which the distance of the surface was found, where the manifest does not say it."""
 
 
 def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
@@ -50,7 +50,6 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
 
     Args:
         capture: that of the request with its pixels; None: it is opened here.
-        timings: told of every stage.
         sharing: the part of this process where several share the solve.
         over_time: what the captures of a sequence share.
 

@@ -1,1 +1,1 @@
-"""What the pages of the service show of a capture and of its solved or depth maps (relit.view/1)."""
+"""Data for the pages that show a capture and its solved or depth maps (relit.view/1)."""

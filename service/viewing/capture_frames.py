@@ -1,4 +1,4 @@
-"""What each captured frame shows: its light in words and numbers, how bright it is, and a small picture of it."""
+"""Describe each captured frame: its light in words and numbers, how bright it is, and a small picture of it."""
 
 import math
 import os
@@ -30,7 +30,7 @@ WHITE_PERCENTILE = 99.0
 DARK_SHARE = 0.01
 """A pixel counts as dark where its brightest channel is below this share of white."""
 POLARISER = {"none": "", "cross": ", crossed polariser", "parallel": ", parallel polariser"}
-"""What the label of a light says of the polariser of the camera."""
+"""Words for the polariser of the camera in the label of a light."""
 
 
 class FrameImage(NamedTuple):
@@ -48,10 +48,10 @@ class CaptureImages(NamedTuple):
     images: list[FrameImage | None]
     """One for each frame of the manifest; None: it cannot be read."""
     faults: list[str]
-    """Why frames cannot be read."""
+    """Reasons why frames cannot be read."""
     inside: np.ndarray  # [rows, cols] bool of the previews: blocks with a pixel of the object
     measured: list[bool]
-    """Which frames are measurements, and not ambient light, a tracking frame or a photograph under an environment."""
+    """True for frames that are measurements, and not ambient light, a tracking frame or a photograph under an environment."""
 
     @property
     def usable(self) -> bool:
@@ -72,7 +72,6 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
     """Decode every frame of a capture once.
 
     Args:
-        capture: an opened capture.
         mask: [rows, cols] bool.
         timings: told of every frame.
     """
@@ -114,7 +113,6 @@ def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[lis
     """Return what view.json says of every frame.
 
     Args:
-        capture: an opened capture.
         found: its images.
         thumbnails: where the picture of each frame lies in the atlas.
         suspects: a sentence for each image whose light disagrees with the others.

@@ -1,5 +1,5 @@
-"""What a basis changes in pictures under lights that it was not made from: key lights from between the captured lights, and light from
-all around. The truth is the weighted sum of the captured images, which is what `relit relight` without maps renders."""
+"""Measure the error of a basis in pictures under lights that it was not made from: key lights from between the captured lights, and light
+from all around. The truth is the weighted sum of the captured images, which is what `relit relight` without maps renders."""
 
 from typing import Any
 
@@ -32,7 +32,6 @@ class HeldOutLights:
         """Choose the lights, and an exposure for each.
 
         Args:
-            stack: the captured images.
             lights: of the images.
             transfer: their table of directions.
             covered: [pixels padded] bool, pixels of the object.

@@ -14,9 +14,9 @@ from stage.results.light_basis import numbers
 
 BINS = 64
 RANGE_PERCENTILES = (1, 99)
-"""What a display maps to black and white at first."""
+"""Percentiles of the values that a display maps to black and white at first."""
 HISTOGRAM_PERCENTILES = (0.1, 99.9)
-"""Where a histogram begins and ends, so that a few wild values do not squeeze the rest into one bin."""
+"""Percentiles at which a histogram begins and ends, so that a few wild values do not squeeze the rest into one bin."""
 
 
 def statistics_of(values: np.ndarray, valid: np.ndarray) -> dict[str, Any]:
@@ -67,7 +67,7 @@ MEANINGS = {
     Status.UNSURE: "Estimated, but less surely than was asked for.",
     Status.OCCLUDED: "One camera sees this place and the other does not, so that there is nothing to triangulate.",
 }
-"""What each status means to a person who looks at a pixel."""
+"""The meaning of each status, for a person who looks at a pixel."""
 REGIMES = {1: "Lambertian", 2: "glossy", 3: "mirror", 4: "mixture of diffuse and specular"}
 """Codes of the layer regime."""
 

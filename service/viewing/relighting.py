@@ -1,4 +1,4 @@
-"""What a browser relights an object with: few coefficient images, whose coefficients differ from tile to tile.
+"""Make the few coefficient images with which a browser relights an object; their coefficients differ from tile to tile.
 
 The images of a small tile have few independent parts, so a few dozen images and a small matrix for each tile show the object as all
 captured images together do (kernels.relight.basis.basis has the method and its sources).
@@ -29,7 +29,7 @@ from stage.stack.ingest import TOP_EXPONENT
 from stage.stack.stack import Stack
 
 LEAST_LIGHTS = 4
-"""With fewer lights there is nothing to relight with: they do not surround any direction."""
+"""The least number of lights for relighting: fewer do not surround any direction."""
 DEFAULT_TERMS = 32
 """Most coefficient images, unless the request says otherwise."""
 RELATIVE_RMS = 0.005
@@ -54,13 +54,10 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     """Write basis, matte, weights and coefficients of the captured images, and return what view.json says of them.
 
     Args:
-        stack: the captured images.
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
         file: for the blocks.
         most_terms: most coefficient images; None: DEFAULT_TERMS.
-        device: where.
-        timings: told of every stage.
 
     Raises:
         ArrayError: a light gives nothing in a channel.

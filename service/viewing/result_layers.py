@@ -18,7 +18,7 @@ VECTOR, COLOUR, SCALAR, CODES, MASK = "vector", "colour", "scalar", "codes", "ma
 
 
 class Appearance(NamedTuple):
-    """How a layer is shown."""
+    """The display of a layer."""
 
     title: str
     kind: str

@@ -1,4 +1,4 @@
-"""What report.json says of the maps beside it: warnings, lights that disagree with the others, and intensities that the solve refined."""
+"""Read report.json beside maps: warnings, lights that disagree with the others, and intensities that the solve refined."""
 
 import json
 from pathlib import Path
@@ -37,7 +37,7 @@ class _Report(BaseModel):
 
 
 class SolveReport(NamedTuple):
-    """What the report of a solve or a depth says."""
+    """Content of the report of a solve or a depth."""
 
     warnings: list[str]
     """Sentences."""

@@ -22,7 +22,7 @@ NO_TILE = 0xFFFF
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image is divided."""
+    """The division of an image into tiles."""
 
     side: int
     index: np.ndarray  # [rows of tiles, columns of tiles] uint16, row by row from 0; NO_TILE where the object is not
@@ -66,7 +66,6 @@ def tile_rows(stack: Stack, factor: np.ndarray, tiling: Tiling, step: int, timin
     """Yield the captured images row by row of tiles, without rows that hold nothing of the object.
 
     Args:
-        stack: the captured images.
         factor: [rows, cols] of the whole image, which the images are multiplied with.
         tiling: of the image that is reduced by the step.
         step: whole factor by which the images are reduced.

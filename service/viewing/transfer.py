@@ -1,4 +1,4 @@
-"""From light of any direction to weights of the captured images: a table over a lat-long grid of directions.
+"""Convert light of any direction to weights of the captured images by a table over a lat-long grid of directions.
 
 Each pixel of the grid is shared out over the captured lights with the weights of `relit relight` without maps. These weights are
 least-error ones that may not be negative, so those of a whole environment are close to the sum of those of its parts, and not equal.

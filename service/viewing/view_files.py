@@ -102,7 +102,7 @@ class ViewResult(NamedTuple):
     """Mean difference of relit pictures from those of `relit relight` under lights that the images were not made from, in 255ths of the
     display's range: mean of the lights, and largest; None: there are no coefficient images."""
     findings: tuple[str, ...]
-    """What is wrong with the capture, in sentences."""
+    """Faults of the capture, in sentences."""
 
 
 def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
@@ -110,7 +110,6 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
 
     Args:
         request: the capture, the maps if there are any, and the folder of the results.
-        progress: told of every stage.
 
     Raises:
         RequestError: a file of the view would replace one of the capture.

@@ -129,7 +129,7 @@ class Capture:
 
     @property
     def is_polarised(self) -> bool:
-        """Whether distant or point lights have cross- and parallel-polarised frames."""
+        """Return whether distant or point lights have cross- and parallel-polarised frames."""
         return any(isinstance(frame.light, DistantLight | PointLight) and frame.light.polarization != "none"
                    for frame in self.manifest.frames)
 

@@ -11,7 +11,7 @@ from stage.capture.polarised_pairs import check_pairs
 from stage.errors import ManifestError
 
 MEASURED_BY = "relit calibrate mirror-ball or light-positions measures where they are, grey-ball or intensity how strong"
-"""How placeholders are replaced."""
+"""The command that replaces each kind of placeholder."""
 
 
 def distant_lights(capture: Capture) -> DistantLights:

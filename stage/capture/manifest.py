@@ -91,7 +91,7 @@ class Manifest(Strict):
     """The recorded value from which readings are not used; integers count as fractions of full scale. None: the largest integer of
     frames of lights alone."""
     color_matrix: Annotated[ColorMatrix, AfterValidator(_invertible)] | None = None
-    """By rows, the matrix from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
+    """The matrix, by rows, from the linear colours of the images to those of `color_space`: white balance, and the colours of the sensor
     of a camera raw file, as `relit calibrate white-balance` measures it. None: the colours are used as they are."""
     exposure_from: Literal["exif"] | None = None
     """`exif` where the exposure time of every frame is the one that EXIF in its file says. None: `exposure_s` of the frames."""
@@ -101,7 +101,7 @@ class Manifest(Strict):
     """The part of a highlight's light that `cross` frames still show, over what `cross` and `parallel` frames show of it together. None: 0,
     ideal polarisers."""
     assumed: Annotated[tuple[Text, ...], FirstFault] = ()
-    """What an import took for granted because the files do not say it, as sentences, which `relit info` and the reports repeat. Take a
+    """Assumptions of the import that the files do not confirm, as sentences, which `relit info` and the reports repeat. Take a
     sentence out once it is checked."""
     frames: Annotated[tuple[Frame, ...], Field(min_length=1), FirstFault]
     """The images, in the order in which they were taken if the subject moves."""
@@ -138,9 +138,6 @@ class Manifest(Strict):
 
 def read_manifest(path: str | Path) -> Manifest:
     """Read and check a capture.json.
-
-    Args:
-        path: the file.
 
     Raises:
         StorageError: the file cannot be read.

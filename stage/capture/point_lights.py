@@ -34,10 +34,10 @@ class PlacedLights(NamedTuple):
 
 
 class LightPlaces(NamedTuple):
-    """Where distant and point lights are and what they give, one row for each frame, as `PlacedLights` has it."""
+    """Positions and irradiance of distant and point lights, one row for each frame, as `PlacedLights` has it."""
 
     frames: tuple[int, ...]
-    """Their numbers in the manifest."""
+    """Numbers of the frames in the manifest."""
     place: np.ndarray  # [lights, 4] float64
     strength: np.ndarray  # [lights, 3] float64
     lobe: np.ndarray  # [lights, 4] float64

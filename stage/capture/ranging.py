@@ -35,7 +35,7 @@ Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]
 
 
 class Emitter(Strict):
-    """What every kind of time-of-flight frame says of the light: where it comes from."""
+    """The position of the light source, which every kind of time-of-flight frame has."""
 
     source_m: Vector | None = None
     """The place of the light source in the camera frame; None: at the camera. Light then goes |p - source| + |p| to a point p and
@@ -65,7 +65,7 @@ class Pulsed(Emitter):
     pulses: Count | None = None
     """The number of laser pulses behind each histogram, for pile-up; None: unknown, which `first_photon_only` does not allow."""
     first_photon_only: bool = False
-    """Whether the detector counts at most one photon a pulse, so that pile-up is corrected."""
+    """True if the detector counts at most one photon a pulse, so that pile-up is corrected."""
     count_scale: Positive | None = None
     """Recorded units of one photon, where counts were multiplied, averaged or divided; None: estimated from the counts."""
 

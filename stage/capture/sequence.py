@@ -29,7 +29,7 @@ class Step(Strict):
     path: Text
     """The folder of its capture or result, relative to the folder of the file."""
     time_s: NotNegative | None = None
-    """When it was taken; give it for every step or for none. None: its number over `frames_per_second`."""
+    """Time at which it was taken, seconds; give it for every step or for none. None: its number over `frames_per_second`."""
 
 
 class SequenceFile(Strict):
@@ -74,7 +74,7 @@ class Sequence(NamedTuple):
     steps: tuple[TimeStep, ...]
     frames_per_second: float
     timed: bool
-    """Whether a file says the rate and times; else the steps are folders in order of name."""
+    """True if a file says the rate and times; else the steps are folders in order of name."""
 
     def step(self, number: int, path: Path) -> TimeStep:
         """Return the step of a number, from 1, of a sequence that was checked before.

@@ -34,7 +34,7 @@ less noise than the recorded ones, so that the measured noise is below that of t
 HALF_INFINITY = 0x7C00
 """The bits of the half value infinity; NaN and values below zero have larger ones."""
 CLIP_NEGATIVE = "--clip-negative sets such values to 0"
-"""What an error message says where the command has this option."""
+"""The advice in error messages of commands that have this option."""
 
 
 def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend the image", stray: float = 0.0) -> None:

@@ -21,7 +21,7 @@ TURNS = (b"irot", b"imir", b"clap")
 
 
 class AvifHeader(NamedTuple):
-    """What is known of an image before it is decoded."""
+    """Size and format of an image, read before it is decoded."""
 
     width: int
     height: int
@@ -62,7 +62,6 @@ def decode(path: str | Path, stream: BinaryIO, header: AvifHeader) -> np.ndarray
 
     Args:
         path: of the file, for messages.
-        stream: the file.
         header: of `header_of`.
 
     Returns:

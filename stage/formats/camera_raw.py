@@ -36,7 +36,7 @@ SINGULAR = 1e-9
 
 
 class RawHeader(NamedTuple):
-    """What is known of a camera raw file before its pixels are unpacked."""
+    """Metadata of a camera raw file, read before its pixels are unpacked."""
 
     width: int  # of the upright image
     height: int

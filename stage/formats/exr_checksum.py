@@ -21,7 +21,7 @@ HEADER_BYTES = 4 << 20
 BLOCK = 1 << 20
 """The bytes of a file that are read at one time."""
 _LEAD = ATTRIBUTE.encode() + b"\0string\0" + struct.pack("<i", DIGITS)
-"""What stands before the digits: name, type and length of the attribute."""
+"""The bytes before the digits: name, type and length of the attribute."""
 
 
 def write_checksum(path: Path) -> None:

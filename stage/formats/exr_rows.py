@@ -27,7 +27,7 @@ BLOCK_ROWS = 32
 
 
 class _Attribute(NamedTuple):
-    """Where the value of an attribute lies in a header."""
+    """The place of an attribute's value in a header."""
 
     part: int
     name: bytes
@@ -118,7 +118,6 @@ def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: boo
     """Yield a file that takes the rows of a picture; it exists when the block ends without an error, whole, and else not at all.
 
     Args:
-        path: the file.
         rows: of the picture.
         metadata, checksum: as of `exr.write_parts`.
 

@@ -26,7 +26,7 @@ HALF = struct.pack("<i", 1)
 
 
 class Scan(NamedTuple):
-    """What was found in the headers of all parts."""
+    """Result of reading the headers of all parts."""
 
     table: int
     """The position of the first byte behind them: of the tables of chunk offsets."""
@@ -39,7 +39,6 @@ def scan_header(path: Path, stream: BinaryIO) -> Scan:
 
     Args:
         path: of the file, for messages.
-        stream: the file.
 
     Raises:
         ImageError: the header has too many attributes, parts or channels, is too long, or is cut short.

@@ -225,7 +225,7 @@ PNG16_LEVEL = 2
 """Level at which deflate packs 16-bit images, whose lower bytes are noise: it takes two thirds of the time of the usual 6, for 0.4 % more
 bytes. Images of 8 bits keep the usual level, which saves a tenth of their bytes."""
 PNG_FILTER_NONE = 8
-"""What OpenImageIO calls rows as they are. Filtered rows of 16-bit images are larger, 1 to 30 %, and take twice the time, because a
+"""OpenImageIO's code for unfiltered rows. Filtered rows of 16-bit images are 1 to 30 % larger, and take twice the time, because a
 difference of noise is more noise; only images of 8 bits are filtered."""
 
 
@@ -233,7 +233,6 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
 
     Args:
-        path: the file.
         codes: [rows, cols] or [rows, cols, 3] uint8 or uint16.
         srgb: True for colours that are encoded in sRGB, False for data that no reader should convert.
 
@@ -267,7 +266,6 @@ def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared:
     """Check that an image has the width and height that a camera declares, and return its header.
 
     Args:
-        path: the file.
         resolution: width and height.
         declared: the field that declares them, for the message.
 

@@ -16,7 +16,7 @@ UPRIGHT = 1
 
 
 class _Turn(NamedTuple):
-    """How an image becomes upright: rows and columns are exchanged first, then reversed."""
+    """The turn that makes an image upright: rows and columns are exchanged first, then reversed."""
 
     exchanged: bool
     rows_reversed: bool

@@ -75,7 +75,7 @@ def view_of_file(view: View, camera: Path | None, resolution: tuple[int, int]) -
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Which images of a folder are frames."""
+    """Names that choose the frames, the mask and the ambient image of a folder."""
 
     images: str | None = None
     """The names of the frames, as the shell matches them; None: every image that is neither mask nor ambient light."""
@@ -89,7 +89,7 @@ class Selected(NamedTuple):
     """The images of a folder by what they are."""
 
     frames: tuple[str, ...]
-    """In natural order: 2 before 10."""
+    """Names of the frames in natural order: 2 before 10."""
     mask: str | None
     ambient: str | None
 
@@ -162,7 +162,7 @@ WAYS: dict[str, tuple[int, int, int]] = {"right": (1, 0, 0), "left": (-1, 0, 0),
 """The direction of an axis as seen by the camera → its unit vector in the camera frame; `away` is where the camera looks."""
 
 Axes = tuple[str, str, str]
-"""Where x, y and z of a table point, each one of WAYS."""
+"""The directions of x, y and z of a table, each a member of WAYS."""
 CAMERA: Axes = ("right", "up", "towards")
 """The axes of the camera frame, which OpenGL has too."""
 OPENCV: Axes = ("right", "down", "away")

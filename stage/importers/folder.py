@@ -22,7 +22,7 @@ class Guess(NamedTuple):
     """The probable layout of a folder."""
 
     layout: str
-    """In words: `an object of the DiLiGenT benchmark`."""
+    """The layout in words: `an object of the DiLiGenT benchmark`."""
     reason: str
     assumed: tuple[str, ...]
     """Assumptions of the command that the files do not tell."""

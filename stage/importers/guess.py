@@ -35,7 +35,7 @@ PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), fr
 SAMPLE = 4000
 """Pixels of an image that are compared."""
 STEADY = 0.05
-"""How far the sums of images may differ, as a part of their median, that are taken for an image and its inverse, or for steps of a wave."""
+"""Largest difference of the sums of images over their median at which they count as an image and its inverse, or as steps of a wave."""
 MOST_STEPS = 16
 FEWEST_PHOTOS = 4
 """Images of one size that may be frames of one capture; fewer are likelier pictures of something."""

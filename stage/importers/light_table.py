@@ -25,7 +25,7 @@ MOST = 1e300
 COMMENTS = ("#", "%", "//")
 
 Run = str
-"""Whether lights are the `rows` or the `columns` of a table of numbers."""
+"""True if lights are the `rows` or the `columns` of a table of numbers."""
 
 
 class LightTable(NamedTuple):

@@ -76,7 +76,7 @@ LINEAR: ColorSpaceName = "lin_rec709_scene"
 
 @dataclass(frozen=True, kw_only=True)
 class PatternImages:
-    """Which images of a folder are frames of patterns, and the rig that took them."""
+    """Names that choose the frames of patterns in a folder, and the rig that took them."""
 
     projector: tuple[int, int]
     images: str | None = None
@@ -95,7 +95,7 @@ class PatternImages:
     video: VideoFrames | None = None
     """The video that the images were unpacked from; None: they are photographs."""
     patterns_first: bool = False
-    """Whether all patterns were taken at one exposure before the next; else each pattern at all exposures."""
+    """True if all patterns were taken at one exposure before the next; else each pattern at all exposures."""
 
     def exposed(self, entries: Sequence[Entry]) -> list[tuple[Entry, float | None]]:
         """Return each image's pattern and exposure time, in the order of the images."""

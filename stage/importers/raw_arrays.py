@@ -23,7 +23,7 @@ RAW = (".bin", ".raw", ".dat")
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayFiles:
-    """Which files of a folder hold arrays, and what the files do not say themselves."""
+    """Names that choose the array files of a folder, and their layout where the files do not state it."""
 
     files: str | None = None
     """The names of the files, as the shell matches them; None: every file with one of SUFFIXES but capture.json."""

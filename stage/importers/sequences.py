@@ -24,17 +24,17 @@ AXIS_OF = {"columns": "column", "rows": "row"}
 
 @dataclass(frozen=True, kw_only=True)
 class GrayStack:
-    """How a stack of a Gray code was taken."""
+    """The layout of a stack of a Gray code."""
 
     sequence: tuple[str, ...] = ("columns", "rows", "white", "black")
-    """Which parts follow each other: of PARTS, each at most once."""
+    """The order of the parts: members of PARTS, each at most once."""
     inverses: str = "pairs"
     """`pairs`: each image is followed by its inverse; `blocks`: all images of an axis, then their inverses; `none`."""
     fine_first: bool = False
-    """Whether the finest stripes are shown first; else the coarsest."""
+    """True if the finest stripes are shown first; else the coarsest."""
     column_bits: int | None = None
     row_bits: int | None = None
-    """How many images code the columns and the rows, the finest left out where they are fewer than all; None: all."""
+    """Number of images that code the columns and the rows, the finest left out where they are fewer than all; None: all."""
 
     def entries(self, projector: tuple[int, int]) -> list[Entry]:
         """Return the patterns in the order of the images.
@@ -83,19 +83,19 @@ def gray_entries(axis: str, size: int, given: int | None, *, inverses: str, fine
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseStack:
-    """How a stack of phase shifts was taken: (1 + cos(2πu/P + offset ∓ 2πi/N)) / 2 in period P at step i of N."""
+    """The layout of a stack of phase shifts with images (1 + cos(2πu/P + offset ∓ 2πi/N)) / 2 in period P at step i of N."""
 
     axes: tuple[str, ...]
     """column, row or both, in the order of the images."""
     periods_px: tuple[float, ...]
     """Periods along the columns in projector pixels, in the order of the images."""
     row_periods_px: tuple[float, ...] | None = None
-    """Those along the rows; None: the same."""
+    """The periods along the rows; None: the same."""
     steps: int
     order: tuple[str, ...] = LOOPS
     """The loops, of LOOPS, the one that changes slowest first."""
     advancing: bool = True
-    """Whether the pattern moves to larger columns from step to step (minus in the formula); else plus."""
+    """True if the pattern moves to larger columns from step to step (minus in the formula); else plus."""
     offset_deg: float = 0.0
 
     def entries(self) -> list[Entry]:

@@ -18,7 +18,7 @@ LOSSLESS = {"FFV1", "FFVH", "HFYU", "ULRG", "ULRA"}
 
 
 class FrameRange(NamedTuple):
-    """Which frames of a video are used, counted from 0."""
+    """The range of frames of a video that are used, counted from 0."""
 
     first: int
     last: int | None
@@ -47,7 +47,7 @@ class VideoFrames(NamedTuple):
 
     folder: Path
     sentence: str
-    """Which frames were read, in words for the user."""
+    """A sentence for the user that says which frames were read."""
     assumed: tuple[str, ...]
     """Sentences for the entry `assumed` of the manifest."""
 

@@ -30,7 +30,7 @@ class BinaryPattern(Strict):
     stripe_px: Positive = 1
     """The width of the finest stripe in projector pixels."""
     inverse: bool = False
-    """Whether black and white are exchanged."""
+    """True if black and white are exchanged."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -68,7 +68,7 @@ class XorPattern(Strict):
     stripe_px: Positive = 1
     """The width of the finest stripe in projector pixels."""
     inverse: bool = False
-    """Whether black and white are exchanged."""
+    """True if black and white are exchanged."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -45,7 +45,7 @@ class KaryPattern(Strict):
     stripe_px: Positive = 1
     """The width of the finest stripe in projector pixels."""
     reflected: bool = False
-    """Whether a digit t is shown as k - 1 - t where the sum of the coarser digits is odd (k-ary Gray code)."""
+    """True if a digit t is shown as k - 1 - t where the sum of the coarser digits is odd (k-ary Gray code)."""
     levels: Annotated[tuple[Level, ...], FirstFault] | None = None
     """The light of each value of a digit, `base` of them; give these or `colors`. None: the digits are colours."""
     colors: Annotated[tuple[Rgb, ...], FirstFault] | None = None

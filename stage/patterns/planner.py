@@ -1,4 +1,4 @@
-"""Before projecting: how many images a code takes, how long that lasts, and how precise the depth will be.
+"""Predict before projecting the number of images of a code, their duration, and the precision of the depth.
 
 The minimum counts are those of Nayar's lecture 3-5, in which code 0 (no light) is not used: N stripes need ⌈log2(N + 1)⌉ binary images.
 What is projected here numbers stripes from 0 and may add inverses and white and black; both counts are given. The line of each code stands
@@ -58,7 +58,7 @@ class Plan(NamedTuple):
     """Time to capture the images."""
     column_sigma_px: float
     depth_sigma_m: float | None
-    """None without a rig."""
+    """Standard deviation of the depth, metres; None without a rig."""
 
 
 def point_count(columns: int, rows: int) -> int:

@@ -20,7 +20,7 @@ class RampPattern(Strict):
     axis: Axis
     """The axis of the projector along which the code varies."""
     direction: Literal["up", "down"]
-    """Whether the light rises or falls along the axis."""
+    """The direction along the axis in which the light rises."""
 
     def level(self, u: np.ndarray, v: np.ndarray, extent: int) -> np.ndarray:
         """Return 0 to 1 at each place."""

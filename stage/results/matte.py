@@ -60,7 +60,7 @@ PARTIAL = (0.02, 0.98)
 
 
 class MatteSource(StrEnum):
-    """What the coverage of a matte is known from."""
+    """The source of the coverage of a matte."""
 
     FULL = "full"
     """There is no mask: everything is the object."""
@@ -76,7 +76,7 @@ class MatteSource(StrEnum):
 
 
 class Matte(NamedTuple):
-    """How much of each pixel the object covers."""
+    """The coverage of the pixels by the object, and its source."""
 
     coverage: np.ndarray  # [rows, cols] float32, 0…1
     factor: np.ndarray  # [rows, cols] float32, 0…1; a sum of captured images times it is premultiplied by `coverage`

@@ -105,14 +105,14 @@ class NominalMap(Strict):
     """An EXR with height.Z in metres, relative to the file; NaN, or mask.Y 0, where nothing is nominal. sigma.Z, if there, is its
     standard deviation."""
     resolution: tuple[Count, Count]
-    """Its width and height in pixels."""
+    """Width and height in pixels."""
     pixel_m: Positive
     top_left_m: Place
     """Board-frame x and y of the upper left corner of its first pixel."""
 
 
 class BoardDesign(Strict):
-    """What a board should be (schema relit.board-design/1)."""
+    """Nominal heights and tolerance regions of a board (schema relit.board-design/1)."""
 
     schema_: Literal["relit.board-design/1"] = Field(alias="schema")
     name: Text
@@ -127,7 +127,7 @@ class GaugeRun(Strict):
     """The result folder of relit inspect-board with regions, relative to the file; in a job of the service, the job that inspected."""
     board: Text
     operator: Text = "operator"
-    """Who, or which station, measured."""
+    """The person or station that measured."""
 
 
 class GaugeRuns(Strict):

@@ -44,7 +44,7 @@ class TargetEntry(Strict):
     name: Text
     """The name of the target, the same in every scan that shows it."""
     position_m: Vector
-    """Where it is, metres, in the frame of the scan."""
+    """Position of the target in the frame of the scan, metres."""
     sigma_m: Positive
     """Standard deviation of each coordinate, metres."""
 
@@ -62,7 +62,7 @@ class ScanEntry(Strict):
     """Standard deviation of every point along its line of sight, metres, where the scan does not hold it (a PLY file without the property
     sigma, a depth without sigma.Z). None: it is estimated by the scatter of the points around local planes."""
     viewpoint_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Where the scanner stood, of a PLY file, metres, in the frame of the scan: each point was seen from there, with nothing in the way.
+    """Position of the scanner for a PLY file, metres, in the frame of the scan: each point was seen from there, with nothing in the way.
     `relit fuse` needs it of PLY files. None: not known, and taken to be the origin where it only tells the side of a surface."""
     scan_to_world: Transform | None = None
     """The rows of world_from_scan: x_world = R x + t, in metres. None: `world_from_camera` of the depth result, or not known."""
@@ -96,7 +96,7 @@ class Turntable(Strict):
     axis: Direction
     """The direction of the axis in the frame of the camera; turns count by the right-hand rule about it."""
     angles_deg: tuple[Finite, ...] | None = None
-    """By how much the table had turned the object at each scan, degrees; one number a scan. The world is the camera frame at 0 degrees.
+    """Turn of the table at each scan, degrees; one number a scan. The world is the camera frame at 0 degrees.
     None: the angles are not known."""
     angle_sigma_deg: NotNegative = 0.0
     """Standard deviation of each angle, degrees."""

@@ -51,7 +51,6 @@ class Correction:
         """Read the dark, flat and ambient frames of a capture and return its correction.
 
         Args:
-            capture: an opened capture.
             full_scale: True to mark the largest value of integers as saturated where the capture gives no `saturation`.
 
         Raises:
@@ -124,7 +123,7 @@ class Correction:
 
     @property
     def _is_pointwise(self) -> bool:
-        """Whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
+        """Return whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
         return self.capture.manifest.color_matrix is None and self.dark is None and self.flat is None and self.ambient is None
 
     def at(self, pixels: np.ndarray) -> "Correction":

@@ -60,7 +60,7 @@ class Ingest:
     folder: Path
     """The folder of the cache."""
     hint: str
-    """What an error message says about the option that names another folder."""
+    """Advice in error messages: the option that names another folder."""
     fingerprints: Fingerprints
     key: str
     """The key of the stack: a hash of everything that the stored values depend on."""
@@ -70,7 +70,6 @@ class Ingest:
         """Hash the images of the light frames of a capture.
 
         Args:
-            capture: an opened capture.
             cache: the folder for the cache; None stands for `.relit` in the folder of the capture.
             tracking: tracking frames, to the reference of which every frame is warped; None leaves the frames as recorded.
 

@@ -113,7 +113,7 @@ class JoinedExposures:
         self._weight[0][self._lost] = times[0]  # clipped even in the shortest: its frames say in which of them
         self._total = self._weight.sum(axis=0)
         self.counts = tuple(int((self._weight[number] > 0).sum()) for number in range(len(times)))
-        """How many pixels take each exposure."""
+        """Number of pixels that take each exposure."""
         self.exposure = (self._total / sum(times)).astype(np.float32)
         """[rows, cols] light that a pixel has gathered, over that of all exposures: 1 where no frame is clipped."""
         limit = FULL_SCALE if capture.manifest.saturation is None else capture.manifest.saturation

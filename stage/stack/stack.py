@@ -28,8 +28,8 @@ PIXEL_PAD = 64
 BAND_BYTES = 256 << 20
 """The bytes of the stack in one band, which bound the memory of every solver."""
 PAGE_BYTES, PICK_BYTES = 64 << 10, 64 << 20
-"""What a scattered read brings into memory, since Linux maps the 16 pages around it where they are cached, and how much of it a pick keeps
-there at one time."""
+"""Bytes that a scattered read brings into memory, since Linux maps the 16 cached pages around it, and the limit on such bytes that a pick
+keeps in memory at one time."""
 
 
 def padded(count: int, multiple: int) -> int:

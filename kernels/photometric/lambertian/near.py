@@ -25,14 +25,14 @@ noise a hundredfold."""
 
 
 class Places(NamedTuple):
-    """Where the lights of a stack are, padded as its light axis is."""
+    """Positions of the lights of a stack, padded as its light axis is."""
 
     place: np.ndarray  # [lights, 4] float32: position and 1, or unit direction from the surface and 0; padding is 0
     lobe: np.ndarray  # [lights, 4] float32: unit axis from the light and exponent μ; μ = 0: the same all round
 
 
 class NearField(NamedTuple):
-    """Where the lights are, and the surface points that they light."""
+    """Positions of the lights, and the surface points that they light."""
 
     places: Places
     points: np.ndarray  # [3, pixels] float32, camera frame, in the unit of the places; finite at every pixel

@@ -1,4 +1,4 @@
-"""How far Lambertian normals may be off: noise and the misfit of the model, told apart on pairs of pixels close to each other.
+"""Estimate the error of Lambertian normals: noise and the misfit of the model, told apart on pairs of pixels close to each other.
 
 Noise differs between two pixels, and between lights. What the model lacks (highlights, another fall-off than Lambert's, light from other
 surfaces, lights that are not where the manifest says) is nearly the same at both pixels, and at lights close to each other. So it
@@ -75,7 +75,7 @@ class PairFits(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """How sure normals are."""
+    """The uncertainty of normals."""
 
     sigma: np.ndarray  # [pixels] standard error, degrees
     confidence: np.ndarray  # [pixels] 0…1

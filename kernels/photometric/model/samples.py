@@ -40,7 +40,7 @@ class Samples(NamedTuple):
 
     @property
     def arrays(self) -> Any:
-        """These samples as kernels take them: an instance of `samples_type`."""
+        """The samples in the form that kernels take: an instance of `samples_type`."""
         arrays = samples_type(self.lanes)()
         for name in arrays._cls.vars:
             setattr(arrays, name, getattr(self, name))

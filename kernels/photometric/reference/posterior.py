@@ -84,7 +84,7 @@ class Noise(NamedTuple):
     """Standard deviation of a reading y: √(absolute² + (floor · level)² + (slope · y)²)."""
 
     absolute: float
-    """In units of the readings, the same at every pixel."""
+    """Standard deviation in units of the readings, the same at every pixel."""
     floor: float
     """Relative to the level of the pixel."""
     slope: float

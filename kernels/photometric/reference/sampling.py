@@ -43,7 +43,7 @@ SHARP = 0.2
 
 
 class Regime(IntEnum):
-    """How a pixel reflects."""
+    """The kind of reflection of a pixel."""
 
     UNSOLVED = 0
     LAMBERTIAN = 1

@@ -1,4 +1,4 @@
-"""How sure a normal of the hypothesis search is: its standard deviation, and the probability that it is at the right mode.
+"""Estimate the certainty of a normal of the hypothesis search: its standard deviation, and the probability that it is at the right mode.
 
 The costs are taken as twice the negative logarithm of a likelihood, of a noise that the misfit itself measures. Near the best normal
 the descent gives the curvature in every direction; further off the costs of the survey are weights of candidates that the readings
@@ -45,7 +45,7 @@ APART_DEGREES, APART_SIGMAS = 4.0, 3.0
 
 
 class Certainty(NamedTuple):
-    """How sure each sampled normal is."""
+    """The certainty of each sampled normal."""
 
     sigma: np.ndarray  # [n] float32, degrees: standard deviation about the mode, and the distance of other modes times their probability
     probability: np.ndarray  # [n] float32, 0…1, that the normal is at the right mode

@@ -40,14 +40,14 @@ class Schedule(NamedTuple):
 
 
 COLD = Schedule(softened=6, judged=9, softness=256.0, cooling=0.3)
-"""From a normal that is off by up to some 20 degrees, with no weights. Fewer turns leave twice as many pixels of real objects above the
-cost of the hypothesis search; twice as many change a tenth of these."""
+"""Schedule from a normal that is off by up to some 20 degrees, with no weights. Fewer turns leave twice as many pixels of real objects
+above the cost of the hypothesis search; twice as many change a tenth of these."""
 WARM = Schedule(softened=0, judged=5)
-"""From the normal and weights of a neighbour, or of the same pixel under nearly the same model."""
+"""Schedule from the normal and weights of a neighbour, or of the same pixel under nearly the same model."""
 
 
 class Descent(NamedTuple):
-    """Where the descent of each sampled pixel ends."""
+    """The end of the descent of each sampled pixel."""
 
     normal: np.ndarray  # [n, 3] float32, unit
     cost: np.ndarray  # [n] float32, per light

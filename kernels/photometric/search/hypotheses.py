@@ -42,7 +42,7 @@ class Diffuse:
 
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
-    """How candidates are judged."""
+    """Options for the scores of candidates."""
 
     noise_floor: float = 0.1
     """Noise s0 of every reading, relative to the pixel's level: it covers the part of a good pixel that the lobes cannot explain."""
@@ -56,7 +56,7 @@ class SearchOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class RingOptions(SearchOptions):
-    """How candidates on rings are judged, and how far the mixture of each is fitted."""
+    """Options for the scores of candidates on rings, and for the fit of the mixture of each."""
 
     reweightings: int = 5
     """Rounds of the robust fit; with three, normals are 0.1° worse on real data."""

@@ -47,7 +47,7 @@ class LightFactors(NamedTuple):
     gain: float
     """Part of the cost of left-out pixels that the factors of the other half take away."""
     believed: bool
-    """Whether the gain is more than noise and misfit give; else the factors are 1."""
+    """True if the gain is more than noise and misfit give; else the factors are 1."""
 
 
 def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarray, row: np.ndarray, col: np.ndarray, *,

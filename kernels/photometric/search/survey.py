@@ -30,7 +30,7 @@ objects have 0.01 to 0.15 under many lights, and a fit with as many unknowns as 
 
 
 class Evidence(NamedTuple):
-    """How well the readings of each sampled pixel are explained."""
+    """The quality of the explanation of each sampled pixel's readings."""
 
     total: np.ndarray  # [n] float64, cost of all readings
     surplus: np.ndarray  # [n] readings that could have contradicted the fit
@@ -87,7 +87,7 @@ SPARE = 24
 
 
 class Sweep(NamedTuple):
-    """Which pixels are surveyed, and how closely."""
+    """The candidates of a survey, and the cost above which a pixel is surveyed."""
 
     rings: tuple[tuple[float, ...], int]
     """Radii of the rings, degrees, and the number of candidates on the last of them."""
@@ -96,9 +96,9 @@ class Sweep(NamedTuple):
 
 
 CLOSE = Sweep(((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 20), 0.03)
-"""To say how probable other modes are."""
+"""The survey that tells how probable other modes are."""
 QUICK = Sweep(((5.0, 10.0, 16.0, 24.0, 34.0, 46.0), 14), 0.04)
-"""To find a better mode: it finds nearly all that a close survey does, in two thirds of the time."""
+"""The survey that looks for a better mode: it finds nearly all that a close survey does, in two thirds of the time."""
 
 
 class Survey(NamedTuple):
@@ -109,7 +109,7 @@ class Survey(NamedTuple):
     middle: np.ndarray  # [m, 3] float32 unit normals that the rings are about
     costs: wp.array  # [candidates, packs] float packs, on the device: cost of each candidate, summed over the lights
     rings: tuple[tuple[float, ...], int]
-    """On which the candidates lie."""
+    """The rings on which the candidates lie, as in `Sweep`."""
 
 
 def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchOptions | None = None,

@@ -1,5 +1,5 @@
-"""How much each reading speaks for cast shadow: the odds of the reading in shadow against those of the reading that the pixel's material
-predicts without.
+"""Compute the evidence of each reading for cast shadow: the odds of the reading in shadow against those of the reading without, which the
+pixel's material predicts.
 
 In shadow a reading is what other surfaces and the noise leave, some hundredths of the pixel's brightness. Lit, it is near the prediction,
 which errs by a part of itself, with the tails of Cauchy's distribution, because materials are not known exactly. Where the prediction is

@@ -72,7 +72,7 @@ _calling = threading.Lock()
 """Held while a product is queued: the stream of a handle is set just before."""
 
 Gemm = Callable[[Product], None]
-"""Does a product."""
+"""A function that computes a matrix product."""
 
 
 def product_of(device: str) -> Gemm | None:
@@ -119,7 +119,7 @@ class SplitWeights(NamedTuple):
     first: np.ndarray  # [3, GROUP, lights] float16, h; its magnitude is below 2^EXPONENTS
     second: np.ndarray  # [3, GROUP, lights] float16, r
     is_first: bool
-    """Whether no other weights of the group come before."""
+    """True if no other weights of the group come before."""
 
 
 def split(weights: np.ndarray) -> list[SplitWeights]:
@@ -144,7 +144,7 @@ def split(weights: np.ndarray) -> list[SplitWeights]:
 
 
 class _Opened(NamedTuple):
-    """What became of opening cuBLAS on a device."""
+    """Result of opening cuBLAS on a device."""
 
     gemm: Gemm | None
     problem: str | None

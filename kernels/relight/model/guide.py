@@ -1,4 +1,4 @@
-"""How far a model of the surface may correct the captured images, pixel by pixel.
+"""Limit the correction of the captured images by a model of the surface, pixel by pixel.
 
 Between the lights a picture is predicted from those around: Σ s_k I_k. The model says by how much that is wrong, M - Σ s_k M_k, its gloss
 scaled to what the images around show (kernels.relight.model.gloss_ratio); how much of it to believe is what the captured lights tell when

@@ -34,8 +34,8 @@ NOTHING = -1.0e9
 ROUNDING = 1e-3
 """Part of the angle between two directions: far more than azimuths in float32 are off."""
 LEEWAY = 0.05
-"""By how much, absolute and relative, horizons are told apart beyond the slopes of the lights: where the horizon of one direction hides a
-light and that of the next does not, the edge of the shadow lies between them by their difference."""
+"""Margin, absolute and relative, by which horizons are told apart beyond the slopes of the lights: where the horizon of one direction hides
+a light and that of the next does not, the edge of the shadow lies between them by their difference."""
 STEEPEST = 1e4
 """Largest slope of a light, which then stands along the line of sight."""
 TURNED_AWAY = -0.05
@@ -107,7 +107,6 @@ def height_field(height: np.ndarray, mask: np.ndarray, projection: Projection, d
         height: [rows, cols] camera-frame z.
         mask: [rows, cols] bool: where there is surface. It must be one part: no break of the height is looked for.
         projection: of the camera; the unit is that of height.
-        device: where.
     """
     solid = np.where(mask, height, NOTHING).astype(np.float32)
     rows, cols = solid.shape

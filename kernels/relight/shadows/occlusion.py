@@ -1,4 +1,4 @@
-"""Which pixels see which lights, over the solved height."""
+"""Find the lights that each pixel sees over the solved height."""
 
 from functools import cache
 from typing import Any
@@ -23,7 +23,6 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
         mask: [rows, cols] uint8, where there is surface.
         projection: of the camera; the unit is that of height.
         extent: of the height and mask, from shadows.extent_of; None: it is found.
-        device: where.
 
     Returns:
         [n, P] uint8 packs: 255 where the light is seen, 0 where the surface hides it. The last pack is filled up with the last

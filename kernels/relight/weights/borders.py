@@ -15,7 +15,7 @@ import numpy as np
 MOST_CELLS = 16
 """Most cells that share one sample; a sample with more is cut in four, because the work grows with the square of the number."""
 QUARTERINGS = 4
-"""How often a sample may be cut in four. What is left then is a thirty-second of a degree wide and goes whole to its nearest light."""
+"""Times that a sample may be cut in four. The rest is then a thirty-second of a degree wide and goes whole to its nearest light."""
 
 
 class LatLongSamples(NamedTuple):

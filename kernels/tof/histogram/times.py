@@ -1,4 +1,4 @@
-"""How well a histogram tells the time of a return: mean and standard deviation of the time's posterior.
+"""Estimate the time of a return from a histogram: mean and standard deviation of the time's posterior.
 
 The Fisher information bounds the error, and meets it where it is small beside the pulse and the bins. With few photons over some
 background the error is larger (the threshold effect), and where one bin holds the whole pulse the information about its time is zero
@@ -64,7 +64,6 @@ def return_times(histograms: LiveCounts, pulse: Pulse, position: wp.array, photo
     """Return the mean and the standard deviation of the time of each return.
 
     Args:
-        histograms: the histograms.
         pulse: shape of a return.
         position: [return, pixel] float32 times of greatest likelihood, bins.
         photons: [return, pixel] float32 their strengths; the first 0 ends the list.

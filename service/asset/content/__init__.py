@@ -1,1 +1,1 @@
-"""What an asset is made of, without a file format: meshes, tangent frames, materials, texture images."""
+"""Contents of an asset, independent of file formats: meshes, tangent frames, materials, texture images."""

@@ -18,7 +18,7 @@ class Part(NamedTuple):
 
 
 class Inspection(NamedTuple):
-    """What an asset holds, and what is wrong with it."""
+    """Contents and faults of an asset."""
 
     file: str
     size_bytes: int  # with all files that it refers to

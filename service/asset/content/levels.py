@@ -22,7 +22,7 @@ SMOOTHINGS = 40
 """Rounds in which a normal becomes the mean of itself and its four neighbours: a standard deviation of four vertices, the side of the faces
 of the second level. Fewer leave detail that its faces cannot carry, more bend the normals of small objects."""
 _KEYS_PER_PIXEL = 1e4
-"""How finely vertices of the border are told apart: simplification returns them as they are, but for the order of their sums."""
+"""Resolution at which vertices of the border are told apart: simplification returns them as they are, but for the order of their sums."""
 
 
 def with_smooth_normals(mesh: SurfaceMesh) -> SurfaceMesh:

@@ -1,4 +1,4 @@
-"""Which neighbouring pixels of a height map lie on one surface: the mesh has faces between these, and between no others.
+"""Find the neighbouring pixels of a height map that lie on one surface: the mesh has faces between these, and between no others.
 
 A camera sees nothing of what lies behind an edge that hides something, and so nothing of how the surface goes on there. Such a break is
 known by the layer `part`, or by a step of the height that is much steeper than the normals of both pixels say. The comparison is made in
@@ -30,7 +30,7 @@ NEIGHBOURS = ((_ALL, _FIRST), (_ALL, _LAST)), ((_FIRST, _ALL), (_LAST, _ALL))
 
 
 class Links(NamedTuple):
-    """Where two neighbouring pixels both have a height and lie on one surface."""
+    """True where two neighbouring pixels both have a height and lie on one surface."""
 
     right: np.ndarray  # [rows, cols - 1] bool, between a pixel and the one to its right
     down: np.ndarray  # [rows - 1, cols] bool, between a pixel and the one below it

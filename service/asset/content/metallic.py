@@ -65,7 +65,7 @@ class MetallicLook(NamedTuple):
 
     @property
     def provenance(self) -> dict[str, str]:
-        """What was derived from the maps, for the metadata of an asset."""
+        """Return the values that were derived from the maps, for the metadata of an asset."""
         derived = {"ior": self.ior, "lost_albedo": self.lost_albedo, "lost_specular": self.lost_specular}
         return {"relit:metallic": json.dumps({name: round(value, 6) for name, value in derived.items()})}
 

@@ -35,7 +35,7 @@ NEUTRAL_SPACE = "lin_rec709_scene"
 """The scene-linear space that readers take raw colours as."""
 
 BLEED_TEXELS = 8
-"""How far colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
+"""Distance in texels by which colour is bled over the edge of the mask: bilinear filtering stays clean down to the third mip level."""
 
 BAND_ROWS = 256
 """Rows that are computed at a time: bounds the memory of single-precision copies; OpenColorIO needs 0.02 s for each call."""
@@ -44,7 +44,7 @@ IMAGES_AT_ONCE = 2
 """Images that are compressed side by side: each holds some 300 MB at 4096 by 4096 texels."""
 
 VISIBLE = 0.5 / 255
-"""How far outside 0…1 a value is called clipped: half a code of a display."""
+"""The least distance outside 0…1 at which a value is called clipped: half a code of a display."""
 
 COLOURS = ("base_color", "diffuse_albedo", "specular")
 """Images that hold colours."""

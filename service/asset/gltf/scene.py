@@ -17,7 +17,7 @@ from stage.capture.camera import Camera
 from stage.results.result_metadata import result_metadata
 
 FREE_OFFSET_PX = 0.5
-"""How far a principal point may lie from the centre of the image before the camera is said to differ from the capturing one."""
+"""Distance in pixels of the principal point from the image centre beyond which the camera is said to differ from the capturing one."""
 
 
 def camera_and_place(camera: Camera, extent: np.ndarray, *, unit_m: float) -> tuple[gltf.Camera, list[float]]:

@@ -22,7 +22,7 @@ APERTURE_UNIT = 0.1
 """USD gives focal lengths and apertures in tenths of a scene unit (UsdGeomCamera, "Units of Measure")."""
 
 PARALLAX_PX = 0.05
-"""How far, in pixels, the far camera may show a point of the surface from where the orthographic camera shows it."""
+"""The largest distance in pixels between the images of a surface point in the far and in the orthographic camera."""
 
 
 def define_cameras(usd_stage: Usd.Stage, root: Sdf.Path, camera: Camera, extent: np.ndarray) -> None:

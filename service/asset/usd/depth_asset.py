@@ -32,7 +32,7 @@ from stage.results.depth_maps import DepthMaps
 
 
 class _Parts(NamedTuple):
-    """What an asset of a depth is made of."""
+    """Mesh, points and colours of an asset of a depth."""
 
     mesh: SurfaceMesh | None  # None: no face, and points were asked for
     points: MeasuredPoints

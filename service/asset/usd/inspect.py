@@ -22,9 +22,9 @@ from stage.errors import storage
 
 SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 FIRST = Usd.TimeCode.EarliestTime()
-"""When an asset with time samples is looked at."""
+"""The time at which an asset with time samples is inspected."""
 HINT_TOLERANCE = 1e-4
-"""How far extentsHint may be from the geometry, as a part of its size: more than float32 rounds."""
+"""The largest deviation of extentsHint from the geometry, as a part of its size: more than float32 rounds."""
 BINARY = b"PXR-USDC"
 """The first bytes of a binary layer."""
 

@@ -61,7 +61,7 @@ PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy
 
 
 class Description(NamedTuple):
-    """What the layers of an asset say about it."""
+    """Metadata that the layers of an asset store."""
 
     name: str  # free text; the root prim is named after it
     camera: Camera | None  # its world_from_camera becomes the root's transform; None: the asset is in the world frame

@@ -100,7 +100,7 @@ class RigLight(NamedTuple):
 
 
 class _Emission(NamedTuple):
-    """What a light of UsdLux emits."""
+    """Intensity and colour of a light of UsdLux."""
 
     prim: UsdLux.NonboundableLightBase | UsdLux.BoundableLightBase
     intensity: float

@@ -45,7 +45,7 @@ class Moment(NamedTuple):
 
 
 class SequenceSizes(NamedTuple):
-    """What was written."""
+    """Numbers of steps, vertices and faces that were written."""
 
     steps: int
     vertices: int

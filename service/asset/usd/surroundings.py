@@ -23,7 +23,7 @@ _FILES = re.compile(rf"{ENVIRONMENT}\.(?:exr|usda)|{RIG}\.usda|{RIG}_\d+\.exr|{c
 
 
 class Surroundings(NamedTuple):
-    """What an asset brings along; the camera of the capture and of the frames is that of the asset."""
+    """Lights and relit frames that an asset includes; the camera of the capture and of the frames is that of the asset."""
 
     rig: Capture | None = None
     """Capture whose lights become the variant `rig` of `light`."""
@@ -32,7 +32,7 @@ class Surroundings(NamedTuple):
     card: Mapping[int, Path] | None = None
     """Relit frames by their numbers, which become the variant `card` of `geo`."""
     clipped: dict[str, int] | None = None
-    """As in stage.colour.environment_maps.read_environment, for lat-long maps."""
+    """Counts of clipped values as in stage.colour.environment_maps.read_environment, for lat-long maps."""
 
 
 class AssetFiles(NamedTuple):

@@ -13,7 +13,7 @@ DISAGREE = 9.0
 
 
 class TileErrors(NamedTuple):
-    """What is known about the errors of one tile's motion."""
+    """The errors of one tile's motion."""
 
     covariance: np.ndarray  # [6, 6] m², as in Motions
     shared_m: float

@@ -19,7 +19,7 @@ ROUNDS = 12
 
 
 class Deviation(NamedTuple):
-    """What was measured less what is nominal, on the grid of the nominal height map."""
+    """Measured less nominal height, on the grid of the nominal height map."""
 
     grid: BoardGrid
     height: np.ndarray  # [rows, cols] float64 metres, NaN where either is missing

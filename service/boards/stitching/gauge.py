@@ -21,15 +21,15 @@ class GaugeStudy(NamedTuple):
     """Standard deviations of what makes measured values differ, in the unit of the values."""
 
     repeatability: float
-    """How far measurements of one part by one operator scatter (equipment variation)."""
+    """Scatter of measurements of one part by one operator (equipment variation)."""
     reproducibility: float | None
-    """Between operators, with the interaction of parts and operators (appraiser variation); None with one operator."""
+    """Variation between operators, with the interaction of parts and operators (appraiser variation); None with one operator."""
     interaction: float | None
-    """How far operators differ from part to part; None where it was pooled, or with one operator."""
+    """Variation of the operators' differences from part to part; None where it was pooled, or with one operator."""
     gauge: float
     """Repeatability and reproducibility together (GRR)."""
     part: float
-    """Between parts."""
+    """Variation between parts."""
     total: float
     degrees_of_freedom: int
     """Degrees of freedom from which the repeatability is known."""

@@ -177,7 +177,7 @@ WIDE_PX = 0.4
 CLEAR_SLOPE = 4.0
 """A slope counts where it is this many times its noise."""
 NOISE_SPAN = 8.0
-"""What noise differs by within a window of some hundred pixels, in σ."""
+"""The range of noise within a window of some hundred pixels, in σ."""
 BEND_NOISE = float(np.sqrt(6 * 6 / 16))
 """The factor by which `bends` multiplies the standard deviation of independent noise along either direction."""
 

@@ -1,4 +1,4 @@
-"""How one patch of heights lies against another that shows the same surface: shift, rotation, offset and tilt, with their information.
+"""Register one patch of heights to another that shows the same surface: shift, rotation, offset and tilt, with their information.
 
 A motion is six numbers in metres: x, y, rotation about z, height, and the slopes along x and y; rotation and slopes are multiplied by the
 half-length L of the board. The coarse search compares the patches at every shift of whole pixels that the stage's error allows
@@ -38,7 +38,7 @@ LEAST_LOG_ODDS = 7.0
 
 
 class Evidence(StrEnum):
-    """What an overlap says about the shift."""
+    """Result of measuring the shift in an overlap."""
 
     SHIFT = "shift"
     """The shift is measured."""
@@ -51,7 +51,7 @@ class Evidence(StrEnum):
 
 
 class Overlap(NamedTuple):
-    """What the common pixels of two patches say about their motions: the difference first − second is `difference`."""
+    """The difference of the motions of two patches (first − second), estimated from their common pixels."""
 
     evidence: Evidence
     difference: np.ndarray  # [6] metres

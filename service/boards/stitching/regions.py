@@ -1,4 +1,4 @@
-"""Whether the regions of a design are within their tolerances, decided by σ (ISO 14253-1)."""
+"""Test whether the regions of a design are within their tolerances, decided by σ (ISO 14253-1)."""
 
 from collections.abc import Sequence
 from enum import StrEnum
@@ -13,7 +13,7 @@ from stage.sets.board import Region
 
 
 class Verdict(StrEnum):
-    """What was decided about a region or a board."""
+    """The decision about a region or a board."""
 
     PASS = "pass"
     """Within the tolerance, by more than the uncertainty."""
@@ -26,7 +26,7 @@ class Verdict(StrEnum):
 
 
 class RegionResult(NamedTuple):
-    """What was found about a region."""
+    """Verdict and measured deviation of a region."""
 
     region: Region
     verdict: Verdict
@@ -35,7 +35,7 @@ class RegionResult(NamedTuple):
     pixels: int
     """Pixels of the grid that lie within the region."""
     measured: int
-    """How many of these have a deviation."""
+    """Number of these pixels that have a deviation."""
 
 
 def pixels_of(region: Region, grid: BoardGrid, *, grow: float = 0.0) -> tuple[tuple[slice, slice], np.ndarray]:

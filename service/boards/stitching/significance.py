@@ -1,4 +1,4 @@
-"""Which deviations are significant: means over windows and regions against their standard deviation, with a stated false-alarm probability.
+"""Test deviations for significance: means over windows and regions against their σ, with a stated false-alarm probability.
 
 The mean over a set of pixels with weights w = 1 / (noise² + shared²) has the variance (Σ w² noise² + (Σ w shared)²) / (Σ w)²: noise
 averages out, the errors that neighbours share do not. With M tests on a board, each has the false-alarm probability P / M (Bonferroni's
@@ -36,7 +36,7 @@ class Mean(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """What the windows found."""
+    """Result of the tests of all windows."""
 
     significant: np.ndarray  # [rows, cols] bool: pixels of significant windows
     mean: np.ndarray  # [rows, cols] deviation in the smallest window around each pixel, metres; NaN where too little is measured
@@ -48,7 +48,7 @@ class Scan(NamedTuple):
     threshold: float
     """σ from which on a window is significant."""
     detectable_m: dict[int, float]
-    """By the side of windows in pixels: the deviation that is found with a probability of 95 % in the median window."""
+    """By the side of windows in pixels, the deviation that is found with a probability of 95 % in the median window."""
 
 
 def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
@@ -56,7 +56,6 @@ def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
 
     Args:
         false_alarm: above 0 and below 1.
-        tests: their number.
         sides: 2 where a deviation of either sign is an alarm, else 1.
     """
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))

@@ -60,7 +60,7 @@ class TilePoints(NamedTuple):
 
 
 class Stitched(NamedTuple):
-    """Where the tiles of a board lie, and how well they agree."""
+    """The positions of the tiles of a board, and their agreement."""
 
     grid: BoardGrid
     centre: tuple[float, float]
@@ -69,7 +69,7 @@ class Stitched(NamedTuple):
     motions: Motions
     overlaps: dict[tuple[int, int], Overlap]
     noise_factor: float
-    """By which the noise is larger than σ of the depths says; 1 or more, and 1 for a single tile."""
+    """Noise over σ of the depths; 1 or more, and 1 for a single tile."""
     shared_m: float
     """Standard deviation of the error of a tile that the pixels of a block share, with the heights by which overlaps differ still."""
     warnings: list[str]

@@ -8,8 +8,8 @@ import numpy as np
 from stage.spread import MAD_TO_SIGMA
 
 LEAST_NOISE_PX, LEAST_TOLERANCE_PX, MOST_TOLERANCE_PX = 0.05, 0.3, 1.0
-"""The least scatter of a stripe that is taken for its noise; and how far a point may be from the line that it belongs to, at the least and
-at the most."""
+"""The least scatter of a stripe that is taken as its noise; and the least and the largest tolerance of the distance of a point from its
+line."""
 OUTLIER = 4.0
 """Distance from a line in standard deviations beyond which a point does not belong to it."""
 LEAST_END, LEAST_TOP, LEAST_RISER = 8, 12, 5
@@ -43,9 +43,9 @@ class StepStripe(NamedTuple):
     base: Segment
     top: Segment
     riser: Segment | None
-    """None where the riser is hidden, or too short in the image."""
+    """The riser; None where it is hidden, or too short in the image."""
     side: int
-    """Whether the riser comes before the top, -1, or behind it, 1, along the stripe."""
+    """Order along the stripe: -1 if the riser comes before the top, 1 if behind it."""
 
 
 def split_stripe(x: np.ndarray, y: np.ndarray, order: np.ndarray, pixel: float) -> StepStripe | None:

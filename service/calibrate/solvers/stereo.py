@@ -29,7 +29,7 @@ class SharedView(NamedTuple):
 
 
 class StereoPose(NamedTuple):
-    """Where another camera stands, with the errors of the views that it shares with the first."""
+    """The pose of another camera, with the errors of the views that it shares with the first."""
 
     camera_from_other: np.ndarray  # [4, 4] float64, metres, camera frames
     first_error_px: np.ndarray  # [views] root mean square of each view, of the first camera

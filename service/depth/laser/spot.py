@@ -42,7 +42,7 @@ class Spot(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Where two rays come closest."""
+    """The place where two rays come closest."""
 
     point: np.ndarray  # [n, 3] midway between the two
     gap: np.ndarray  # [n] metres between the rays: the residual

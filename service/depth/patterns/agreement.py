@@ -26,7 +26,7 @@ them at most."""
 TRUSTED_PART = 0.6
 """Least part of these neighbours that is not doubted."""
 DISTRUSTED = {Status.MULTIPATH: 1.0, Status.OUT_OF_RANGE: 1.0, Status.UNDECIDED: 0.5}
-"""How far pixels that the decoder refused count as doubted: noise alone leaves some undecided, light of other ways many of all."""
+"""Weights with which pixels that the decoder refused count as doubted: noise leaves some undecided, light of other ways many of all."""
 UNLIT = (Status.UNSOLVED, Status.SHADOWED, Status.LOW_MODULATION, Status.SATURATED)
 """Statuses of pixels that the projector does not light well enough to tell anything."""
 SURE_SHARE = 0.5

@@ -52,7 +52,7 @@ class PatternProjector(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisDecoder:
-    """How one axis is decoded."""
+    """The decoder of one axis."""
 
     axis: Axis
     name: str
@@ -65,7 +65,7 @@ class AxisDecoder:
     halo: int = 0
     """Number of rows above and below a band that decoding reads too."""
     made: EvenLight | None = None
-    """How white and black are made of phases, where it needs them and the capture has none."""
+    """The rule that makes white and black of phases, where it needs them and the capture has none."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class AxisCodes:
     refine: bool
     """Interpolate a Gray code with inverses between the edges of its stripes."""
     made: EvenLight | None = None
-    """How white and black are made of phases; None where the capture has both, or no phases."""
+    """The rule that makes white and black of phases; None where the capture has both, or no phases."""
 
     @classmethod
     def of(cls, collected: Collected, axis: Axis, projector: PatternProjector, *, refine: bool) -> "AxisCodes":

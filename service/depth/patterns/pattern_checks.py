@@ -83,7 +83,7 @@ class Reading(NamedTuple):
     patterns: Callable[[list[Pattern]], list[Pattern]]
     """Returns what the frames would show then."""
     mirrored: bool = False
-    """Whether the coordinates run from the other border."""
+    """True if the coordinates run from the other border."""
 
 
 def _changed(**fields: Callable[[Any], Any]) -> Callable[[list[Pattern]], list[Pattern]]:

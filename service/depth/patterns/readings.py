@@ -19,7 +19,7 @@ from stage.patterns.phase import FULL_STEPS, PhaseCode
 
 
 class EvenLight(NamedTuple):
-    """How white and black are made of the phase frames of one period."""
+    """The rule that makes white and black of the phase frames of one period."""
 
     frames: tuple[int, ...]
     weights: np.ndarray  # [frames, 3] of each reading in the mean, the cosine and the sine

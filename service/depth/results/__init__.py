@@ -1,1 +1,1 @@
-"""What every depth method returns, and its points."""
+"""The result of every depth method, and its points."""

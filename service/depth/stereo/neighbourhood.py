@@ -1,4 +1,4 @@
-"""What the pixels around each pixel tell: their mean, the contrast of a texture, and how far a bent surface lies from a plane."""
+"""Measure the neighbourhood of each pixel: the mean, the contrast of a texture, and how far a bent surface lies from a plane."""
 
 import numpy as np
 

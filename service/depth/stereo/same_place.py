@@ -32,7 +32,7 @@ class CodedImage(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where the second camera sees the pixels of the first."""
+    """The places at which the second camera sees the pixels of the first."""
 
     u: np.ndarray  # [n] continuous image coordinates of the second camera
     v: np.ndarray  # [n]

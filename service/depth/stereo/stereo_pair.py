@@ -23,7 +23,7 @@ BYTES_PER_LABEL = 3
 HALO = 24
 """Rows above and below a band that are matched with it: paths over more rows hardly change the sums."""
 LEAST_ROWS = 16
-"""Rows of a band without its halo, at the least."""
+"""The least number of rows of a band without its halo."""
 MOST_LABELS = 4096
 """Most disparities that are compared; so many are those of a scene that begins much nearer to the cameras than it can be in focus."""
 PROBE_BYTES = 64 << 20
@@ -97,7 +97,7 @@ class Places(NamedTuple):
 
     disparity: np.ndarray  # [places] float32
     compared: int
-    """How many places were compared."""
+    """Number of places that were compared."""
 
 
 def unique_places(images: RectifiedFrames, device: str) -> Places:

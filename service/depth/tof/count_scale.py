@@ -1,4 +1,4 @@
-"""How many recorded units a photon makes: the dispersion of the background, and the step between recorded values.
+"""Estimate the recorded units of a photon: the dispersion of the background, and the step between recorded values.
 
 Counts of photons have a variance equal to their mean. Counts that were multiplied by g, averaged over 1/g frames or divided by a sum have
 a variance of g times their mean, and divided by g they are as precise as photons again.

@@ -98,7 +98,7 @@ def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
 
 
 class Quadrature(NamedTuple):
-    """What the lights need for every integral: the weights of least expected error are inverse[:-1] @ moments."""
+    """The matrix that serves every integral over the lights: the weights of least expected error are inverse[:-1] @ moments."""
 
     range: float
     """ρ, as a distance between unit vectors."""

@@ -1,1 +1,1 @@
-"""How options are declared, read from a command line and recorded."""
+"""Declare options, read them from a command line and record them."""

@@ -45,7 +45,7 @@ CropBox = tuple[NotNegativeCount, NotNegativeCount, Count, Count]
 
 
 class Role(StrEnum):
-    """What the value of a field is; written into `Annotated`, CHOICE where nothing is written."""
+    """The role of a field in a request; written into `Annotated`, CHOICE where nothing is written."""
 
     CHOICE = "choice"
     """A choice about the work: it is recorded with the results, and `relit submit` and `relit farm template` have it too, for the commands
@@ -55,16 +55,16 @@ class Role(StrEnum):
     OUTPUT = "output"
     """The file or folder of the results."""
     MACHINE = "machine"
-    """Where the work is done: the device, and the folder for caches."""
+    """A choice of the machine: the device, and the folder for caches."""
     RUN = "run"
-    """What one run does beside the work: all frames anew, a contact sheet, a report."""
+    """A choice about one run beside the work: all frames anew, a contact sheet, a report."""
     PART = "part"
     """The part of the work that one run does. It is recorded nowhere, so that results do not say how the work was divided."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spelling:
-    """How an option is typed, where the rule does not say it."""
+    """The spelling of an option, where the rule does not say it."""
 
     flag: str | None = None
     """The flag, such as --filter, where it does not follow from the field's name."""
@@ -73,7 +73,7 @@ class Spelling:
     metavar: str | None = None
     """The word that stands for the value in the help."""
     argument: bool = False
-    """Whether the value is given by its place, without a flag."""
+    """True if the value is given by its place, without a flag."""
 
 
 CAPTURE = Spelling(argument=True, metavar="CAPTURE")
@@ -127,7 +127,7 @@ class Request(DeviceRequest):
 
 
 class SequenceOptions(Options):
-    """How the steps of a sequence of captures are taken together."""
+    """Options for joining the steps of a sequence of captures."""
 
     temporal: Annotated[bool, Role.RUN] = True
     """Join the estimates of consecutive steps of a sequence where they agree within their standard deviations."""
@@ -140,7 +140,7 @@ class SequenceRequest(SequenceOptions, Request):
 
 
 class PixelOptions(Options):
-    """How the pixels of images are read."""
+    """Options for reading the pixels of images."""
 
     clip_negative: bool = False
     """Set values to 0 that are negative beyond the noise of their image, and say how many; without it such images are refused. Noise around
@@ -155,7 +155,7 @@ class PixelOptions(Options):
 
 
 class StackOptions(PixelOptions):
-    """How the images of a capture are aligned."""
+    """Options for aligning the images of a capture."""
 
     align: bool = False
     """The subject moves: warp every frame to the time of the middle tracking frame (light type full). The mask belongs to that time."""

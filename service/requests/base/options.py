@@ -55,7 +55,7 @@ class Option(NamedTuple):
 
     @property
     def is_repeated(self) -> bool:
-        """Whether several values are typed by giving the option several times."""
+        """Return whether several values are typed by giving the option several times."""
         return get_origin(self.kind) is tuple and get_args(self.kind)[-1] is Ellipsis and Commas not in self.constraints
 
 

@@ -28,7 +28,7 @@ class Key(Strict):
 
     frame: Annotated[int, Field(ge=0, le=LAST_FRAME)]
     interpolation: Literal["linear", "step"] = "linear"
-    """From this key to the next: an even change, or none until the next."""
+    """The change from this key to the next: even, or none until the next."""
 
 
 class EnvironmentKey(Key):
@@ -44,7 +44,7 @@ class LightKey(Key):
     """A distant disc of even radiance."""
 
     direction: Direction
-    """From the surface to the middle of the disc, camera frame."""
+    """Direction from the surface to the middle of the disc, camera frame."""
     irradiance: Rgb
     """Irradiance on a surface that faces the light, in the unit of the captured lights."""
     angle_degrees: Annotated[float, Field(ge=0, le=180)] = SUN_DEGREES
@@ -52,7 +52,7 @@ class LightKey(Key):
 
 
 class WeightKey(Key):
-    """How much of a captured image is added, as it was captured."""
+    """The weight with which a captured image is added, as it was captured."""
 
     weight: NotNegative
 

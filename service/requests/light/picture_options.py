@@ -1,4 +1,4 @@
-"""What all requests for pictures under new light have in common."""
+"""Options that all requests for pictures under new light share."""
 
 from typing import Annotated
 
@@ -46,7 +46,7 @@ class FrameCompression(Choice):
 
 
 class FrameParts(Choice):
-    """How the layers of a frame lie in its file."""
+    """The layout of the layers of a frame in its file."""
 
     SINGLE = "single", "all in one part"
     MULTI = "multi", "each layer in a part of its own"
@@ -61,7 +61,7 @@ class FrameMatte(Choice):
 
 
 class PictureOptions(Options):
-    """How a picture under new light is written."""
+    """Options for writing a picture under new light."""
 
     exposure: Annotated[float, Spelling(metavar="STOPS")] = Field(default=0.0, ge=-MAX_STOPS, le=MAX_STOPS, allow_inf_nan=False)
     """Exposure in stops: every picture is multiplied by 2 to this power."""

@@ -35,7 +35,7 @@ class JobView(View):
     finished_at: Time | None
     progress: ProgressView | None
     error: str | None
-    """Why it failed, in one sentence."""
+    """The reason why the job failed, in one sentence."""
 
 
 class LogEntry(View):

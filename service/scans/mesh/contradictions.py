@@ -1,4 +1,4 @@
-"""Where photometric normals and a fused surface contradict each other, so that normals must not move the surface.
+"""Find places where photometric normals and a fused surface contradict each other, so that normals must not move the surface.
 
 Range images close the mouth of a narrow gap, and make a wall or a ramp of a step between two parts that stand one before the other. The
 photographs show the normals of both parts there and no wall. A surface that was made to have these normals would be drawn from one part to
@@ -27,7 +27,7 @@ MOTION = 2.0
 
 
 class Trust(NamedTuple):
-    """How far the normals of the vertices can be trusted."""
+    """The trust in the normals of the vertices."""
 
     agree: np.ndarray  # [V] bool, where the normals and the surface do not contradict each other
     counts: np.ndarray  # [V] 0…1, by how much each vertex counts where the drift of the normals is measured

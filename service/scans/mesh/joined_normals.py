@@ -69,7 +69,7 @@ class _Mesh(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """What the least squares are weighted by."""
+    """The standard deviations that weight the least squares."""
 
     sigma: np.ndarray  # [V] metres, of the depth
     tilt: np.ndarray  # [V] radians, standard deviation of the photometric normals

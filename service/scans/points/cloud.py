@@ -49,7 +49,7 @@ class Thinned(NamedTuple):
     directions: np.ndarray  # [n, 3] float64, unit, from the camera
     sigma: np.ndarray  # [n] float64 metres
     even: bool = True
-    """Whether points are as far apart on all of the surface."""
+    """True if points are as far apart on all of the surface."""
 
 
 def thinned_scan(scan: Scan) -> Thinned:
@@ -76,7 +76,6 @@ def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
     """Return the means of the points of a scan in cells.
 
     Args:
-        scan: the scan.
         thinned: what `thinned_scan` made of it, which is taken in its place if it has far fewer points.
         cell_m: the side of the cells, metres, if the noise does not demand larger ones.
     """

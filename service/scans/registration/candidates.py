@@ -1,4 +1,4 @@
-"""Which pairs of scans are worth a registration: those that overlap at known poses, or else those whose surfaces look alike."""
+"""Choose the pairs of scans to register: those that overlap at known poses, or else those whose surfaces look alike."""
 
 from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
@@ -22,11 +22,11 @@ SAMPLE = 200
 CELL_LIMIT = 1 << 19
 """Cells of the world are numbered from minus to plus so many along each axis."""
 STEPS = np.array([1, 2 * CELL_LIMIT, 4 * CELL_LIMIT**2])
-"""What the number of a cell grows by from one to the next along each axis; six times the largest number is a 64-bit integer still."""
+"""Strides of the cell number along each axis; six times the largest number still fits a 64-bit integer."""
 
 
 class Outline(NamedTuple):
-    """What is kept in memory of every scan, to choose pairs."""
+    """Reduced points, normals and features of a scan, kept in memory to choose pairs."""
 
     points: np.ndarray  # [n, 3] float32 metres, of the rough scale
     normals: np.ndarray  # [n, 3] float32, of these points
@@ -41,7 +41,7 @@ def outline_of(ready: Prepared, cell_m: float) -> Outline:
 
 
 class Overlaps:
-    """How much scans overlap at poses, from above: by cells of the world that both are in or beside."""
+    """Upper bound of the overlap of scans at poses: by cells of the world that both are in or beside."""
 
     def __init__(self, outlines: Mapping[int, Outline], poses: Mapping[int, np.ndarray], near_cells: float) -> None:
         """Args: outlines: of the scans. poses: world_from_scan [4, 4] of those that have one. near_cells: how far points may be apart."""
@@ -66,7 +66,7 @@ class Overlaps:
         return float(inside / (min(len(own), len(self._outlines[a].points)) if alike else len(own)))
 
     def facing(self, a: int, b: int) -> float:
-        """Return about which part of the smaller scan, or of the one of smaller scale, has surface of the other around it that is turned
+        """Return about which part of the smaller scan, or of the scan of smaller scale, has surface of the other around it that is turned
         the same way, so that both can have seen it: what pairs are ordered by."""
         side = self._near * max(self._outlines[a].cell_m, self._outlines[b].cell_m)
         if self._outlines[a].cell_m < self._outlines[b].cell_m:

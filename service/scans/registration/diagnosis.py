@@ -1,4 +1,4 @@
-"""Why a scan could not be joined: whether it fits mirrored or in another unit; and scans whose scale is not that of the others."""
+"""Find why a scan could not be joined: it fits mirrored or in another unit; and find scans whose scale differs from that of the others."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ FACTORS = {0.001: "as if it were in millimetres", 0.01: "as if it were in centim
 ODD = 8.0
 """A scan whose extent is this many times that of the others, or that part of it, has another unit or shows something else."""
 FACTOR_SPAN = 4.0
-"""By how much the extent of a scan in the right unit may differ from that of the others."""
+"""Factor by which the extent of a scan in the right unit may differ from that of the others."""
 MOST_TRIED = 24
 """The most scans that a scan is tried against."""
 

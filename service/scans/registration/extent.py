@@ -1,4 +1,4 @@
-"""How large scans are, and the scale at which each is compared with others."""
+"""Measure the size of scans, and the scale at which each is compared with others."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""What the surfaces of scans say of poses that are not to be moved."""
+"""Compare the surfaces of scans with poses that are not to be moved."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,7 @@ class FixedPoses(NamedTuple):
     poses: list[np.ndarray]
     pairs: tuple[Pair, ...]
     off: dict[tuple[int, int], tuple[float, float]]
-    """By how much the best pose of each joined pair differs from the given one: metres at the overlap, and degrees."""
+    """Difference between the best and the given pose of each joined pair: metres at the overlap, and degrees."""
     wrong: dict[tuple[int, int], tuple[float, float]]
     """The part of `off` that noise does not explain."""
 

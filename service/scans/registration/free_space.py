@@ -1,4 +1,4 @@
-"""What the range image of one scan says of the points of another: seen, hidden behind the surface, or where the camera saw through."""
+"""Compare the points of one scan with the range image of another: seen, hidden behind the surface, or where the camera saw through."""
 
 from typing import NamedTuple
 
@@ -33,7 +33,7 @@ seen edge-on lies between its pixels."""
 
 
 class Sight(NamedTuple):
-    """How many points of one scan another scan sees, or contradicts."""
+    """Numbers of points of one scan that another scan sees, or contradicts."""
 
     agreeing: int
     """Points on the surface that the camera measured."""
@@ -52,9 +52,9 @@ class Contradiction(NamedTuple):
     """The parts of the points of two scans, on or before the surface of the other, that the other contradicts."""
 
     points: float
-    """All of them."""
+    """The part of all contradicted points."""
     surface: float
-    """Those of a part of the surface which the other camera cannot have missed."""
+    """The part of the contradicted points on surface that the other camera cannot have missed."""
 
 
 def depth_range(scan: Scan) -> DepthRange | None:

@@ -30,7 +30,7 @@ class PairTask(NamedTuple):
     near_cells: float
     """Points overlap at the start if they are at most this many cells apart."""
     may_search: bool
-    """Whether the pose is searched if the start does not lead to one."""
+    """True if the pose is searched if the start does not lead to one."""
 
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:
@@ -38,7 +38,6 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
 
     Args:
         task: which scans, and their start.
-        a, b: the scans.
         cell_m: side of the cells of the rough scale of each, metres. If they differ, the part of the larger scan around the smaller one is
             taken at the scale of that, which takes a start.
         least_overlap: the least part of the smaller of two scans that must be matched.

@@ -45,13 +45,13 @@ details are large has .2 with them and 5 to 50 without, and is tried out for the
 TRIED_POINTS = 800
 """The most points of the fit that is first tried out."""
 SHIFTS = (0.1, -0.1, 0.3)
-"""By how much, in parts of the size of the scans, a scan is moved along a weak direction to try it out."""
+"""Distances, in parts of the size of the scans, by which a scan is moved along a weak direction to try it out."""
 NEAR_SHIFT = 3.0
 """The same from a start, in spacings: a place far from the start is none."""
 KEPT = 0.3
 """The part of such a shift that is left after a fit, from which on the scan slides along the direction."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
-"""Another pose fits as well if its residual is at most this many times that of the best, its overlap that part of it at the least, and not
+"""Another pose fits as well if its residual is at most this many times that of the best, its overlap at least that part of it, and not
 this much more of it is contradicted."""
 
 
@@ -60,7 +60,7 @@ SCALE_SIGMAS, SCALE_LEAST, SCALE_MOST = 5.0, 0.001, 0.2
 
 
 class PairState(StrEnum):
-    """What became of a pair."""
+    """The outcome of registering a pair."""
 
     JOINED = "joined"
     NO_POSE = "no pose"
@@ -75,7 +75,7 @@ class PairState(StrEnum):
 
 
 class Evidence(StrEnum):
-    """What the pose of a pair was found by."""
+    """The data from which the pose of a pair was found."""
 
     SURFACES = "surfaces"
     TARGETS = "targets"
@@ -88,12 +88,12 @@ class Pair(NamedTuple):
     b: int
     state: PairState
     fit: Fit | None
-    """What the best pose leaves; None: no pose was found."""
+    """The best pose and its residuals; None: no pose was found."""
     overlap: float
     """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
     contradicted: float
     reason: str
-    """Why it was refused, in words; empty of a joined pair."""
+    """The reason why the pair was refused, in words; empty for a joined pair."""
     by: Evidence = Evidence.SURFACES
 
 
@@ -123,7 +123,6 @@ def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
     """Thin a scan to both scales and describe its rough points.
 
     Args:
-        scan: the scan.
         cell_m: side of the cells of the rough scale, metres.
         threads: for the search of neighbours.
     """
@@ -138,7 +137,6 @@ def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float,
     """Register two scans without a start.
 
     Args:
-        a, b: the scans.
         numbers: of the scans, for the result.
         cell_m: side of the cells of the rough scale, metres.
         least_overlap: the least part of the smaller scan that must be matched.

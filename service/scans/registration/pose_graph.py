@@ -17,7 +17,7 @@ from service.scans.points.rigid import about, applied, inverse, screwed, step_be
 from service.scans.registration.pairs import Pair
 
 SHRINK = 1.6
-"""By which factor μ shrinks from round to round."""
+"""Factor by which μ shrinks from round to round."""
 STEPS = 4
 """Steps of Gauss and Newton in each round."""
 LAST_STEPS = 12

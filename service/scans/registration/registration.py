@@ -30,13 +30,13 @@ from stage.errors import ScanError
 from stage.sets.scan_set import Turntable
 
 ROUNDS = 2
-"""How often pairs that the poses predict to overlap are looked for."""
+"""Number of times that pairs which the poses predict to overlap are looked for."""
 Advance = Callable[[float], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationOptions:
-    """How scans are registered."""
+    """Options of the registration of scans."""
 
     cell_m: float | None = None
     """Side of the cells of the rough scale, metres; None: a sixtieth of the median extent of the scans."""
@@ -49,7 +49,7 @@ class RegistrationOptions:
 
 
 class ScanWork(Protocol):
-    """Where scans and pairs are made and kept."""
+    """The places where scans and pairs are made and kept."""
 
     def outlines(self, cells: dict[int, float], advance: Advance) -> dict[int, Outline]:
         """Prepare scans at rough scales with cells of these sides, metres, and return their outlines."""
@@ -76,7 +76,7 @@ class Registration(NamedTuple):
     """The scan whose pose is fixed."""
     pairs: tuple[Pair, ...]
     alone: dict[int, str]
-    """Why each scan that could not be joined is not, in words after its name."""
+    """The reason for each scan that could not be joined, in words after its name."""
     scales: dict[int, float]
     """The approximate scale of each joined scan whose scale is not that of the others."""
     kept: tuple[tuple[Pair, float], ...]

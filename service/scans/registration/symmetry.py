@@ -1,4 +1,4 @@
-"""Whether a scan looks much the same when it is turned about an axis, so that little of it tells one of its poses from another."""
+"""Test whether a scan looks much the same when it is turned about an axis, so that little of it tells one of its poses from another."""
 
 import numpy as np
 
@@ -19,7 +19,6 @@ def looks_alike_turned(scan: Prepared, cell_m: float) -> bool:
     """Return whether a good part of a scan lies on itself after a turn about the axis about which its pose is determined least.
 
     Args:
-        scan: the scan.
         cell_m: side of the cells of its rough scale, metres.
     """
     here = fit(scan.rough, scan.rough, np.eye(4), [2 * cell_m])

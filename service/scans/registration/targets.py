@@ -28,7 +28,7 @@ STEPS = 6
 
 
 class TargetPose(NamedTuple):
-    """What the common targets of two scans say of their pose."""
+    """The pose of two scans from their common targets."""
 
     common: tuple[str, ...]
     state: PairState
@@ -37,7 +37,7 @@ class TargetPose(NamedTuple):
     used: tuple[str, ...]
     """The targets that keep their distances."""
     reason: str
-    """Why there is no pose, in words; empty where there is one."""
+    """The reason why there is no pose, in words; empty where there is one."""
 
 
 def pose_by_targets(a: Sequence[Target], b: Sequence[Target], *, first_row: tuple[int, int]) -> TargetPose:

@@ -1,1 +1,1 @@
-"""What every part of the server uses: settings, log, traces, names and locks."""
+"""Settings, log, traces, names and locks, which every part of the server uses."""

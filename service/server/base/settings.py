@@ -119,7 +119,7 @@ class Settings(BaseSettings):
     oidc_claim: str = "groups"
     """Claim of a token whose text or texts `oidc_grants` maps to projects."""
     oidc_grants: Annotated[tuple[Granted, ...], NoDecode] = ()
-    """What a value of the claim allows: VALUE=PROJECT:SCOPE, separated by commas."""
+    """The rights that a value of the claim grants: VALUE=PROJECT:SCOPE, separated by commas."""
     roots: Annotated[tuple[Folder, ...], NoDecode] = ()
     """Folders of the server whose captures and environments may be registered without an upload; in the environment separated by `:`."""
     project_roots: Annotated[tuple[ProjectFolder, ...], NoDecode] = ()

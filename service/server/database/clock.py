@@ -1,4 +1,4 @@
-"""Whether the machine's clock can be believed when something is removed for its age.
+"""Check that the machine's clock is right before something is removed for its age.
 
 A clock that jumps years ahead would make every job old at once. So the time at each look is recorded, and compared at the next look with
 the time that has really passed; after a jump, ages count again only when the clock has gone on steadily for WAIT_S.

@@ -40,7 +40,7 @@ class Database:
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether the database is a file of SQLite."""
+        """Return whether the database is a file of SQLite."""
         return self.engine.dialect.name == "sqlite"
 
     def transact(self, work: Callable[[sa.Connection], T], *, patience_s: float = 0.0) -> T:

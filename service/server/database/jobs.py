@@ -20,9 +20,9 @@ from service.server.database.tables import intakes, job_inputs, job_log, jobs, n
 FRAMES = "frames"
 """The stage that counts frames."""
 PATIENCE_S = 600.0
-"""How long a change by a worker waits for a database that does not answer."""
+"""Seconds that a change by a worker waits for a database that does not answer."""
 LATELY_S = 60.0
-"""How long `watched` returns a job after it ended; the clocks of workers may differ by this much."""
+"""Seconds for which `watched` returns a job after it ended; the clocks of workers may differ by this much."""
 MOST_ENTRIES = 1000
 """Most entries of the log of a job; what comes after is not recorded."""
 OF_IDENTIFIERS = sa.select(jobs).where(jobs.c.id.in_(sa.bindparam("jobs", expanding=True)))
@@ -44,11 +44,11 @@ class Claim(NamedTuple):
 NOTHING_LOST: dict[str, Any] = {"lost": 0, "lost_repeating": 0, "stages_begun": [], "repeating": False}
 """Values of a job at the beginning of a step."""
 REPEATED = 10
-"""How many times `max_lost` workers may die one after the other in stages that earlier workers came through."""
+"""Number of times that `max_lost` workers may die one after the other in stages that earlier workers came through."""
 
 
 class StageProgress(NamedTuple):
-    """How far a job is in its stage."""
+    """The progress of a job in its stage."""
 
     stage: str
     done: int
@@ -176,7 +176,6 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, frames
     makes progress does not kill its workers.
 
     Args:
-        database: of the service.
         claim: of the worker.
         progress: of the stage under way, as users see it.
         frames: frames that the job has, where users see more; None: those of `progress`.

@@ -30,14 +30,14 @@ and those of each request would wait for the garbage collector."""
 
 
 class Caller(NamedTuple):
-    """Who sends a request."""
+    """The sender of a request."""
 
     project: str
     scope: Scope
     key: str | None
     """Identifier of the key, or of the user of an identity provider; None: the request has neither."""
     until: float | None = None
-    """When the key or the token expires, seconds since 1970; None: never."""
+    """Time at which the key or the token expires, seconds since 1970; None: never."""
 
     def may(self, scope: Scope) -> bool:
         """Return whether the caller's scope includes this one."""

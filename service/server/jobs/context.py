@@ -1,4 +1,4 @@
-"""What the steps of a job are given: the worker that does them, and the job."""
+"""The arguments of the steps of a job: the worker that does them, and the job."""
 
 import shutil
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from service.server.storage.objects import Storage
 
 
 class WorkerContext(NamedTuple):
-    """What the steps of a worker need."""
+    """Services and settings that the steps of a worker need."""
 
     database: Database
     storage: Storage
@@ -34,7 +34,7 @@ class WorkerContext(NamedTuple):
     worker: str = ""
     """Name of the worker."""
     queue: JobQueue | None = None
-    """Where other workers are asked to help; None: nobody is asked."""
+    """The queue in which other workers are asked to help; None: nobody is asked."""
 
     settings: Settings | None = None
     """The settings of the service, for its quotas and `min_free_bytes`; None: neither is looked at."""
@@ -58,7 +58,7 @@ class Job(NamedTuple):
     chunk_frames: int
     attempt: int = 1
     is_resumed: bool = False
-    """Whether it has lost a worker since it last made progress."""
+    """True if the job has lost a worker since it last made progress."""
 
     @classmethod
     def of(cls, row: sa.RowMapping | Mapping[str, Any]) -> "Job":
@@ -81,4 +81,4 @@ class JobStep(NamedTuple):
     made: Callable[[], int] = lambda: 0
     """Returns how many of these frames this machine has."""
     help: Callable[[Progress], None] | None = None
-    """Does pieces of the step beside the worker that runs it; None: it cannot be divided."""
+    """A function that does pieces of the step beside the worker that runs it; None: it cannot be divided."""

@@ -1,4 +1,4 @@
-"""What a worker without other work does for a job that another worker has: pieces of its solve, or chunks of its frames."""
+"""Let a worker without other work help with a job that another worker has: pieces of its solve, or chunks of its frames."""
 
 import time
 from collections.abc import Callable

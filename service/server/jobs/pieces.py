@@ -122,7 +122,7 @@ class JobPieces:
 
     @property
     def are_shared(self) -> bool:
-        """Whether other workers have been asked to help."""
+        """Return whether other workers have been asked to help."""
         return self._invited > 0
 
     @property

@@ -1,4 +1,4 @@
-"""Where the files are that a job reads and writes: captures, environments and results of other jobs, as folders of this machine."""
+"""Find the files that a job reads and writes: captures, environments and results of other jobs, as folders of this machine."""
 
 from collections.abc import Iterable
 from pathlib import Path

@@ -36,16 +36,16 @@ from stage.errors import StorageError
 
 T = TypeVar("T")
 DONE, STOPPED, LATER = "done", "stopped", "later"
-"""What became of a job or a step: it is done; this worker has the job no longer; another worker does the step."""
+"""Outcomes of a job or a step: it is done; this worker has the job no longer; another worker does the step."""
 LOOK_S = 0.5
 """Seconds between two looks for a step that another worker does."""
 
 NO_MEMORY = re.compile("failed to allocate|out of memory|insufficient memory|bad_alloc", re.IGNORECASE)
-"""What Warp, CUDA, OpenCV and the C++ library say where Python has a MemoryError."""
+"""Messages with which Warp, CUDA, OpenCV and the C++ library report a lack of memory, for which Python has MemoryError."""
 
 
 class JobRunner:
-    """Does the jobs that the queues give to a worker."""
+    """Run the jobs that the queues give to a worker."""
 
     def __init__(self, context: WorkerContext, worker: str, *, alive: Callable[[float], None]) -> None:
         """Create a runner.

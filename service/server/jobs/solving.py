@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from service.requests.solve import SolveRequest
 
 TIME_STEP = "step"
-"""What the names of the steps begin with that do a time step."""
+"""The prefix of the names of steps that solve one time step."""
 
 
 def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> list[JobStep]:

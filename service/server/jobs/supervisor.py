@@ -39,7 +39,7 @@ class Heartbeat:
 
     @property
     def was_ready(self) -> bool:
-        """Whether the worker ever took jobs."""
+        """Return whether the worker ever took jobs."""
         return bool(self._signs[READY] > 0)
 
     def beat(self) -> None:

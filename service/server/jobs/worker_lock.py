@@ -25,7 +25,7 @@ KEEPALIVE = {"tcp_keepalives_idle": 3, "tcp_keepalives_interval": 1, "tcp_keepal
 
 
 class LockState(Enum):
-    """What `WorkerLock.hold` found."""
+    """Results of `WorkerLock.hold`."""
 
     KEPT = "kept"
     TAKEN = "taken"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 CPU = "cpu"
-"""The device that every machine has: no process is asked whether it is there."""
+"""The device that every machine has: no process needs to look for it."""
 
 
 def of_workers(settings: "Settings") -> list[str]:

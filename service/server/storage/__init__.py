@@ -1,1 +1,1 @@
-"""Where captures and results lie: the data folder, or an object store."""
+"""Storage of captures and results: the data folder, or an object store."""

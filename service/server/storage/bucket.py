@@ -28,8 +28,8 @@ CONNECT_S, REQUEST_S = 10, 120
 RETRIES, RETRY_S = 100, 120
 """Retries, and their time in all, after errors of the network and of the store (5xx), with growing pauses; then the step fails."""
 BROKEN, AGAIN_S = "HTTP error:", 0.5
-"""What errors of the connection are called by obstore, which gives up at once after some of them (a damaged answer, a request cut while it
-is sent), and the pause before another try."""
+"""The text in obstore's connection errors, after some of which it gives up at once (a damaged answer, a request cut while it is sent), and
+the pause before another try."""
 PROBE_RETRIES, PROBE_S = 1, 5
 """Retries and time of a check whether the store answers, for which somebody waits."""
 

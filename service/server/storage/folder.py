@@ -12,7 +12,7 @@ from service.reporting.progress import Progress
 from stage.errors import storage
 
 REMOVED = "removed"
-"""What precedes the marks of prefixes that are removed: in the data folder an empty file for each that was removed lately."""
+"""Folder in the data folder for the marks of removed prefixes: an empty file for each prefix that was removed lately."""
 MARKS = "projects/*/*/*"
 REMEMBERED_S = 3 * 86_400.0
 """Seconds for which a removed prefix is remembered: longer than a writer that was under way goes on."""

@@ -162,7 +162,7 @@ class ObjectStorage:
 
 
 Storage = FolderStorage | ObjectStorage
-"""Where the files of captures and results lie. A prefix is one of service.server.storage.layout."""
+"""The storage of the files of captures and results. A prefix is one of service.server.storage.layout."""
 
 
 def open_storage(settings: Settings) -> Storage:

@@ -22,7 +22,7 @@ class Differences(NamedTuple):
 
     missing: list[str]
     changed: list[str]
-    """Those with another size or another ETag."""
+    """Objects with another size or another ETag."""
 
 
 def present(bucket: Bucket, *, pieces: bool) -> dict[str, Object]:

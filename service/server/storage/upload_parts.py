@@ -1,4 +1,4 @@
-"""Where the bytes of incomplete uploads are, and which request may add to them.
+"""The bytes of incomplete uploads, and the request that may add to them.
 
 With the data folder as storage, each upload has one part file there, whose lock is that of the file. With an object store, the API
 processes of a service may have nothing in common but that store and the database: a request then writes to a file of its own, whose bytes
@@ -36,7 +36,7 @@ class FolderParts:
     """Part files in the data folder, which all API processes of a service share."""
 
     saves_while_writing = True
-    """Whether bytes can be counted before a request has ended."""
+    """True if bytes can be counted before a request has ended."""
 
     def __init__(self, folder: Path, database: Database) -> None:
         """Args: folder: of the part files. database: of the service."""

@@ -30,11 +30,11 @@ class DirectLight(NamedTuple):
     given: SolveInput
     lights: Lights
     field: NearField | None
-    """Where the lights are, where some light is near."""
+    """The positions of the lights; None where all lights are distant."""
     solved: wp.array  # [rows, cols] uint8 on the device: the number of the part of each solved pixel, 0 elsewhere
     height: wp.array  # [rows, cols] float32, on the device
     shadows: bool
-    """Whether cast shadows of the height are taken out."""
+    """True if cast shadows of the height are taken out."""
     arriving: ArrivingLight | None
     """None: no interreflection is taken out."""
     albedo: np.ndarray  # [3, pixels] of the light that other surfaces send, at the normals from which all this follows

@@ -68,7 +68,7 @@ class Distance(NamedTuple):
     """The depth that explains the images, and what the report says of it."""
 
     capture: Capture
-    """With `surface_z_m`; without it where an orthographic camera keeps its default."""
+    """The capture with `surface_z_m`; without it where an orthographic camera keeps its default."""
     facts: dict[str, Any]
     warning: str
     normal_degrees: float

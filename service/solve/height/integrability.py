@@ -1,4 +1,4 @@
-"""How far normals are from those of any surface.
+"""Measure how far normals are from those of any surface.
 
 Normals that were solved pixel by pixel are those of a surface only where they are right: an error of the normals is, in general, not the
 gradient of any height. So the normals of the integrated height differ from the solved ones by that part of the error which no surface has,

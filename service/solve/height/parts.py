@@ -68,7 +68,7 @@ class PlacedPart(NamedTuple):
     centre: tuple[int, int]
     """Mean row and column."""
     offset: Offset | None
-    """How far it moved towards the viewer, in the unit of height; None: it is the part against which the others move, or the
+    """The distance that it moved towards the viewer, in the unit of height; None: it is the part against which the others move, or the
     shadows leave its step open."""
     largest: bool
 

@@ -1,4 +1,4 @@
-"""Whether the axes of the lights are those of the camera, from the surface that was solved with them.
+"""Test whether the axes of the lights are those of the camera, from the surface that was solved with them.
 
 Mirrored or turned lights explain the images as well as the right ones. What tells them apart: a visible surface faces the camera, its
 slopes are those of one height (service.light_estimation.axes), and the outline and the cast shadows of what is not hollow
@@ -56,7 +56,7 @@ class LightAxes(NamedTuple):
     matrices: tuple[np.ndarray, ...] = ()
     """[3, 3], what corrects directions and normals: one, or two between which nothing decides; none where nothing is certain."""
     degrees: float | None = None
-    """How far the normals are off, where the solved ones are not turned with the lights."""
+    """The error of the normals in degrees, where the solved ones are not turned with the lights."""
 
 
 class _Map(NamedTuple):

@@ -282,7 +282,7 @@ class _Walk:
 
     @property
     def _matt(self) -> bool:
-        """Whether the images hold diffuse light alone, so that a specular lobe explains nothing but noise."""
+        """Return whether the images hold diffuse light alone, so that a specular lobe explains nothing but noise."""
         return self._given.pairs is not None
 
     def _beside(self, pixels: np.ndarray) -> np.ndarray:

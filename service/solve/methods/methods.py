@@ -34,7 +34,7 @@ class MethodEntry(NamedTuple):
     residual: str
     """The meaning of the residual of a pixel, for the report."""
     is_default: Callable[[Capture], bool] = lambda capture: False
-    """Whether a capture is solved by this method when the request names none."""
+    """True if a capture is solved by this method when the request names none."""
 
 
 def _suits_svbrdf(capture: Capture) -> bool:

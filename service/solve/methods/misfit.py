@@ -1,4 +1,4 @@
-"""How far an object's Lambertian normals may be off, from pairs of its pixels."""
+"""Estimate the error of an object's Lambertian normals from pairs of its pixels."""
 
 from collections.abc import Callable
 

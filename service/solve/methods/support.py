@@ -1,4 +1,4 @@
-"""Whether few lights support the general solver: readings of lights that are left out are predicted by it and by Lambert's law.
+"""Test whether few lights support the general solver: readings of lights that are left out are predicted by it and by Lambert's law.
 
 A mixture of six lobes and a normal follow a dozen readings whatever their cause, be it a highlight or a light whose direction is a few
 degrees off. What they learnt from highlights predicts further readings; what they learnt from errors does not.
@@ -27,9 +27,9 @@ class LeftOut(NamedTuple):
     """Mean cost of the left-out readings, as the search counts it."""
 
     general: float
-    """As the mixture of lobes predicts them."""
+    """The readings as the mixture of lobes predicts them."""
     lambert: float
-    """As Lambert's law predicts them."""
+    """The readings as Lambert's law predicts them."""
 
     @property
     def ratio(self) -> float:
@@ -83,7 +83,7 @@ def _cost(readings: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 FEW_LIGHTS = 32
 """Fewer lights than this, four for each of the eight unknowns of a pixel, must show that they support the general solver."""
 TESTED_LIGHTS = 6
-"""With fewer lights than this none can be left out: those that remain would not determine what is tested."""
+"""The least number of lights of which one can be left out: with fewer, those that remain would not determine what is tested."""
 SUPPORTED_RATIO = 0.7
 """Largest misfit of left-out readings, over that of Lambert's law, at which the general solver is supported: 0.28 to 0.5 on objects where
 its normals are better, real and path-traced, 0.9 and above where they follow errors of the lights."""

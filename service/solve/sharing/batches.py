@@ -29,14 +29,14 @@ LEAST_READINGS = 3
 
 Piece = TypeVar("Piece")
 View = Callable[[np.ndarray], np.ndarray]
-"""From pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
+"""A function from pixel positions (row-major, [n]) to unit directions to the viewer [n, 3] float32."""
 
 
 class ReadBand(NamedTuple):
     """A band of the image with its readings on the device."""
 
     span: slice
-    """Its pixels, as row-major positions in the image."""
+    """Pixels of the band, as row-major positions in the image."""
     inside: np.ndarray  # [n] bool: which of these pixels are inside the mask
     band: packs.Band
     readings: Readings

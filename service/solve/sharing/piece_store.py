@@ -1,4 +1,4 @@
-"""Where the workers of one job keep the pieces that each makes, and how they know that they work at the same."""
+"""Storage in which the workers of one job keep their pieces, and the check that they work at the same job."""
 
 import hashlib
 from typing import Protocol
@@ -12,7 +12,7 @@ DIGEST_BYTES = 32
 
 
 class PieceStore(Protocol):
-    """Where the workers of a job store what they find. The methods are called by several threads."""
+    """Storage of the pieces that the workers of a job find. The methods are called by several threads."""
 
     def read(self, name: str) -> bytes | None:
         """Return what was stored under a name, or None."""

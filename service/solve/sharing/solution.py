@@ -46,14 +46,14 @@ class SolveInput:
     camera: Camera
     mask: np.ndarray  # [rows, cols] bool: the pixels to solve
     devices: tuple[str, ...]
-    """Where bands and batches are worked on, one or more; what looks at the whole object is done on the first."""
+    """Devices for bands and batches, one or more; work on the whole object is done on the first."""
     timings: Timings
     cache: Path | None = None
     """Folder for stack caches; None: `.relit` in the folder of each capture."""
     relative: bool = False
-    """Whether the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
+    """True if the irradiance of all lights lacks one common factor, so that the scale of albedo is unknown."""
     refine_intensities: bool = True
-    """Whether a solver may replace the intensities of the lights by those that the object asks for."""
+    """True if a solver may replace the intensities of the lights by those that the object asks for."""
     sharing: SharedSolve | None = None
     """The part of this worker in a solve that several share; None: it is alone."""
     pairs: SeparatedPairs | None = None
@@ -70,7 +70,7 @@ class SuspectLight(NamedTuple):
 
     image: str
     misfit: float
-    """That of `service.light_estimation.suspects`."""
+    """The misfit of `service.light_estimation.suspects`."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class Solution:
     suspects: list[SuspectLight] = field(default_factory=list)
     sigma: np.ndarray | None = None  # [pixels] float16, standard error of the normal in degrees; None: that of the confidence
     judged_by_surface: bool = False
-    """Whether confidence falls where the normals are not those of a surface."""
+    """True if confidence falls where the normals are not those of a surface."""
     warnings: list[str] = field(default_factory=list)
     """A sentence for each thing that does not fit on the whole object: what it is, and what to try."""
     facts: dict[str, Any] = field(default_factory=dict)

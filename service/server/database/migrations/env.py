@@ -1,4 +1,4 @@
-"""What Alembic runs to upgrade a database; service.server.database.schema gives the connection, which is in a transaction."""
+"""Alembic runs this file to upgrade a database; service.server.database.schema gives the connection, which is in a transaction."""
 
 from alembic import context
 
