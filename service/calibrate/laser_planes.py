@@ -62,7 +62,6 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
 
     Args:
         request: the captures of the board, and those that are written too.
-        progress: told how far the work is.
         manifest_paths: the manifest to write for each capture, then for each of `apply_to`; None: their own.
 
     Raises:

@@ -127,7 +127,6 @@ def fuse_brick(places: np.ndarray, outlines: list[PreparedScan], scan: Callable[
         names: the layers of the scans.
         voxel: side of a voxel, metres.
         origin: of the lattice, [3] metres.
-        device: where to compute.
 
     Convention:
         The surface lies at the mean of the measured distances weighted by the inverse of their variances.

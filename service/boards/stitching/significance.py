@@ -56,7 +56,6 @@ def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
 
     Args:
         false_alarm: above 0 and below 1.
-        tests: their number.
         sides: 2 where a deviation of either sign is an alarm, else 1.
     """
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))
@@ -79,7 +78,6 @@ def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false
     """Look for significant windows over a whole board.
 
     Args:
-        deviation: of the board.
         tolerance_m: deviations up to this are no defect; one number, or one for each pixel, [rows, cols].
         false_alarm: the probability of any false alarm on a board without defects.
         smallest_px: side of the smallest window.

@@ -76,7 +76,6 @@ def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
     """Return the means of the points of a scan in cells.
 
     Args:
-        scan: the scan.
         thinned: what `thinned_scan` made of it, which is taken in its place if it has far fewer points.
         cell_m: the side of the cells, metres, if the noise does not demand larger ones.
     """
@@ -95,7 +94,6 @@ def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
     """Return points with their normals, spacing and borders.
 
     Args:
-        thinned: the points.
         most: the most points that are matched with other scans; they are drawn evenly over the surface, and always the same.
         threads: for the search of neighbours.
     """

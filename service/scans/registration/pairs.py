@@ -123,7 +123,6 @@ def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
     """Thin a scan to both scales and describe its rough points.
 
     Args:
-        scan: the scan.
         cell_m: side of the cells of the rough scale, metres.
         threads: for the search of neighbours.
     """
@@ -138,7 +137,6 @@ def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float,
     """Register two scans without a start.
 
     Args:
-        a, b: the scans.
         numbers: of the scans, for the result.
         cell_m: side of the cells of the rough scale, metres.
         least_overlap: the least part of the smaller scan that must be matched.
