@@ -54,10 +54,6 @@ def gauge_board(request: GaugeBoardRequest, progress: Progress | None = None) ->
 
     A part of the study is a region of a board; its values are the deviations from the nominal height.
 
-    Args:
-        request: the study and where to put the result.
-        progress: told of every stage.
-
     Raises:
         StageError: the study or a result cannot be used, or runs are missing; nothing is written.
         StorageError: the results cannot be written.

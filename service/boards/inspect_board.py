@@ -78,9 +78,6 @@ class _Judged(NamedTuple):
 def inspect_board(request: InspectBoardRequest, progress: Progress | None = None) -> InspectBoardResult:
     """Inspect a board.
 
-    Args:
-        request: what to inspect and where to put it.
-
     Raises:
         StageError, KernelError: bad input, or tiles or heights that do not fit together; nothing is written.
         StorageError: the results cannot be written.

@@ -27,8 +27,6 @@ def write_picture(path: Path, heights: HeightMap, deviation: Deviation | None, i
     """Write the panels as one PNG.
 
     Args:
-        path: the file.
-        heights: of the board.
         deviation, inspected, wanted: of the comparison, [rows, cols]: the pixels that were inspected, and those that have a nominal height.
         defects, regions: drawn as frames.
 

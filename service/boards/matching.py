@@ -35,7 +35,6 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
 
     Args:
         measured: the blend of the tiles on the nominal grid.
-        stitched: of the tiles.
         nominal: what it is compared with.
         placement_m: standard deviation of the board's place, metres; None: SHIFT_SIGMA_PX pixels.
 

@@ -35,7 +35,6 @@ def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: 
         path: the file, or the folder with it.
         device: on which captures are decoded.
         cache: folder for the image stacks of captures; None: beside each.
-        progress: told of every tile.
 
     Raises:
         StageError, KernelError: the file or a tile cannot be used; the message names it.

@@ -57,7 +57,6 @@ def find_mirror_balls(captures: LightCaptures, options: SpotOptions, radius_m: f
 
     Args:
         captures: lit by one lamp a frame.
-        options: of the search for bright spots.
         radius_m: of every ball; None: not known.
         z_m: camera-frame z of every centre, for an orthographic camera; None: not known.
 

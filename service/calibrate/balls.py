@@ -24,8 +24,6 @@ def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None
     """Return the balls that a request names: those of its circles, then those of its masks.
 
     Args:
-        request: circles and masks.
-        camera: the camera that took the images.
         exactly: how many balls there must be; None: `at_least` says it.
         at_least: how many balls there must be at least.
         radii: metres, one for all balls or one for each; empty: not known.

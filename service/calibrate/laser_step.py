@@ -38,8 +38,6 @@ def planes_on_step(captures: list[Capture], frames: list[list[Frame]], height_m:
         captures: one for each pose of the step.
         frames: the laser frames of each, the same planes in each.
         height_m: height of the step, metres.
-        device: where stripes are found.
-        timings: told of every capture.
 
     Raises:
         StageError: a frame is unreadable.

@@ -47,7 +47,6 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
 
     Args:
         request: the captures of the board, and those that are written too.
-        progress: told how far the work is.
         manifest_paths: the manifest to write for each of `captures`, then for each of `apply_to`; None: their own.
 
     Raises:

@@ -104,9 +104,7 @@ def write_lights(kind: str, request: Options, captures: LightCaptures, results: 
 
     Args:
         kind: of the calibration, the section of the report.
-        request: what was asked.
         captures: that were read and that get the lights.
-        results: of each light.
         headings: of the table, between frame and flags.
         summary: what the report says beside the lights.
         relative: whether the common scale of the measured lights is unknown; None: their strength was not measured.

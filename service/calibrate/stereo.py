@@ -46,7 +46,6 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
 
     Args:
         request: the capture of the board, and those that are written too.
-        progress: told how far the work is.
         manifest_paths: the manifest to write for the capture, then for each of `apply_to`; None: their own.
 
     Raises:

@@ -53,7 +53,6 @@ def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = No
     """Calibrate a time-of-flight camera, and write the calibration.
 
     Args:
-        request: the sweep, and the file to write.
         allowed: folders of the captures that the sweep may name; None: any.
 
     Raises:

@@ -84,9 +84,6 @@ class DepthResult(NamedTuple):
 def depth(request: DepthRequest, progress: Progress | None = None) -> DepthResult:
     """Measure the depth of a capture.
 
-    Args:
-        request: what to measure and where to put it.
-
     Raises:
         StageError, KernelError: bad input; nothing is written.
         StorageError: the results cannot be written; nothing is left half-written.

@@ -49,9 +49,6 @@ class ScanResult(NamedTuple):
 def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     """Turn a scan into a point cloud.
 
-    Args:
-        request: what to read and where to put it.
-
     Raises:
         StageError, KernelError: bad input; nothing is written.
         RequestError: no shot gives a point, or LAS is asked for without laspy.

@@ -83,9 +83,6 @@ class SeparationResult(NamedTuple):
 def separate(request: SeparateRequest, progress: Progress | None = None) -> SeparationResult:
     """Separate direct from global light.
 
-    Args:
-        request: what to separate and where to put it.
-
     Raises:
         StageError, KernelError: the capture has no frames for it, or they are not what they must be; nothing is written.
         RequestError: a period that the capture does not have, or a black level beside a black frame.
@@ -154,7 +151,6 @@ def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[flo
     """Choose the period to separate with, and return its frames along each axis.
 
     Args:
-        collected: the codes of a capture.
         wanted_px: the period that was asked for; None: the shortest.
 
     Raises:

@@ -64,10 +64,8 @@ def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, ra
     In a perspective image the outline of a ball off the axis is an ellipse, which the circle approximates.
 
     Args:
-        camera: the camera of the image.
         u, v: the centre, continuous image coordinates.
         radius_px: the radius in pixels.
-        radius_m, z_m: as in `ball_from_outline`.
 
     Raises:
         CalibrationError: the circle is not wholly inside the image.
@@ -87,7 +85,6 @@ def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, r
     outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
 
     Args:
-        camera: the camera of the image.
         outline: [points, 2] u, v.
         error_px: the standard error of the centre of the outline, which the result holds.
         radius_m: the radius of the ball, which determines its distance from a perspective camera.

@@ -29,9 +29,7 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
     fitted to these points, so that a stand or a hole does not influence it.
 
     Args:
-        camera: the camera of the image.
         coverage: [rows, cols], from 0 outside to 1 inside, binary or anti-aliased.
-        radius_m, z_m: as in `ball_from_outline`.
 
     Raises:
         CalibrationError: the mask is empty, or its outline is no circle.
@@ -62,7 +60,6 @@ def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> t
     """Fit a ball to the points near its outline, and choose these points anew, in turn.
 
     Args:
-        camera: the camera of the image.
         outline: [points, 2] u, v.
         inside: [points] bool, those that a proposal takes for points of the outline.
 

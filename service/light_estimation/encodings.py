@@ -20,7 +20,6 @@ def other_readings(radiance: np.ndarray, exposure: np.ndarray | float, declared:
     Args:
         radiance: [..., rows, cols, 3] or [rows, cols, 3], scene-linear as declared.
         exposure: recorded values over radiance; has the dimensions of `radiance` or fewer.
-        declared: the colour space of the manifest.
 
     Yields:
         A colour space, and float64 in the shape of `radiance`; of images declared linear only if no value is above 1.

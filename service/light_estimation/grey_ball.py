@@ -114,7 +114,6 @@ def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: D
         light: the light, which gives direction or position.
         view: the pixels of the ball.
         exposure: recorded values over radiance.
-        declared: the colour space of the manifest.
         residual: of `fit_brightness` as declared.
 
     Returns:

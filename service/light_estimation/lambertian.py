@@ -70,11 +70,16 @@ def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndar
     return Fit(vector, residual, lit)
 
 
-def least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight."""
+def normal_equations(weight: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Return Σ weight basis basisᵀ of each column, [columns, 3, 3]."""
     outer = (basis[:, :, None] * basis[:, None, :]).reshape(-1, 9)
-    gram = (weight.T @ outer).reshape(-1, 3, 3)
-    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
+    return np.asarray((weight.T @ outer).reshape(-1, 3, 3))
+
+
+def least_squares(readings: np.ndarray, weight: np.ndarray, basis: np.ndarray, ridge: float = 1e-9) -> np.ndarray:
+    """Return the [3, columns] that minimise Σ weight (readings - basis x)² in each column, 0 where no reading has weight."""
+    gram = normal_equations(weight, basis)
+    gram += (ridge * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(gram, ((weight * readings).T @ basis)[:, :, None])[:, :, 0].T)
 
 

@@ -39,7 +39,6 @@ def fit_near(readings: np.ndarray, usable: np.ndarray, lamps: NearLamps, points:
     Args:
         readings: [lights, pixels] radiance.
         usable: [lights, pixels] bool, True for unsaturated readings.
-        lamps: the lights.
         points: [pixels, 3] metres, camera frame.
     """
     way = lamps.place[:, None, :3] - lamps.place[:, None, 3:] * points  # [lights, pixels, 3]

@@ -8,6 +8,7 @@ that point inwards there, but it also casts shadows on itself, which the images 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 EDGE = 40
 """The band along the outline is about a fortieth of the object's size wide."""
@@ -41,7 +42,7 @@ def outline(normal: np.ndarray, mask: np.ndarray) -> Outline:
         mask: [rows, cols] bool.
     """
     width = max(1, round(np.sqrt(np.count_nonzero(mask)) / EDGE))
-    blurred = _blur(_blur(mask.astype(np.float64), width), width)
+    blurred = uniform_filter(uniform_filter(mask.astype(np.float64), 2 * width + 1, mode="nearest"), 2 * width + 1, mode="nearest")
     down, right = np.gradient(blurred)
     length = np.hypot(down, right)
     edge = mask & (blurred < INSIDE) & (length > 1e-6) & (np.linalg.norm(normal, axis=0) > 0.5)
@@ -87,13 +88,3 @@ def cast_shadows(height: np.ndarray, mask: np.ndarray, pixels: np.ndarray, direc
         met = framed.take(((at_row + 1) * (cols + 2) + at_col + 1).astype(int))
         hidden[light] = (met > start + near * rise + LIFT).any(axis=0)
     return hidden
-
-
-def _blur(image: np.ndarray, radius: int) -> np.ndarray:
-    """Return the mean over a square of 2 radius + 1 pixels; beyond the image its border values go on."""
-    for axis in (0, 1):
-        padding = [(radius + 1, radius) if a == axis else (0, 0) for a in (0, 1)]
-        total = np.cumsum(np.pad(image, padding, mode="edge"), axis=axis)
-        size, last = 2 * radius + 1, total.shape[axis]
-        image = (np.take(total, np.arange(size, last), axis) - np.take(total, np.arange(last - size), axis)) / size
-    return image

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.light_estimation.grey_ball import WEIGHT_SCALE
+from service.light_estimation.lambertian import SHADOW, bright_readings, least_squares, normal_equations
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -23,10 +24,8 @@ MIN_PIXELS = 30
 """The least count of pixels that must show a light."""
 MIN_DETERMINED = 1e-3
 """The least relative singular value of the equations for the ambiguity: below it the brightness is not determined."""
-SHADOW = 0.1
-"""A reading below this part of the bright readings of the pixel, or of |b|, is in shadow or grazing light."""
-BRIGHT_END = 0.9
-"""The quantile of the readings of a pixel that stands for its brightest one."""
+RIDGE = 1e-12
+"""The part of the mean of its diagonal that is added to the normal equations of a pixel: pixels of no weight get no b."""
 ROUNDS = 60
 """The most rounds."""
 LINEAR_ROUNDS = range(6, 12)
@@ -151,7 +150,7 @@ def _fit_channel(reading: np.ndarray, usable: np.ndarray, directions: np.ndarray
         before = e
         # the first rounds alternate: they converge slowly, but highlights cannot make them negative
         e = _linear(reading, weight, directions, e) if step in LINEAR_ROUNDS else e
-        b = _normals(reading / e[:, None], weight * e[:, None] ** 2, directions)
+        b = least_squares(reading / e[:, None], weight * e[:, None] ** 2, directions, RIDGE)
         e = _scale(reading, directions @ b, weight)
         e /= e.mean()
         if step >= LINEAR_ROUNDS.stop and np.abs(e / before - 1).max() < CONVERGED:
@@ -167,7 +166,7 @@ def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: 
 
     A negative result, which outliers cause in early rounds, is replaced by the given `e`.
     """
-    gram = _gram(weight, directions)
+    gram = normal_equations(weight, directions)
     values, vectors = np.linalg.eigh(gram)
     root = vectors / np.sqrt(np.maximum(values, 1e-9 * values[:, 2:] + TINY))[:, None, :]
     spread = np.einsum("lp,li,pij->lpj", weight * reading, directions, root, optimize=True).reshape(len(reading), -1)
@@ -180,9 +179,8 @@ def _linear(reading: np.ndarray, weight: np.ndarray, directions: np.ndarray, e: 
 def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return Cauchy weights of the residual over |b| from the last weights; 0 where the readings or the model show a shadow."""
     scaled = reading / e[:, None]
-    top = np.quantile(np.where(lit, scaled, 0), BRIGHT_END, axis=0)
-    bright = lit & (scaled > SHADOW * top)
-    b = _normals(scaled, weight * bright, directions)
+    bright = lit & (scaled > SHADOW * bright_readings(scaled, lit))
+    b = least_squares(scaled, weight * bright, directions, RIDGE)
     model, length = directions @ b, np.maximum(np.linalg.norm(b, axis=0), TINY)
     chosen = bright & (model > SHADOW * length)
     relative = np.where(chosen, scaled - model, 0) / length
@@ -190,19 +188,6 @@ def _weights(reading: np.ndarray, lit: np.ndarray, e: np.ndarray, directions: np
     weight = chosen / (1 + (relative / (WEIGHT_SCALE * spread + 1e-9)) ** 2)
     weight[:, (weight > 0.1).sum(axis=0) < MIN_LIGHTS] = 0  # three readings fit any brightness
     return weight
-
-
-def _normals(scaled: np.ndarray, weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return b of every pixel [3, pixels] by weighted least squares."""
-    gram = _gram(weight, directions)
-    gram += (1e-12 * np.trace(gram, axis1=1, axis2=2) + TINY)[:, None, None] * np.eye(3)  # pixels of no weight get no b
-    return np.linalg.solve(gram, ((weight * scaled).T @ directions)[:, :, None])[:, :, 0].T
-
-
-def _gram(weight: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the normal equations of every pixel [pixels, 3, 3]."""
-    outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
-    return (weight.T @ outer).reshape(-1, 3, 3)
 
 
 def _scale(reading: np.ndarray, model: np.ndarray, weight: np.ndarray) -> np.ndarray:

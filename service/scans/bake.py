@@ -27,8 +27,6 @@ def bake(mesh: SurfaceMesh, scans: list[PreparedScan], names: tuple[str, ...], v
         scans: that were fused.
         names: their layers.
         voxel: side of a voxel of the fusion, metres.
-        px: side of the texture.
-        device: where to compute.
     """
     texels = np.stack([mesh.st[:, 0], 1 - mesh.st[:, 1]], axis=-1).astype(np.float64) * px
     face, weights = rasterise(texels, mesh.triangles, px, px, device=device)

@@ -55,8 +55,6 @@ def fuse(request: FuseRequest, progress: Progress | None = None, sharing: Shared
     """Fuse the scans of a set.
 
     Args:
-        request: the scan set, and the folder of the results.
-        progress: told of every stage.
         sharing: the part of this worker in a fusion that others help with; None: there are no others.
 
     Raises:
@@ -188,11 +186,6 @@ def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
 
 def with_joined_normals(surface: Surface, fused: FusedBricks, where: str) -> tuple[Surface, dict[str, Any]]:
     """Return a surface that has the photometric normals of its views, and what the report says of it.
-
-    Args:
-        surface: of all bricks.
-        fused: where it comes from.
-        where: what messages begin with.
 
     Raises:
         RequestError: normals and depth contradict each other at most vertices.

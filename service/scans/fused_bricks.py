@@ -54,8 +54,6 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
     """Fuse the scans of a set brick by brick. What is kept of scans and bricks lies on the disk until the context ends.
 
     Args:
-        request: the scan set, and how.
-        timings: told of every phase.
         sharing: the part of this worker in a fusion that others help with; None: there are no others.
 
     Raises:
@@ -129,8 +127,6 @@ def placing_warnings(names: list[str], placings: list[Placing], choice: Misplace
     """Yield which scans lie beside the others, and which have nothing in common with any.
 
     Args:
-        names: of the scans.
-        placings: of each.
         choice: what becomes of those that lie beside the others.
     """
     for name, placing in zip(names, placings, strict=True):

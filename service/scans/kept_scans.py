@@ -65,8 +65,6 @@ class KeptScans:
         """Create the scans, of which none is read yet.
 
         Args:
-            file: the scan-set.json.
-            listed: its content.
             pieces: where prepared scans and pairs are kept, with the run that they belong to.
             memory_bytes: that scans read again may take, beside those that threads are at work on.
             threads: scans and pairs at one time.
@@ -177,11 +175,7 @@ def with_found_targets(scan: Scan, entry: ScanEntry, options: RegisterOptions, f
     """Return the targets of a scan with the markers and board corners that its image shows.
 
     Args:
-        scan: as it was read.
-        entry: of the scan.
         options: which markers and which board to look for.
-        file: the scan-set.json, which paths are relative to.
-        where: what messages begin with.
 
     Raises:
         ManifestError: the image is not one of the scan's camera, or a target is found whose name is listed too.

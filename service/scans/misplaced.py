@@ -93,8 +93,6 @@ def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -
     """Compare every scan with the others and find those that are misplaced, the worst first taken out of the comparison of the rest.
 
     Args:
-        samples: of each scan.
-        readings: of each scan.
         voxel: side of a voxel, metres; displacements below half of it do no harm.
     """
     firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])

@@ -35,9 +35,7 @@ def as_range_image(scan: Scan, where: str, voxel_m: float | None = None, *, devi
 
     Args:
         scan: a set of points with a pose, whose `origin` is where the scanner stood.
-        where: what messages begin with.
         voxel_m: metres, to which points that are far closer together are joined; None: they stay.
-        device: where to compute.
 
     Raises:
         RequestError: the points cannot have been seen from there, or are spread too far.

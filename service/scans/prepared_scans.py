@@ -72,8 +72,6 @@ class PreparedScans:
         """Create the scans, of which none is read yet.
 
         Args:
-            file: the scan-set.json.
-            scan_set: its content.
             folder: for the arrays of the scans; exists.
             voxel_m: metres, to which pixels that are far smaller are joined; None: they stay.
             device: where sets of points are made range images.

@@ -34,10 +34,6 @@ class _Sigma(NamedTuple):
 def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
     """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory.
 
-    Args:
-        file: the scan-set.json, which paths are relative to.
-        scans: its content.
-
     Raises:
         StageError: a scan cannot be used; the message names it.
     """
@@ -49,8 +45,6 @@ def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool
     """Read one scan of a set.
 
     Args:
-        file: the scan-set.json, which paths are relative to.
-        scans: its content.
         number: of the scan, from 0.
         estimate_normals: whether normals are fitted to the points where the scan has none; without them the scan has none.
 

@@ -71,8 +71,6 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
     """Find the poses of the scans of a set. Scans are read one by one; what is kept of them and of pairs lies on the disk.
 
     Args:
-        request: the set, and how.
-        progress: told of every stage.
         sharing: the part of this worker in a registration that others help with; None: there are no others.
 
     Raises:

@@ -45,7 +45,6 @@ def write_tiles(fused: FusedBricks, out: Path, *, name: str, provenance: dict[st
         out: folder of the results.
         name: free text; the root prim is named after it.
         provenance: kept with the asset.
-        advance: told how many bricks are done.
 
     Raises:
         StorageError: a file cannot be written.

@@ -27,7 +27,6 @@ class Blender:
         """Start with nothing.
 
         Args:
-            grid: of the result.
             centre, length_m: of the motions.
             noise_factor: by which the noise of patches is larger than they say.
         """

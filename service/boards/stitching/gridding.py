@@ -18,7 +18,6 @@ def grid_points(x: np.ndarray, y: np.ndarray, z: np.ndarray, sigma: np.ndarray, 
 
     Args:
         x, y, z, sigma: [n] metres, board frame.
-        grid: the grid.
 
     Returns:
         The patch, empty where no point lies on the grid.

@@ -93,8 +93,6 @@ def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
     """Compare two patches on one grid.
 
     Args:
-        first, second: the patches.
-        grid: their grid.
         centre: x and y about which motions turn and tilt, metres.
         length_m: L, metres.
         shift_sigma_m: standard deviation along x and y of what is known about the shift before.

@@ -42,7 +42,6 @@ def pixels_of(region: Region, grid: BoardGrid, *, grow: float = 0.0) -> tuple[tu
     """Return the rows and columns around a region, and within them the pixels whose centres it holds.
 
     Args:
-        region: where.
         grid: of the pixels.
         grow: by how much of its size the region is made larger.
     """
@@ -76,8 +75,6 @@ def check_regions(deviation: Deviation, regions: Sequence[Region], *, false_alar
     probability that any region outside its tolerance passes, are both at most `false_alarm`.
 
     Args:
-        deviation: of the board from its design.
-        regions: of the design.
         false_alarm: above 0 and below 1.
 
     Returns:

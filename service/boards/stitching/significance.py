@@ -78,7 +78,6 @@ def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false
     """Look for significant windows over a whole board.
 
     Args:
-        deviation: of the board.
         tolerance_m: deviations up to this are no defect; one number, or one for each pixel, [rows, cols].
         false_alarm: the probability of any false alarm on a board without defects.
         smallest_px: side of the smallest window.

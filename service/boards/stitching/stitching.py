@@ -133,9 +133,6 @@ def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, m
     """Return the height map of all tiles.
 
     Args:
-        tiles: those that were stitched.
-        stitched: where they lie.
-        grid: of the height map.
         motion: [6] a motion of the whole board; None: none.
         progress: called with the count of tiles that are done.
     """

@@ -67,7 +67,6 @@ def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutli
     """Find round outlines, the most complete and largest first.
 
     Args:
-        camera: the camera of the images.
         pictures: [rows, cols] each, 0 to 1, in which outlines stand still: the mean and the brightest of all frames.
     """
     found: list[RoundOutline] = []

@@ -72,7 +72,6 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
         ball, view: the ball, and the normals and lines of sight of its pixels.
-        options: the options of the search.
 
     Raises:
         CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the message does not name the frame.

@@ -69,18 +69,22 @@ class ProCam(NamedTuple):
     rms_px: float  # of camera and projector in the joint fit
 
 
+def eight_bits(image: np.ndarray) -> np.ndarray:
+    """Return a linear image as 8 bits, brightened to its white and encoded by a square root."""
+    white = max(float(np.percentile(image, 99.5)), 1e-12)
+    return np.asarray(np.rint(255 * np.sqrt(np.clip(image / white, 0, 1))), dtype=np.uint8)
+
+
 def find_corners(image: np.ndarray, board: tuple[int, int]) -> np.ndarray | None:
     """Find the inner corners of a chessboard in an image.
 
     Args:
         image: [rows, cols] float32, linear, evenly lit.
-        board: the count of inner corners across and down.
 
     Returns:
         [corners, 2] sub-pixel image coordinates, row by row of the board; None when a corner is not visible.
     """
-    white = max(float(np.percentile(image, 99.5)), 1e-12)
-    shown = np.rint(255 * np.sqrt(np.clip(image / white, 0, 1))).astype(np.uint8)
+    shown = eight_bits(image)
     found, corners = cv2.findChessboardCornersSB(shown, board, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
         found, corners = cv2.findChessboardCorners(shown, board, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE)
@@ -100,7 +104,6 @@ def projector_corners(corners: np.ndarray, u: np.ndarray, v: np.ndarray, decoded
         corners: [corners, 2] image coordinates of the camera.
         u, v: [rows, cols] decoded projector coordinates.
         decoded: [rows, cols] bool, True where both coordinates are decoded.
-        board: the count of inner corners across and down.
 
     Returns:
         [corners, 2] projector coordinates; NaN where too few pixels around a corner are decoded, or they fit no homography.
@@ -138,7 +141,6 @@ def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: floa
 
     Args:
         views: three views or more.
-        board: the count of inner corners across and down.
         square_m: the side of a square in metres.
         camera_size, projector_size: width and height in pixels.
 

@@ -54,10 +54,7 @@ def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square
 
     Args:
         corners: [corners, 2] image coordinates of each view, all of the board.
-        board: the count of inner corners across and down.
         square_m: the side of a square in metres.
-        size: width and height of the images.
-        name: of the camera, for messages.
 
     Raises:
         CalibrationError: there are too few views, or the poses do not determine the camera.
@@ -84,11 +81,8 @@ def calibrate_pose(views: Sequence[SharedView], board: tuple[int, int], square_m
 
     Args:
         views: three or more, all of the board.
-        board: the count of inner corners across and down.
         square_m: the side of a square in metres.
-        first, other: the lenses.
         size: width and height of the images of the first camera.
-        name: of the other camera, for messages.
 
     Raises:
         CalibrationError: there are too few views that both cameras share.

@@ -59,7 +59,6 @@ def stripe_map(samples: StripeSamples, shape: tuple[int, ...], camera: Camera, *
     Args:
         samples: those with status OK are used.
         shape: lines, and pixels of a line.
-        camera: perspective.
         along: "row": lines are rows; "column": lines are columns.
     """
     ok = samples.status == Status.OK
@@ -121,7 +120,6 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
     Args:
         samples: of all frames whose stripes cross the same lines; those that are OK are compared.
         curve: [n] int, number of the curve of each sample, different for curves of different frames.
-        camera: perspective.
         doubled: whether frames of the capture show two stripes.
     """
     ok = np.flatnonzero(samples.status == Status.OK)

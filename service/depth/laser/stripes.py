@@ -39,11 +39,7 @@ class SweepEnergy:
     """The energy of each pixel over the frames of a sweep."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        """Begin with no frame.
-
-        Args:
-            shape: rows and columns.
-        """
+        """Begin with no frame."""
         self.square = np.zeros(shape, np.float32)
         self.fourth = np.zeros(shape, np.float32)
         self.noise2 = 0.0
@@ -188,11 +184,8 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
     """Measure the stripe of one frame on each line.
 
     Args:
-        signal: of the frame.
         mask: [rows, cols] bool.
-        laser: its plane.
         sweep: of the frames whose stripes cross the same lines.
-        camera: perspective.
         near_m, far_m: span of depths; others are OUT_OF_RANGE.
     """
     along = along_of(laser)

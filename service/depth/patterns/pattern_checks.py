@@ -1,6 +1,6 @@
 """Checks of a capture under patterns by a sample of its pixels: frames that are declared wrongly, and waves that the projector bends."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,23 +141,28 @@ def _mirror(axis: Decoded, extent: float, device: str) -> Decoded:
     return axis._replace(coordinate=type(axis.coordinate)(extent - axis.coordinate.numpy(), device=device))
 
 
+def _other_readings(patterns: list[Pattern], score: Callable[[list[Pattern], bool], float]) -> Iterator[tuple[float, Reading]]:
+    """Yield the score of each other reading of the frames that is one; `score` takes what they would show, and whether it is mirrored."""
+    for reading in READINGS:
+        try:
+            other = reading.patterns(patterns)
+            if reading.mirrored or other != patterns:
+                found = score(other, reading.mirrored)
+                if not np.isnan(found):
+                    yield found, reading
+        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
+            continue
+
+
 def check_declaration(sample: Sample, patterns: list[Pattern], projector: PatternProjector, model: ProjectorModel, noise: NoiseModel,
                       device: str) -> str | None:
     """Return a sentence if the frames make much more sense when they are understood in another way than the manifest declares."""
     share = agreeing_share(sample, patterns, projector, model, noise, device)
     if not share < DOUBTFUL_SHARE:
         return None
-    best, chosen = 0.0, None
-    for reading in READINGS:
-        try:
-            other = reading.patterns(patterns)
-            if not reading.mirrored and other == patterns:
-                continue
-            found = agreeing_share(sample, other, projector, model, noise, device, mirrored=reading.mirrored)
-        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
-            continue
-        if found > best:
-            best, chosen = found, reading
+    readings = _other_readings(patterns, lambda other, mirrored: agreeing_share(sample, other, projector, model, noise, device,
+                                                                                mirrored=mirrored))
+    best, chosen = max(readings, key=lambda found: found[0], default=(0.0, None))
     if chosen is None or best < max(CLEAR_SHARE, CLEAR_TIMES * share):
         return None
     return (f"frames: as declared, {100 * share:.0f} % of the pixels with signal agree with their neighbours; {100 * best:.0f} % do if "
@@ -173,15 +178,9 @@ def check_unevenness(sample: Sample, patterns: list[Pattern], projector: Pattern
     declared = unevenness(sample, patterns, projector, noise, device)
     if not declared > UNEVEN:
         return None
-    best, chosen = declared, None
-    for reading in READINGS:
-        try:
-            other = reading.patterns(patterns)
-            found = float("nan") if reading.mirrored or other == patterns else unevenness(sample, other, projector, noise, device)
-        except (StageError, KernelError, ValueError):  # the frames cannot be a code in that reading
-            continue
-        if found < best:
-            best, chosen = found, reading
+    readings = _other_readings(patterns, lambda other, mirrored: float("nan") if mirrored else
+                               unevenness(sample, other, projector, noise, device))
+    best, chosen = min(readings, key=lambda found: found[0], default=(declared, None))
     if chosen is None or best > declared / CLEAR_TIMES:
         return None
     return (f"frames: as declared, neighbouring pixels lie {100 * declared:.2g} % of the projector apart on average; {100 * best:.2g} % if "

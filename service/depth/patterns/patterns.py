@@ -68,7 +68,6 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
     """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
 
     Args:
-        capture: with pattern frames.
         mask: [rows, cols] bool.
         request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
 

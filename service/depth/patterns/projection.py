@@ -34,9 +34,6 @@ class PatternsResult(NamedTuple):
 def make_patterns(request: PatternsRequest, progress: Progress | None = None) -> PatternsResult:
     """Write PNG images and patterns.json.
 
-    Args:
-        request: code, projector, options, folder.
-
     Raises:
         RequestError: an option that does not belong to the code, or that the code refuses.
         StorageError: a file cannot be written.

@@ -39,7 +39,6 @@ def even_light(collected: Collected, response: Sequence[float] | None = None) ->
     """Return how white and black follow from the phases of a capture: from the longest period, which blur dims least.
 
     Args:
-        collected: the codes of the capture.
         response: the projector's light at even levels from 0 to 1; None: linear.
 
     Returns:

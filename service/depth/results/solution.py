@@ -125,8 +125,6 @@ def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, no
     """Return one point for each solved pixel, row by row; or the measured places between pixels, if the method has them.
 
     Args:
-        solution: of the whole image.
-        camera: of the capture.
         color_space: of the capture's images.
         normals: fit them too.
     """

@@ -113,7 +113,6 @@ def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectificati
 
     Args:
         reference: the camera of the capture, perspective.
-        other: the other camera.
         where: the file and the field of the other camera, for messages.
 
     Raises:

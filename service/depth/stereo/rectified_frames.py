@@ -30,10 +30,7 @@ def rectified_frames(capture: Capture, frames: Sequence[Frame], other: int, rect
     """Read and rectify the frames of the reference camera and of one other, and yield images that exist until the block ends.
 
     Args:
-        capture: an opened capture.
-        frames: its stereo frames.
         other: index of the other camera.
-        rectification: of the two cameras.
         cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
         progress: called after every frame with the count of frames that have been read.
 

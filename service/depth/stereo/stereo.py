@@ -4,7 +4,6 @@ Each other camera is matched with the camera of the capture (stereo_pair.py) in 
 lens distortion undone, gives its depth. Where several cameras see a place, their depths are averaged by their variances.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from service.depth.patterns.patterns import full_scale
 from service.depth.patterns.triangulation_check import check_perspective
 from service.depth.results.solution import DepthSolution, statistics
 from service.depth.stereo.rectification import Rectification, rectify
-from service.depth.stereo.rectified_frames import RectifiedFrames, rectified_frames
+from service.depth.stereo.rectified_frames import rectified_frames
 from service.depth.stereo.stereo_pair import LEAST_PLACES, MOST_LABELS, SURE_LEAD, Disparity, Places, match, range_of, unique_places
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -68,7 +67,6 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
     """Match the frames under texture and triangulate them.
 
     Args:
-        capture: with stereo frames.
         mask: [rows, cols] bool.
         request: its noise and its span of depths; depths outside are OUT_OF_RANGE.
 
@@ -92,7 +90,9 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
             _check_order(places, geometry, where, other.name)
             least, most = _span(places, geometry, request, where, other.name)
             timings.stage("match", images.left.shape[1])
-            disparity = _matched(images, least, most, noise, device, timings)
+            for rows, matched in match(images, least, most, noise, device):
+                timings.advance(rows)
+                disparity = matched
         told = {"name": other.name, "baseline_m": _short(geometry.baseline_m), "rectified": [geometry.left.width, geometry.left.height],
                 "disparity_px": [_short(least + geometry.offset_px), _short(most + geometry.offset_px)],
                 "sigma_px": statistics(disparity.sigma[disparity.status == Status.OK])}
@@ -111,19 +111,6 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
         warnings += _chance(solution, mask)
     solution.warnings += [*warnings, *_doubts(solution, mask)]
     return solution
-
-
-def _matched(images: RectifiedFrames, least: float, most: float, noise: NoiseModel, device: str, timings: Timings) -> Disparity:
-    """Return the disparity of all bands."""
-    done = list(_told(match(images, least, most, noise, device), timings))
-    return done[-1]
-
-
-def _told(steps: Iterator[tuple[int, Disparity]], timings: Timings) -> Iterator[Disparity]:
-    """Yield the disparity after each band, and tell the timings of it."""
-    for rows, disparity in steps:
-        timings.advance(rows)
-        yield disparity
 
 
 def _check_order(places: Places, geometry: Rectification, where: str, name: str) -> None:

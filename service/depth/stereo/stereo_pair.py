@@ -140,7 +140,6 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
     """Match two rectified images band by band.
 
     Args:
-        images: of both cameras.
         least, most: the disparities that are considered.
         noise: of a reading before smoothing.
 

@@ -151,7 +151,6 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     """Return the range of each pixel from correlation images, of every pixel from which one can be decoded, however unsurely.
 
     Args:
-        frames: the images of a capture.
         options: vote: whether neighbours are asked, for the light of dark pixels and for wraps.
         calibration: noise and wiggling, where they are known.
         near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.

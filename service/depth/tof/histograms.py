@@ -136,7 +136,6 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     """Return the range of each pixel from photon histograms.
 
     Args:
-        frames: the histograms of a capture.
         options: which return, and whether neighbours vote.
         calibration: the pulse, where it is known.
         near_m, far_m: the span of half paths; None: that of the histogram.

@@ -24,9 +24,6 @@ from stage.tof.source import SourcePath
 def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
     """Write a simulated capture.
 
-    Args:
-        request: scene, camera, where to.
-
     Returns:
         The capture.json.
 

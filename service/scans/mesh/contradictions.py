@@ -37,7 +37,6 @@ def compared(bands: Bands, difference: np.ndarray, noise: np.ndarray, pixel_m: f
     """Compare photometric normals with those of the surface, over several lengths.
 
     Args:
-        bands: of the mesh.
         difference: [V, 3] normals of the mesh without the photometric ones.
         noise: [V, 3] an example of the noise of the former.
         pixel_m: distance of neighbouring pixels on the surface.
@@ -54,7 +53,6 @@ def unlike_noise(bands: Bands, move: np.ndarray, sigma: np.ndarray, agree: np.nd
     """Return [V] bool, where the motions of the vertices around are larger than the noise of the depth explains.
 
     Args:
-        bands: of the mesh.
         move: [V] metres.
         sigma: [V] metres, standard deviation of the depth.
         agree: [V] bool, the vertices that moved.

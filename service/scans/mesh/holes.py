@@ -127,7 +127,6 @@ def _measured(a: np.ndarray, b: np.ndarray, edges: np.ndarray, closed: list[bool
     Args:
         a, b: [n, 3] metres.
         edges: [holes] how many edges each hole has.
-        closed: of each hole.
     """
     if len(edges) == 0:
         return []

@@ -20,6 +20,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array, eye_array
+from scipy.sparse.linalg import cg
 
 from service.scans.mesh.bands import Bands
 from service.scans.mesh.contradictions import compared, unlike_noise
@@ -147,7 +149,6 @@ def _corrected(bands: Bands, measured: np.ndarray, noise: np.ndarray, normals: n
     """Return the photometric normals without the drift that the depth shows.
 
     Args:
-        bands: of the mesh.
         measured: [V, 3] normals of the surface.
         noise: [V, 3] an example of their noise.
         normals: [V, 3] photometric.
@@ -169,7 +170,6 @@ def _limited(bands: Bands, move: np.ndarray, noise: np.ndarray, agree: np.ndarra
     and N / V of the band is the best estimate (Wiener 1949). Below that length drift is nothing.
 
     Args:
-        bands: of the mesh.
         move: [V] metres.
         noise: [V] an example of the noise of the depth, metres.
         agree: [V] bool, the vertices whose motions are compared.
@@ -198,7 +198,6 @@ def _moves(points: np.ndarray, faces: np.ndarray, mesh: _Mesh, weights: _Weights
     Args:
         points: [V, 3] metres.
         faces: [F, 3] int.
-        mesh: of them.
         weights: of depth and normals.
         ways: [V, 3] unit, the directions in which the vertices move.
         normals: [V, 3] corrected.
@@ -242,24 +241,8 @@ def _moves(points: np.ndarray, faces: np.ndarray, mesh: _Mesh, weights: _Weights
 
 def _solved(mesh: _Mesh, diagonal: np.ndarray, between: np.ndarray, right: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Solve a symmetric positive system, with one number a vertex and one an edge, by conjugate gradients scaled by the diagonal."""
-    one, other, count = mesh.one, mesh.other, len(diagonal)
-
-    def times(x: np.ndarray) -> np.ndarray:
-        return diagonal * x + np.bincount(one, between * x[other], count) + np.bincount(other, between * x[one], count)
-
-    x = first.copy()
-    rest = right - times(x)
-    scaled = rest / diagonal
-    along, product = scaled.copy(), float(rest @ scaled)
-    enough = TOLERANCE**2 * float(right @ (right / diagonal))
-    for _ in range(MOST_ITERATIONS):
-        if product <= enough:
-            break
-        image = times(along)
-        step = product / float(along @ image)
-        x += step * along
-        rest -= step * image
-        scaled = rest / diagonal
-        before, product = product, float(rest @ scaled)
-        along = scaled + product / before * along
-    return x
+    root, count = 1 / np.sqrt(diagonal), len(diagonal)
+    beside = coo_array((between * root[mesh.one] * root[mesh.other], (mesh.one, mesh.other)), shape=(count, count))
+    found, _ = cg((eye_array(count) + beside + beside.T).tocsr(), right * root, first / root, rtol=TOLERANCE, atol=0.0,
+                  maxiter=MOST_ITERATIONS)
+    return np.asarray(found * root)

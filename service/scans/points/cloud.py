@@ -94,7 +94,6 @@ def cloud_of(thinned: Thinned, *, most: int, threads: int = 1) -> Cloud:
     """Return points with their normals, spacing and borders.
 
     Args:
-        thinned: the points.
         most: the most points that are matched with other scans; they are drawn evenly over the surface, and always the same.
         threads: for the search of neighbours.
     """

@@ -28,7 +28,6 @@ def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge], ro
     """Return the covariance of the pose of each scan.
 
     Args:
-        solved: the poses.
         pairs: with their fits, in the order of the edges.
         edges: those that `solved` was found from.
         rows: returns the matched points of a pair.

@@ -17,7 +17,6 @@ def fpfh(cloud: Cloud, radius: float) -> np.ndarray:
     """Return the histogram of each point, [n, 33] float32, of length 1 in each of the three angles; 0 of a point without neighbours.
 
     Args:
-        cloud: the points with their normals.
         radius: of the neighbourhood, metres.
     """
     index, distance = cloud.tree.nearest(cloud.points, NEIGHBOURS + 1)

@@ -67,7 +67,6 @@ def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float], *, most: in
     """Move scan b until its surface lies on that of scan a.
 
     Args:
-        a, b: the scans.
         start: [4, 4] a_from_b.
         reaches: the largest distances, metres, at which points are matched, one after the other.
         most: the most points of b that are matched; None: all that are drawn.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from service.calibrate.solvers.procam import find_corners
+from service.calibrate.solvers.procam import eight_bits, find_corners
 from service.scans.points.scan import Scan, Target
 from stage.spread import MAD_TO_SIGMA
 
@@ -56,7 +56,7 @@ def markers_in(image: np.ndarray, dictionary: str) -> list[ImagePoint]:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]), parameters)
-    found, numbers, _ = detector.detectMarkers(_shown(image))
+    found, numbers, _ = detector.detectMarkers(eight_bits(np.nan_to_num(image)))
     if numbers is None:
         return []
     every = [int(number) for number in np.ravel(numbers)]
@@ -104,7 +104,6 @@ def placed(points: list[ImagePoint], scan: Scan) -> tuple[Target, ...]:
 
     Args:
         points: in an image of the camera of the scan.
-        scan: a range image.
 
     Convention:
         The depth of a target is the mean of at most MOST_AVERAGED independent depths.
@@ -156,13 +155,6 @@ def _plane(matrix: np.ndarray, value: np.ndarray) -> tuple[float, float, float] 
         return None
     spread = np.linalg.pinv(matrix[used].T @ matrix[used])
     return float(solution[2]), scale * float(np.sqrt(spread[2, 2])), scale
-
-
-def _shown(image: np.ndarray) -> np.ndarray:
-    """Return a linear image as 8 bits, brightened to its white and encoded by a square root."""
-    known = np.nan_to_num(image)
-    white = max(float(np.percentile(known, 99.5)), 1e-12)
-    return np.asarray(np.rint(255 * np.sqrt(np.clip(known / white, 0, 1))), dtype=np.uint8)
 
 
 def _mean_within(image: np.ndarray, corners: np.ndarray) -> float:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_erosion, maximum_filter, minimum_filter
 
 from service.scans.points.cloud import Cloud
 from service.scans.points.rigid import applied, inverse
@@ -62,14 +63,8 @@ def depth_range(scan: Scan) -> DepthRange | None:
     if scan.camera is None:
         return None
     depth = scan.image(-scan.points[:, 2].astype(np.float32))
-    there = depth != 0
-    padded = np.pad(depth, 1)
-    known = np.pad(there, 1)
-    rows, cols = depth.shape
-    views = [(padded[i:i + rows, j:j + cols], known[i:i + rows, j:j + cols]) for i in range(3) for j in range(3)]
-    inner = np.logical_and.reduce([seen for _, seen in views])
-    low = np.where(inner, np.minimum.reduce([values for values, _ in views]), 0)
-    high = np.where(inner, np.maximum.reduce([values for values, _ in views]), 0)
+    inner = binary_erosion(depth != 0, np.ones((3, 3)))
+    low, high = (np.where(inner, extreme(depth, 3), 0) for extreme in (minimum_filter, maximum_filter))
     step = max(1, int(np.ceil(np.sqrt(depth.size / MOST_PIXELS))))
     return DepthRange(scan.camera, step, _of_squares(low, step, np.minimum), _of_squares(high, step, np.maximum))
 
@@ -88,7 +83,6 @@ def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
     """Compare points with what a range image says of the space before and behind its surface.
 
     Args:
-        image: the range image.
         points: [n, 3] metres, of another scan.
         pose: [4, 4] from the frame of the points to that of the image.
         tolerance: [n] metres: how far before the surface a point may lie without a contradiction.

@@ -37,7 +37,6 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
     """Register two scans as a task says.
 
     Args:
-        task: which scans, and their start.
         cell_m: side of the cells of the rough scale of each, metres. If they differ, the part of the larger scan around the smaller one is
             taken at the scale of that, which takes a start.
         least_overlap: the least part of the smaller of two scans that must be matched.

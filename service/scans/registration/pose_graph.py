@@ -62,7 +62,6 @@ def solve(edges: Sequence[Edge], start: dict[int, np.ndarray], *, fixed: int, fr
     """Find the poses of all scans of a connected graph.
 
     Args:
-        edges: the pairs.
         start: world_from_scan [4, 4] of every scan.
         fixed: the scan whose pose stays.
         freedoms: [6, k] of each scan that may move in k ways alone: small motions of rotation vector and translation about the origin of

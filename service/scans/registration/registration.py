@@ -17,13 +17,12 @@ from service.scans.points.rigid import inverse
 from service.scans.points.scan import Scan, Target
 from service.scans.registration.candidates import ALL_PAIRS, PARTNERS, Outline, Overlaps, likeness, most_alike, outline_of, overlapping
 from service.scans.registration.covariance import covariances, rows_of
-from service.scans.registration.diagnosis import odd_scales, why_alone
+from service.scans.registration.diagnosis import looks_alike_turned, odd_scales, why_alone
 from service.scans.registration.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
 from service.scans.registration.fine import Rows
 from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
-from service.scans.registration.symmetry import looks_alike_turned
 from service.scans.registration.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
 from service.scans.registration.turntable import angle_of, freedom, turned_pose
 from stage.errors import ScanError
@@ -97,7 +96,6 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
     Args:
         scans: two or more.
         starts: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
-        options: how.
         table: the turntable, if its axis is right and only the angles are to be found.
         advance: told how far the work is, from 0 to 1.
 
@@ -263,13 +261,10 @@ def _predicted(outlines: dict[int, Outline], pairs: dict[tuple[int, int], Pair],
     """Return further joined pairs, of scans that overlap at the poses that were found.
 
     Args:
-        outlines: of the scans.
         pairs: what became of each pair that was tried.
         tried: pairs that this function tried before, to which it adds.
         solved: the poses; None: there are none.
         count: of all scans.
-        options: how.
-        registered: registers pairs.
     """
     if solved is None:
         return {}

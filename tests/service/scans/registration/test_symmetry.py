@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from service.scans.registration.diagnosis import looks_alike_turned
 from service.scans.registration.extent import CELLS_ACROSS, extent_of
 from service.scans.registration.pairs import prepare
 from service.scans.registration.registration import RegistrationOptions, register
-from service.scans.registration.symmetry import looks_alike_turned
 from tests.scenes.turntable import figure, pillar, urn, vase
 from tests.service.scans.registration.test_registration import jug, off, registered, scan_of, seen, statues
 
