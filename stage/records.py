@@ -25,15 +25,10 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
     """Read a JSON file and check it against a model.
 
     Args:
-        path: the file.
         model: the model of its content.
         schema: the value that its key `schema` must have.
         further: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report
             because it stops at the first fault of a long list.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, has another schema, or fields are wrong; a sentence for each names file and field.
     """
     text = inputs.read_bytes(path)
     try:

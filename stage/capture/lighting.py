@@ -92,10 +92,6 @@ def lights_from_centre(capture: Capture) -> DistantLights:
 
 
 def check_surface(capture: Capture) -> None:
-    """Check that the images have more than one pixel, because a surface needs two.
-
-    Raises:
-        ManifestError: the images have one pixel.
-    """
+    """Check that the images have more than one pixel, because a surface needs two."""
     if capture.camera.width * capture.camera.height == 1:
         raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: is 1x1: a surface needs two pixels or more")

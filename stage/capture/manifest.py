@@ -137,24 +137,12 @@ class Manifest(Strict):
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """Read and check a capture.json.
-
-    Args:
-        path: the file.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.
-    """
+    """Read and check a capture.json."""
     return read_record(path, Manifest, SCHEMA, _frame_faults)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
-    """Write a capture.json whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a capture.json whole or not at all."""
     write_text(path, manifest_text(manifest))
 
 

@@ -85,7 +85,6 @@ def place_lights(capture: Capture) -> PlacedLights:
     Raises:
         ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
             object.
-        ImageError: the mask is empty or unreadable.
     """
     where = capture.folder / FILE_NAME
     frames, place, strength, lobe = light_places(capture)

@@ -63,9 +63,6 @@ def check_pairs(capture: Capture, place: np.ndarray) -> None:
     Args:
         capture: whose distant and point lights are checked.
         place: [lights, 3] or [lights, 4], of these lights.
-
-    Raises:
-        ManifestError: an image of a pair is missing, or some lights are not polarised; names the first frame.
     """
     if not capture.is_polarised:
         return

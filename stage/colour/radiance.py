@@ -41,7 +41,6 @@ def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend 
     """Check that no value is NaN, infinite, or further below zero than the noise of the image.
 
     Args:
-        path: of the image, for messages.
         pixels: [rows, cols, channels] floating point.
         remedy: what the message about negative values says can be done.
         stray: the part of the pixels that may be below the noise, such as RAW_STRAY.

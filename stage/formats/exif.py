@@ -31,7 +31,6 @@ def exposure_times(where: str, exposures: Mapping[str, Exposure]) -> dict[str, f
     """Return the exposure time of every image, in seconds.
 
     Args:
-        where: the manifest, for messages.
         exposures: the settings of each image, by its name.
 
     Raises:

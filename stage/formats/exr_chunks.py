@@ -24,7 +24,6 @@ def missing_bytes(stream: BinaryIO, table: int, parts: Sequence[Mapping[str, Any
     The library reports a short file only while it decodes, and then on the terminal too.
 
     Args:
-        stream: the file.
         table: the position of the tables of chunk offsets.
         parts: the header attributes of every part, in the order of the file.
 

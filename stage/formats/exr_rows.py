@@ -58,10 +58,6 @@ class RowFile:
         Args:
             parts: those of the picture, with the same channels in every call, each [rows, cols]; rows must be a multiple of BLOCK_ROWS
                 unless they are the last.
-
-        Raises:
-            ValueError: rows that are not the last are no multiple, or there are too many.
-            StorageError: the file cannot be written.
         """
         rows = len(next(iter(parts[0].channels.values())))
         if self._taken + rows > self._rows or (rows % BLOCK_ROWS and self._taken + rows < self._rows):
@@ -100,10 +96,6 @@ class RowFile:
 
         Args:
             checksum: as of `exr.write_parts`.
-
-        Raises:
-            ValueError: rows are missing.
-            StorageError: the file cannot be written.
         """
         if self._taken < self._rows:
             raise ValueError(f"{self._rows - self._taken} of {self._rows} rows are missing")
@@ -118,13 +110,8 @@ def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: boo
     """Yield a file that takes the rows of a picture; it exists when the block ends without an error, whole, and else not at all.
 
     Args:
-        path: the file.
         rows: of the picture.
         metadata, checksum: as of `exr.write_parts`.
-
-    Raises:
-        ValueError: rows are missing at the end.
-        StorageError: the file cannot be written; nothing is left behind.
     """
     if checksum:
         metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}

@@ -37,10 +37,6 @@ class Scan(NamedTuple):
 def scan_header(path: Path, stream: BinaryIO) -> Scan:
     """Check how much the header of an EXR file holds.
 
-    Args:
-        path: of the file, for messages.
-        stream: the file.
-
     Raises:
         ImageError: the header has too many attributes, parts or channels, is too long, or is cut short.
     """

@@ -62,12 +62,7 @@ def decoded_by(decoder: Decoder) -> Iterator[None]:
 
 
 def read_header(path: str | Path) -> ImageHeader:
-    """Read the size and the channels of an image.
-
-    Raises:
-        ImageError: relit does not read such files, the file is truncated (EXR and PNG), or it has no grey or RGB channels.
-        StorageError: the file cannot be opened.
-    """
+    """Read the size and the channels of an image."""
     if _elsewhere:
         return _elsewhere[-1].header(Path(path))
     _check_suffix(path)
@@ -105,10 +100,6 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
     Returns:
         [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel.
-
-    Raises:
-        ImageError: the file is damaged, or relit does not read such files.
-        StorageError: the file cannot be opened.
     """
     recorded = read_recorded(path)
     return np.take(fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
@@ -131,10 +122,6 @@ def read_recorded(path: str | Path) -> np.ndarray:
     Returns:
         [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
         returns them; grey images repeat their one channel.
-
-    Raises:
-        ImageError: the file is damaged, or relit does not read such files.
-        StorageError: the file cannot be opened.
     """
     if _elsewhere:
         return _elsewhere[-1].recorded(Path(path))
@@ -184,7 +171,6 @@ def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None =
     """Read a mask, which is True where the first channel of an image is above one half.
 
     Args:
-        path: the image.
         resolution: the width and height that the mask must have.
         crop: the part of the mask that is returned; None: all of it.
 
@@ -205,14 +191,10 @@ def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarra
     """Read the values of a mask: the first channel of an image, where partial values stand for pixels that the object covers in part.
 
     Args:
-        path: the image.
         resolution: the width and height that the mask must have.
 
     Returns:
         [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0.
-
-    Raises:
-        ImageError: the mask has another size or is unreadable.
     """
     check_resolution(path, resolution)
     values = read_pixels(path)[..., 0].astype(np.float32)
@@ -233,7 +215,6 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
 
     Args:
-        path: the file.
         codes: [rows, cols] or [rows, cols, 3] uint8 or uint16.
         srgb: True for colours that are encoded in sRGB, False for data that no reader should convert.
 
@@ -267,7 +248,6 @@ def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared:
     """Check that an image has the width and height that a camera declares, and return its header.
 
     Args:
-        path: the file.
         resolution: width and height.
         declared: the field that declares them, for the message.
 

@@ -50,7 +50,6 @@ def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, sho
         time_s: [n] time of the shot of each point, on the clock of the scan; written as gps_time (GPS week time: seconds, no date).
         shot: [n] index of the shot of each point; the points of one shot are numbered by their range, the nearest first.
         range_m: [n] metres, the range of each point.
-        path: the file.
         provenance: texts that are kept in a record beside the scale of intensity.
 
     Returns:
@@ -58,7 +57,6 @@ def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, sho
 
     Raises:
         ResultError: there is no point.
-        StorageError: the file cannot be written.
 
     Source:
         ASPRS, "LAS Specification 1.4 - R15", 2019: point data record format 6.

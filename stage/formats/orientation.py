@@ -62,11 +62,7 @@ def check_agreement(where: str, orientations: Mapping[str, int]) -> None:
     A camera that looks straight down guesses its orientation anew for each photograph.
 
     Args:
-        where: the manifest, for the message.
         orientations: of each image, by its name.
-
-    Raises:
-        ManifestError: two images differ; the message names them.
     """
     first: dict[int, str] = {}
     for name, orientation in orientations.items():

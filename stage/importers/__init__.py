@@ -8,5 +8,6 @@ The functions share these arguments, and say only where they take them otherwise
     view         the camera; None: orthographic, of unknown scale
     color_space  of the images; None: sRGB of 8-bit images, scene-linear of others
 
-Every function that reads or writes a file raises StorageError where the file system refuses.
+Every function raises ManifestError, which names the file and where it can the line, where a file does not hold what it should, or files
+do not fit each other or the options.
 """

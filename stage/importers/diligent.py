@@ -17,12 +17,6 @@ def import_folder(source: Path, destination: Path) -> Path:
 
     Args:
         source: the folder of the object.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: a text file is missing, has the wrong count of rows, or names an image that does not exist.
     """
     with storage("read", source / "filenames.txt"):
         lines = (source / "filenames.txt").read_text(encoding="utf-8", errors="replace").splitlines()

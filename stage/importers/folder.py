@@ -53,7 +53,6 @@ def made(layout: str, reason: str, words: list[object], source: Path, *, solve: 
 
     Args:
         layout: what the folder seems to be.
-        reason: why.
         words: the layout and arguments of `relit import`.
         source: the folder of the capture.
         solve: whether `relit solve` makes the result; else `relit depth`.

@@ -53,9 +53,6 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 
     Returns:
         [rows, columns] float64.
-
-    Raises:
-        ManifestError: a row has another count of numbers, or a number is not finite; the message names file and line.
     """
     with storage("read", path):
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -74,11 +71,7 @@ def read_table(path: Path, columns: int) -> np.ndarray:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ManifestError: the file is no JSON.
-    """
+    """Return the content of a JSON file."""
     try:
         return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -92,11 +85,7 @@ def image_resolution(path: Path) -> tuple[int, int]:
 
 
 def color_space_of(path: Path) -> ColorSpaceName:
-    """Return sRGB for an image of 8-bit integers, and scene-linear for any other.
-
-    Raises:
-        ManifestError: the file is no image.
-    """
+    """Return sRGB for an image of 8-bit integers, and scene-linear for any other."""
     if path.suffix.lower() == ".exr" or path_is_raw(path):
         return "lin_rec709_scene"
     source = oiio.ImageInput.open(str(path))
@@ -128,7 +117,6 @@ def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
     Raises:
         ManifestError: a file is missing, lies outside `source`, or differs from a file of its name in `destination`; then no file
             is placed.
-        StorageError: the file system refuses.
     """
     wanted = []
     for name in names:
@@ -163,13 +151,6 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         destination: the folder of the capture.
         folder: the folder of the images; None: that of `table`.
         arrays: what the .npy files of these names hold, which are written; the other files are placed.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: a value is invalid, or `place_images` refuses a file.
-        StorageError: the file system refuses.
     """
     try:
         manifest = Manifest.model_validate(data)

@@ -56,9 +56,6 @@ def read_rig(path: Path) -> LightRig:
         path: a .mat file with S (positions) and, if they are known, Dir, Phi and mu; or a .json file with these keys, with `positions`,
             `directions`, `intensities` and `mu`, or with a list `lights` of objects of `position`, `direction`, `intensity`, `mu` and
             `image`.
-
-    Raises:
-        ManifestError: the file holds no positions, or its arrays do not fit each other.
     """
     fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
@@ -77,11 +74,7 @@ def read_rig(path: Path) -> LightRig:
 
 
 def read_camera_matrix(path: Path) -> CameraMatrix:
-    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json).
-
-    Raises:
-        ManifestError: the file holds no matrix of a camera.
-    """
+    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json)."""
     matlab = path.suffix.lower() == ".mat"
     matrices = read_mat_arrays(path) if matlab else read_matrices(path)
     name = next((name for name in CAMERA_MATRIX if name in matrices), None)

@@ -49,9 +49,6 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
             each light; or a .json file with a list of lights or an object of lights by image name.
         variable: the variable of a .mat file, or the key of a JSON object; None: the only one that can be meant.
         run: whether lights are rows or columns of a table of numbers; None: as its shape says.
-
-    Raises:
-        ManifestError: the file holds no table of lights, or its shape leaves open where the lights are; the message names file and line.
     """
     suffix = path.suffix.lower()
     if suffix == ".mat":
@@ -71,9 +68,6 @@ def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
 
     Returns:
         [lights, 3] float64.
-
-    Raises:
-        ManifestError: the file holds something else.
     """
     if path.suffix.lower() == ".mat":
         name, values = _variable(path, read_mat_arrays(path), variable,

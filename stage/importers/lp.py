@@ -21,12 +21,6 @@ def import_folder(source: Path, destination: Path) -> Path:
 
     Args:
         source: the .lp file, or a folder with exactly one .lp file.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: there is no .lp file or more than one, a line is wrong, or an image does not exist.
     """
     path = _find(source)
     folder = path.parent

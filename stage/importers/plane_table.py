@@ -35,10 +35,6 @@ class PlaneTable(NamedTuple):
 
         Args:
             form: one of FORMS, for coefficients; None: not told.
-            path: the file, for messages.
-
-        Raises:
-            ManifestError: a normal is zero, or coefficients come without their form.
         """
         normals = self.values[:, :3] if self.values.shape[1] == 4 else self.values[:, 3:]
         length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -59,9 +55,6 @@ def read_planes(path: Path) -> PlaneTable:
     Args:
         path: text or CSV with a row for each plane, an image name before it or none; .npy or .mat with such an array; or a calibration file
             of OpenCV or JSON (.yml, .xml, .json) with one of NAMES, or with a normal and a distance or a point.
-
-    Raises:
-        ManifestError: there are no planes, or a row is no four or six numbers.
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:

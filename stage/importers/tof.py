@@ -46,10 +46,6 @@ def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequ
         arrays: which files, and what they do not say themselves.
         planes: `first` or `last`: where the images are counted in arrays of three dimensions; None: as their shape says.
         source_m: the place of the light source; None: at the camera.
-
-    Raises:
-        ManifestError: there are more or fewer images than frequencies times phases, or they differ in size; the message names the file.
-        ImageError: a file cannot be read.
     """
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
@@ -102,10 +98,6 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
         bins: `first` or `last`: where the bins are counted.
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.
-
-    Raises:
-        ManifestError: an array is no histogram of pixels, or sizes differ; the message names the file.
-        ImageError: a file cannot be read.
     """
     arrays = arrays or ArrayFiles()
     folder, names = (source.parent, [source.name]) if source.is_file() else (source, arrays.names(source))

@@ -42,7 +42,6 @@ def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
     """Return the tracking frames of a capture, which all lights lit.
 
     Args:
-        capture: an opened capture.
         to: the image of the tracking frame to align to; None stands for the middle one, and the later of two middle ones.
 
     Raises:

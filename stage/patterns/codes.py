@@ -71,13 +71,6 @@ def collect(patterns: Sequence[Pattern | None]) -> Collected:
 
     Args:
         patterns: the entry of each frame; None for frames that are something else.
-
-    Returns:
-        The codes, complete.
-
-    Raises:
-        ManifestError: two frames show one pattern, a bit or digit or its inverse is missing, or the frames of one code disagree
-            about their stripes; the message names it.
     """
     first: dict[Pattern, int] = {}
     for index, pattern in enumerate(patterns):

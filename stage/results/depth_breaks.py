@@ -60,7 +60,6 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
     Args:
         depth: [rows, cols] metres, above zero in the mask.
         mask: [rows, cols] bool, True where there is a depth.
-        camera: of the whole image.
         offset: rows downwards, at least 0, and columns to the right, which may be negative.
         sigma: [rows, cols] metres, standard deviation of the depth; values that are not finite count as 0. None: 0 everywhere.
 

@@ -89,11 +89,7 @@ def matte_of(capture: Capture, stack: Stack) -> Matte:
     """Return the matte of a capture.
 
     Args:
-        capture: its mask says where the object is.
         stack: its images, as recorded or aligned.
-
-    Raises:
-        ImageError: the mask is empty or unreadable.
     """
     mask, given = capture.mask(), capture.mask_values()
     readings = Readings(stack, mask.shape[1])

@@ -22,7 +22,6 @@ def camera_and_provenance(metadata: Mapping[str, Any], path: str | Path, *, file
 
     Args:
         metadata: the attributes of the file.
-        path: the file, for the message.
         file_name: the name of such files, for the message: maps.exr or depth.exr.
 
     Raises:

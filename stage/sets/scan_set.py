@@ -129,24 +129,13 @@ def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
 
     Args:
         path: the file, or the folder with it.
-
-    Returns:
-        The file, and its content.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.
     """
     file = path / SCAN_SET_FILE if path.is_dir() else path
     return file, read_record(file, ScanSet, SCAN_SET_SCHEMA, _faults)
 
 
 def write_scan_set(scans: ScanSet, path: Path) -> None:
-    """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default."""
     data = scans.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     entries = ",\n".join("    " + json.dumps(entry) for entry in data.pop("scans"))
     body = json.dumps({"schema": data.pop("schema"), "name": data.pop("name"), **data}, indent=2)

@@ -38,11 +38,6 @@ class Alignment:
     def __init__(self, capture: Capture, tracking: Tracking, frames: list[Frame]) -> None:
         """Assign the frames of a stack to the intervals between tracking frames.
 
-        Args:
-            capture: an opened capture.
-            tracking: its tracking frames.
-            frames: the frames of its stack.
-
         Raises:
             ManifestError: a frame lies too far outside the tracking frames; the message names it.
         """
@@ -57,9 +52,6 @@ class Alignment:
 
         Args:
             correction: the correction of the capture, which tracking frames need too.
-
-        Raises:
-            ImageError: a tracking frame is unreadable, or dark; the message names the file.
         """
         from stage.motion import flow  # OpenCV takes 0.15 s to load, which only aligned captures need
 

@@ -70,13 +70,11 @@ class Ingest:
         """Hash the images of the light frames of a capture.
 
         Args:
-            capture: an opened capture.
             cache: the folder for the cache; None stands for `.relit` in the folder of the capture.
             tracking: tracking frames, to the reference of which every frame is warped; None leaves the frames as recorded.
 
         Raises:
             ManifestError: no light lit any frame of the capture.
-            StorageError: an image cannot be read.
         """
         frames = capture.sources()
         if not frames:
@@ -94,8 +92,6 @@ class Ingest:
 
         Raises:
             ManifestError: a frame lies too far outside the tracking frames.
-            ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; the message names the file.
-            StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
         """
         found = stacks.find(self.folder, self.key)
         if found is not None:

@@ -112,20 +112,12 @@ class TofCalibration(Strict):
 
 
 def read_calibration(path: str | Path) -> TofCalibration:
-    """Read a relit.tof/1 file.
-
-    Raises:
-        ManifestError: a field is wrong; the message names file and field.
-    """
+    """Read a relit.tof/1 file."""
     return read_record(path, TofCalibration, SCHEMA)
 
 
 def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
-    """Write a relit.tof/1 file whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a relit.tof/1 file whole or not at all."""
     data = {"schema": SCHEMA, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
     write_text(path, json.dumps(data, indent=2) + "\n")
 
@@ -136,8 +128,6 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
     Args:
         phase_rad: [n] measured phases, radians.
         range_m: [n] true ranges along the ray, metres.
-        modulation_hz: the modulation frequency.
-        highest: the highest harmonic.
 
     Raises:
         CalibrationError: there are too few readings, or they cover too little of a period.
@@ -239,9 +229,5 @@ class Sweep(Strict):
 
 
 def read_sweep(path: str | Path) -> Sweep:
-    """Read a relit.tof-sweep/1 file.
-
-    Raises:
-        ManifestError: a field is wrong; the message names file and field.
-    """
+    """Read a relit.tof-sweep/1 file."""
     return read_record(path, Sweep, SWEEP_SCHEMA)

@@ -67,7 +67,6 @@ def read_correlations(capture: Capture) -> CorrelationImages:
 
     Raises:
         ManifestError: there is none.
-        ImageError: a file is unreadable or has another size than the camera; the message names the file.
     """
     frames = _frames(capture, ContinuousWave)
     if not frames:
@@ -84,8 +83,6 @@ def read_histograms(capture: Capture) -> Histograms:
 
     Raises:
         ManifestError: there is none, frames have different bins, or first_photon_only is given without pulses.
-        ImageError: a file is unreadable, has another size than the camera, or holds impossible counts; the message names the
-            file.
     """
     frames = _frames(capture, Pulsed)
     if not frames:
@@ -105,11 +102,7 @@ def read_histograms(capture: Capture) -> Histograms:
 
 
 def check_frames(capture: Capture) -> None:
-    """Check that the time-of-flight frames of a capture go together: one kind, one place of the source, and the same bins.
-
-    Raises:
-        ManifestError: they do not; the message names the frames.
-    """
+    """Check that the time-of-flight frames of a capture go together: one kind, one place of the source, and the same bins."""
     if is_pulsed(capture):
         _check_bins(capture, _frames(capture, Pulsed))
     read_source(capture)
@@ -120,9 +113,6 @@ def read_frame(capture: Capture, frame: Frame) -> np.ndarray:
 
     Returns:
         [rows, cols] float32 of a correlation image, which may be negative or not finite; [rows · cols, bins] float32 counts of histograms.
-
-    Raises:
-        ImageError: the file is unreadable or has another size than the camera, or holds impossible counts; the message names the file.
     """
     return _histogram(capture, frame) if isinstance(frame.tof, Pulsed) else _plane(capture, frame)
 

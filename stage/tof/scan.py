@@ -121,7 +121,6 @@ def read_scan(path: str | Path) -> Shots:
 
     Raises:
         ManifestError: scan.json is missing or wrong; the message names the field.
-        ImageError: an array is unreadable or has the wrong shape; the message names the file.
     """
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given
@@ -162,7 +161,6 @@ def world_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[
     """Return the world points of ranges, from the pose of the platform at the time of each shot.
 
     Args:
-        shots: the shots of the scan.
         index: [m] the shot of each range; a shot may have several ranges.
         range_m: [m] metres.
 
