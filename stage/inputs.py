@@ -126,11 +126,7 @@ def opened(path: str | Path) -> Iterator[Source]:
 
 
 def read_bytes(path: str | Path, most: int = -1) -> bytes:
-    """Return the content of a file, or its first `most` bytes.
-
-    Raises:
-        ManifestError: the path leads out of a confined folder.
-    """
+    """Return the content of a file, or its first `most` bytes."""
     with opened(path) as source, storage("read", path):
         return source.file.read(most)
 

@@ -131,15 +131,15 @@ class Capture:
 
         Returns:
             [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
+
+        Raises:
+            ImageError: a value is NaN, infinite, or negative beyond the noise of the image and not to be clipped.
         """
         return self.part_of(self.recorded_whole(name, keep_half=keep_half))
 
     def recorded_whole(self, name: str, *, keep_half: bool = False) -> np.ndarray:
-        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have.
-
-        Returns:
-            [rows, cols, 3] as `recorded`.
-        """
+        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have: [rows, cols, 3] as
+        `recorded`."""
         path = self.file(name)
         pixels = images.read_recorded(path)
         if pixels.dtype.kind == "u":
@@ -158,21 +158,14 @@ class Capture:
         return image if self.pixels.crop is None else np.ascontiguousarray(self.pixels.crop.of(image))
 
     def mask(self) -> np.ndarray:
-        """Read the mask of the object.
-
-        Returns:
-            [rows, cols] bool, True on the object; all True when the manifest names no mask.
-        """
+        """Read the mask of the object: [rows, cols] bool, True on the object; all True when the manifest names no mask."""
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=bool)
         return images.read_mask(self.file(self.manifest.mask), self.image_resolution, self.pixels.crop)
 
     def mask_values(self) -> np.ndarray:
-        """Read the mask of the object with its partial values.
-
-        Returns:
-            [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when the manifest names no mask.
-        """
+        """Read the mask of the object with its partial values: [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when
+        the manifest names no mask."""
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         return self.part_of(images.read_mask_values(self.file(self.manifest.mask), self.image_resolution))

@@ -79,12 +79,7 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
 
 
 def lights_from_centre(capture: Capture) -> DistantLights:
-    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object.
-
-    Raises:
-        ManifestError: a light is neither distant nor a point light, there is none, or a point light stands at an impossible
-            position.
-    """
+    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object."""
     if not capture.lit_by(PointLight):
         return distant_lights(capture)
     placed = place_lights(capture)

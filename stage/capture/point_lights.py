@@ -44,11 +44,7 @@ class LightPlaces(NamedTuple):
 
 
 def light_places(capture: Capture) -> LightPlaces:
-    """Return where the lights of the stack of a capture are, all of which must be distant or point lights.
-
-    Raises:
-        ManifestError: a light is of another type, or there is none.
-    """
+    """Return where the lights of the stack of a capture are, all of which must be distant or point lights."""
     where = capture.folder / FILE_NAME
     lights = []
     for index, frame in enumerate(capture.manifest.frames):

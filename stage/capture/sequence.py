@@ -77,11 +77,7 @@ class Sequence(NamedTuple):
     """Whether a file says the rate and times; else the steps are folders in order of name."""
 
     def step(self, number: int, path: Path) -> TimeStep:
-        """Return the step of a number, from 1, of a sequence that was checked before.
-
-        Raises:
-            ManifestError: it has fewer steps by now.
-        """
+        """Return the step of a number, from 1, of a sequence that was checked before."""
         if number > len(self.steps):
             raise ManifestError(f"{path}: has {len(self.steps)} steps now, and had more when it was checked")
         return self.steps[number - 1]
@@ -117,9 +113,6 @@ def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequ
     Args:
         path: a sequence.json, its folder, or a folder of captures.
         frames_per_second: of a folder of captures; a file says its own.
-
-    Raises:
-        ManifestError: sequence.json is wrong, or says another rate than is given.
     """
     file = path if path.is_file() else path / SEQUENCE_FILE
     if not file.is_file():
@@ -158,11 +151,7 @@ def check_alike(sequence: Sequence) -> list[Manifest]:
 
 
 def difference(manifest: Manifest, other: Manifest, fields: Iterable[str]) -> Difference | None:
-    """Return the first of some fields in which two manifests differ, or None.
-
-    Args:
-        fields: names, with dots between those that lead to a value.
-    """
+    """Return the first of some fields in which two manifests differ, or None."""
     for field in fields:
         value, there = attrgetter(field)(manifest), attrgetter(field)(other)
         if value != there:

@@ -57,11 +57,7 @@ def header_of(path: str | Path, stream: BinaryIO) -> AvifHeader:
 
 
 def decode(path: str | Path, stream: BinaryIO, header: AvifHeader) -> np.ndarray:
-    """Decode an AVIF image that is open, without alpha.
-
-    Returns:
-        [rows, cols, 1 or 3] uint8, or float32 fractions of full scale of deeper images.
-    """
+    """Decode an AVIF image that is open, without alpha: [rows, cols, 1 or 3] uint8, or float32 fractions of full scale of deeper images."""
     import cv2  # a tenth of a second that captures of other images need not wait
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # OpenCV writes on the terminal what it raises too

@@ -45,11 +45,7 @@ class RawHeader(NamedTuple):
 
 
 def header_of(source: inputs.Source) -> RawHeader:
-    """Read the size, the orientation and the exposure of a camera raw file that is open.
-
-    Raises:
-        ImageError: the file is damaged or of no known camera, or rawpy is not installed.
-    """
+    """Read the size, the orientation and the exposure of a camera raw file that is open."""
     with _parsed(source) as raw:
         return _header(source, raw)
 

@@ -14,8 +14,7 @@ from stage import inputs
 from stage.errors import ImageError, StorageError, storage
 from stage.files import replacing
 from stage.formats import exr_checksum
-from stage.formats.exr_chunks import missing_bytes
-from stage.formats.exr_scan import scan_header
+from stage.formats.exr_scan import missing_bytes, scan_header
 
 HALF_MAX = 65504.0
 """The largest half value."""
@@ -141,7 +140,6 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
 
     Args:
         channels: the channels by name, each [rows, cols] float16 or float32.
-        color_space, compression: as in Part.
     """
     write_parts(path, [Part("", channels, color_space, compression)], metadata=metadata)
 
@@ -162,13 +160,7 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
 
 
 def encode(temporary: Path, parts: Sequence[Part], *, metadata: Mapping[str, Any], path: str | Path) -> None:
-    """Encode an EXR file into a temporary file.
-
-    Args:
-        temporary: the file that is written.
-        parts, metadata: as of `write_parts`.
-        path: the file that it is for, which messages name.
-    """
+    """Encode an EXR file into a temporary file."""
     written: list[tuple[dict[str, Any], dict[str, np.ndarray], str]] = []
     for part in parts:
         header: dict[str, Any] = {"compression": part.compression, "type": OpenEXR.scanlineimage, "colorInteropID": part.color_space}

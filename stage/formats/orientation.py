@@ -60,9 +60,6 @@ def check_agreement(where: str, orientations: Mapping[str, int]) -> None:
     """Check that all frames of a capture are turned in the same way.
 
     A camera that looks straight down guesses its orientation anew for each photograph.
-
-    Args:
-        orientations: of each image, by its name.
     """
     first: dict[int, str] = {}
     for name, orientation in orientations.items():

@@ -58,11 +58,7 @@ def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int |
 
 
 def read_ply(path: str | Path) -> PointCloud:
-    """Read a PLY file that Relit wrote.
-
-    Raises:
-        ResultError: the file has another layout, or is truncated.
-    """
+    """Read a PLY file that Relit wrote."""
     with storage("read", path), open(path, "rb") as stream:
         start = stream.read(MAX_HEADER)
         end = start.find(b"end_header\n")

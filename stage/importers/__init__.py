@@ -6,6 +6,8 @@ The functions share these arguments, and say only where they take them otherwise
     destination  the folder of the capture; another folder than the source gets links to, or copies of, the images
     selection    which images are frames; None: all but mask and ambient light
     view         the camera; None: orthographic, of unknown scale
+    camera       a file with the matrix of the camera; None: as `view` says
+    lights       the file of the lights; None: the only table in the folder
     color_space  of the images; None: sRGB of 8-bit images, scene-linear of others
 
 Every function raises ManifestError, which names the file and where it can the line, where a file does not hold what it should, or files

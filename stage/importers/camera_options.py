@@ -153,11 +153,8 @@ OPENCV: Axes = ("right", "down", "away")
 
 
 def camera_from_table(axes: Axes) -> np.ndarray:
-    """Return the matrix that takes vectors of a table to the camera frame.
-
-    Returns:
-        [3, 3] float64 for column vectors; it mirrors when the axes are left-handed.
-    """
+    """Return the matrix that takes vectors of a table to the camera frame: [3, 3] float64 for column vectors; it mirrors when the axes are
+    left-handed."""
     matrix = np.array([WAYS[way] for way in axes], dtype=np.float64).T
     if np.linalg.matrix_rank(matrix) < 3:
         raise ManifestError(f"--axes {','.join(axes)}: two of them lie on one line: give one of right, left, one of up, down and one of "

@@ -35,7 +35,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
 
     Args:
         view: the camera, as far as options say it.
-        camera: a file with its matrix; None: as `view` says.
         planes: the file of the planes; None: every frame gets a placeholder.
         form: what four coefficients of a plane mean, one of `plane_table.FORMS`.
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.

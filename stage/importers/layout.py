@@ -7,7 +7,7 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import OpenImageIO as oiio
@@ -21,6 +21,8 @@ from stage.files import replacing
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.records import describe
+
+T = TypeVar("T")
 
 PREVIOUS_NAME = "capture.previous.json"
 """The name under which a capture.json is kept that an import replaces by another."""
@@ -48,24 +50,27 @@ def image_names(folder: Path) -> list[str]:
                              if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
 
 
-def read_table(path: Path, columns: int) -> np.ndarray:
-    """Read a text file with rows of numbers that white space separates.
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines of a text file that are not blank, without white space around them, each with its number from 1."""
+    text = inputs.read_bytes(path).decode("utf-8-sig", "replace")
+    return [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
 
-    Returns:
-        [rows, columns] float64.
-    """
-    with storage("read", path):
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+
+def first_of(values: Mapping[str, T], names: Iterable[str]) -> T | None:
+    """Return the value under the first of several names that there is; None where there is none."""
+    return next((values[name] for name in names if name in values), None)
+
+
+def read_table(path: Path, columns: int) -> np.ndarray:
+    """Read a text file with rows of numbers that white space separates: [rows, columns] float64."""
     rows = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
+    for number, line in read_lines(path):
         try:
             row = [float(part) for part in line.split()]
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise ManifestError(f"{path}: line {number}: {line.strip()[:60]!r} is not {columns} numbers")
+            raise ManifestError(f"{path}: line {number}: {line[:60]!r} is not {columns} numbers")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
 
@@ -146,9 +151,7 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
     A capture.json that was there and differs is kept as PREVIOUS_NAME.
 
     Args:
-        data: the manifest as plain data.
         table: the file that the manifest was made from; errors name it.
-        destination: the folder of the capture.
         folder: the folder of the images; None: that of `table`.
         arrays: what the .npy files of these names hold, which are written; the other files are placed.
     """

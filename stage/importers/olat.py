@@ -32,9 +32,7 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     Args:
         axes: where x, y and z of the table point, as seen by the camera.
         to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
-        lights: the table; None: the only one in the folder.
-        variable: of a .mat or JSON table, as `read_light_table` takes it.
-        run: whether lights are rows or columns, as `read_light_table` takes it.
+        variable, run: as `read_light_table` takes them.
         strengths: a file with the strength of each light; None: that in the table, else equal.
     """
     path = lights or find_table(source)
@@ -65,8 +63,6 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
     Args:
         axes: where x, y and z of the rig point, as seen by the camera, whose centre is their origin.
         unit_m: the metres in one unit of the positions.
-        lights: the file of the rig; None: the only table in the folder.
-        camera: a file with the matrix of the camera; None: as `view` says.
     """
     path = lights or find_table(source)
     rig = read_rig(path)

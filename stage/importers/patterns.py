@@ -108,8 +108,6 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
-        pictures: the frames of the phases, and the rig.
-        phase: how they were taken.
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
         gray_stripe_px: the width of its finest stripe in projector pixels.
         gray: how it was taken; its sequence and bits follow from the axes and the images.
@@ -138,10 +136,8 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
 
     Args:
         codec: one of CODECS.
-        axes: column, row or both: what was coded.
         unit_m: the metres in one unit of the translation.
         projector: the width and height of the projector; None: as the calibration says.
-        images: the names of the frames, as the shell matches them; None: every image but mask, white and black.
     """
     size = projector or projector_size(calibration)
     if size is None:

@@ -55,10 +55,7 @@ def gray_entries(axis: str, size: int, given: int | None, *, inverses: str, fine
     """Return the patterns of one axis of a Gray code.
 
     Args:
-        size: the pixels of the projector along the axis.
-        given: the count of bits, the finest left out; None: all.
-        inverses: pairs, blocks or none.
-        fine_first: whether the finest stripes come first.
+        given: the count of bits, the finest left out; None: all. The others are as of `GrayStack`.
     """
     whole = digit_count(size, 2)
     bits = whole if given is None else given

@@ -152,22 +152,19 @@ def binary_patterns(extent: int, axis: Axis, *, code: Literal["binary", "gray"] 
     return (*frames, *(uniform_patterns() if references else ()))
 
 
-def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float = 1, inverses: bool = True,
-                 references: bool = True) -> tuple[XorPattern | UniformPattern, ...]:
+def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float = 1,
+                 inverses: bool = True) -> tuple[XorPattern | UniformPattern, ...]:
     """Return the frames of a Gray code in stripes that are all narrow, for scenes whose surfaces light each other.
 
     Args:
         base_bit: 0 for XOR-02 (no stripe wider than two finest ones), 1 for XOR-04.
-        stripe_px: width of the finest stripe.
-        inverses: with each frame its inverse.
-        references: with white and black.
     """
     bits = digit_count(stripe_count(extent, stripe_px), 2)
     if not 0 <= base_bit < bits:
         raise ValueError(f"base bit {base_bit} does not exist in {bits} bits (0 to {bits - 1})")
     frames = [XorPattern(code="xor", axis=axis, bit=bit, bits=bits, base_bit=base_bit, stripe_px=stripe_px, inverse=inverse)
               for bit in reversed(range(bits)) for inverse in ((False, True) if inverses else (False,))]
-    return (*frames, *(uniform_patterns() if references else ()))
+    return (*frames, *uniform_patterns())
 
 
 def _describe(pattern: BinaryPattern | XorPattern) -> str:

@@ -52,10 +52,6 @@ def draw(pattern: Pattern, resolution: tuple[int, int]) -> np.ndarray:
     Convention: coordinates are continuous, 0 at the outer edge of the first pixel; pixel c has its centre at c + 0.5. A code's level is
     taken at u along its axis and v across it.
 
-    Args:
-        pattern: the manifest entry.
-        resolution: width and height of the projector.
-
     Returns:
         [rows, cols] or, in colours, [rows, cols, 3] float32, 0…1, linear light.
     """

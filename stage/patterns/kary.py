@@ -119,7 +119,6 @@ def digits_of(code: np.ndarray, base: int, digits: int, *, reflected: bool) -> n
 
     Args:
         code: [...] whole numbers from 0.
-        base: k.
         digits: how many; more significant ones are cut off.
         reflected: a digit t becomes k - 1 - t where the more significant digits, as shown, add up to an odd number: neighbours
             then differ in one digit, by one (k-ary Gray code). With odd k the plain digits above add up to odd at the same time.
@@ -143,9 +142,7 @@ def kary_patterns(extent: int, axis: Axis, *, base: int, reflected: bool = True,
     """Return the frames of base-k digits, most significant first, then white and black, without which levels cannot be told.
 
     Args:
-        base: k.
         reflected: k-ary Gray code, in which neighbouring stripes differ in one digit by one.
-        stripe_px: width of the finest stripe.
         levels: [k] grey level of each digit value, linear light; None (and no colors): even steps from 0 to 1.
         colors: [k] colour of each digit value, in place of levels.
     """

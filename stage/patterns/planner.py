@@ -123,12 +123,7 @@ def depth_sigma(rig: Rig, column_sigma_px: float) -> float:
 
 
 def tabulate(costs: Iterable[Cost], *, frame_rate: float, rig: Rig | None = None) -> tuple[Plan, ...]:
-    """Return the table: what each code costs in time and, with a rig, how precise its depth is.
-
-    Args:
-        frame_rate: images a second.
-        rig: for the depth; None: columns alone.
-    """
+    """Return the table: what each code costs in time and, with a rig, how precise its depth is."""
     if not frame_rate > 0:
         raise ValueError(f"the frame rate is {frame_rate:g}: give images a second, more than 0")
     return tuple(Plan(cost.name, cost.minimum, cost.images, cost.images / frame_rate, cost.column_sigma_px,

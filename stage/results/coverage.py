@@ -116,10 +116,8 @@ def before_dark(readings: Readings, border: np.ndarray, whole: np.ndarray, clear
     """Return [n] bool: the background beside a border pixel is dark in comparison with the object there.
 
     Args:
-        border: [n, 2] rows and columns.
         whole: [rows, cols] bool, pixels of the object alone.
         clear: [rows, cols] bool, pixels of the background alone.
-        far: the distance up to which the background counts, in pixels.
     """
     if not (len(border) and clear.any() and whole.any()):
         return np.zeros(len(border), dtype=bool)

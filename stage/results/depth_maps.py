@@ -69,9 +69,6 @@ class DepthMaps:
 
         Args:
             unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
-
-        Raises:
-            ResultError: the layer of the mask or of the depth is missing, or the metadata holds no camera.
         """
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=DEPTH_FILE)

@@ -43,10 +43,8 @@ def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarra
     """Write the basis images as layers `basis.NNN.{R,G,B}`, which are 0 outside the mask, and the mask as `mask.Y`.
 
     Args:
-        path: the EXR file.
         layers: K images, each [3, rows, cols] float16 or float32.
         mask: [rows, cols] bool.
-        color_space: the scene-linear colour space of the images.
     """
     channels = {f"{layer_name(k)}.{name}": np.where(mask, plane, 0).astype(plane.dtype)
                 for k, layer in enumerate(layers) for name, plane in zip("RGB", layer, strict=True)}

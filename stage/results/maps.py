@@ -97,9 +97,6 @@ class SurfaceMaps:
         Args:
             unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
             layers: the layers to read beside `mask`; the others are None.
-
-        Raises:
-            ResultError: a layer is incomplete or not finite, or the metadata holds no camera.
         """
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=MAPS_FILE)

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
-from stage.records import faults_of, read_record
+from stage.records import faults_of_each, read_record
 from stage.transforms import Transform
 
 SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
@@ -147,11 +147,7 @@ def _faults(data: dict[str, Any]) -> Iterator[str]:
     scans = data.get("scans")
     if not isinstance(scans, list):
         return
-    for index, scan in enumerate(scans):
-        try:
-            ScanEntry.model_validate(scan)
-        except ValidationError as error:
-            yield from faults_of(error, within=("scans", index))
+    yield from faults_of_each(data, "scans", ScanEntry)
     turntable = data.get("turntable")
     angles = turntable.get("angles_deg") if isinstance(turntable, dict) else None
     yield from _between_scans([scan.get("name") if isinstance(scan, dict) else None for scan in scans],

@@ -110,7 +110,6 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights 
     """Return a stack whose frames of one light are merged; where every light has one frame, the stack as it is.
 
     Args:
-        frames: of the stack, in its order.
         component: what the images of a polarised pair become.
         leak: of the polarisers, `Manifest.polarizer_leak`.
     """

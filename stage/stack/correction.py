@@ -135,7 +135,6 @@ class Correction:
 
         Args:
             recorded: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16.
-            frame: which gives the exposure.
         """
         pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:

@@ -19,12 +19,7 @@ class Fingerprints:
     """The content hashes of the files of one folder, which are kept in a JSON file between runs."""
 
     def __init__(self, folder: Path, memory: Path) -> None:
-        """Load the hashes that an earlier run has kept.
-
-        Args:
-            folder: the folder of the files.
-            memory: the JSON file of the hashes, which need not exist.
-        """
+        """Load the hashes that an earlier run has kept."""
         self._folder = folder
         self._memory = memory
         self._known: dict[str, list[int | str]] = {}

@@ -110,11 +110,7 @@ class Ingest:
 
 def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
                progress: FrameProgress | None = None) -> Stack:
-    """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do.
-
-    Raises:
-        ManifestError, ImageError, StorageError: for the reasons that these two name.
-    """
+    """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do."""
     return Ingest.of(capture, cache=cache, tracking=tracking).stack(progress)
 
 

@@ -104,13 +104,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
 
 @contextmanager
 def scratch_arrays(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
-    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files.
-
-    Args:
-        size: bytes of all arrays together.
-        capture: whose folder has the scratch file, where `cache` does not.
-        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture.
-    """
+    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files."""
     if size <= MEMORY_BYTES:
         yield lambda shape, dtype: np.empty(shape, dtype)
         return

@@ -63,11 +63,7 @@ def is_pulsed(capture: Capture) -> bool:
 
 
 def read_correlations(capture: Capture) -> CorrelationImages:
-    """Read the correlation images of a capture.
-
-    Raises:
-        ManifestError: there is none.
-    """
+    """Read the correlation images of a capture."""
     frames = _frames(capture, ContinuousWave)
     if not frames:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: none is cw")
@@ -109,11 +105,8 @@ def check_frames(capture: Capture) -> None:
 
 
 def read_frame(capture: Capture, frame: Frame) -> np.ndarray:
-    """Read the recorded values of one time-of-flight frame.
-
-    Returns:
-        [rows, cols] float32 of a correlation image, which may be negative or not finite; [rows · cols, bins] float32 counts of histograms.
-    """
+    """Read the recorded values of one time-of-flight frame: [rows, cols] float32 of a correlation image, which may be negative or not
+    finite; [rows · cols, bins] float32 counts of histograms."""
     return _histogram(capture, frame) if isinstance(frame.tof, Pulsed) else _plane(capture, frame)
 
 
@@ -180,11 +173,7 @@ def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read a .npy file of real numbers.
-
-    Raises:
-        ImageError: the file is no whole .npy file, or not of real numbers; the message names the file.
-    """
+    """Read a .npy file of real numbers."""
     with inputs.opened(path) as source:
         array_shape(path, source.file, source.max_pixels)
         with storage("read", path):

@@ -41,7 +41,6 @@ def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, 
     """Interpolate the poses of a track at given times: positions linearly, rotations by slerp.
 
     Args:
-        track: the poses in order of time.
         times_s: [n] seconds, on the clock of the track.
 
     Returns:
@@ -118,9 +117,6 @@ def read_scan(path: str | Path) -> Shots:
 
     Args:
         path: the folder of the scan, or the scan.json in it.
-
-    Raises:
-        ManifestError: scan.json is missing or wrong; the message names the field.
     """
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given

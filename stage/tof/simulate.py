@@ -105,11 +105,8 @@ class HistogramCamera:
 
 
 def correlation_images(scene: TofScene, camera: CorrelationCamera, random: np.random.Generator | None = None) -> np.ndarray:
-    """Return correlation images, with noise when `random` is given.
-
-    Returns:
-        [images, rows, cols] float64 electrons, in the order of `camera.settings()`.
-    """
+    """Return correlation images, with noise when `random` is given: [images, rows, cols] float64 electrons, in the order of
+    `camera.settings()`."""
     images = []
     for hz, delta in camera.settings():
         mean = camera.ambient_electrons * scene.albedo
