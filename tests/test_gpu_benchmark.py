@@ -16,6 +16,7 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, *arguments], cwd=HOME, capture_output=True, text=True, timeout=300, check=False)
 
 
+@pytest.mark.long
 def test_it_needs_only_warp_and_numpy():
     """Importing it loads none of the packages that the rest of relit needs."""
     others = ("OpenEXR", "OpenImageIO", "cv2", "fastapi", "pxr", "pydantic", "scipy", "service", "stage", "typer")
@@ -23,6 +24,7 @@ def test_it_needs_only_warp_and_numpy():
     assert (said.stdout.strip(), said.stderr) == ("[]", "")
 
 
+@pytest.mark.long
 @pytest.mark.skipif("cuda:0" in devices.names(), reason="there is a GPU")
 def test_a_machine_without_a_gpu_is_told_so():
     """The benchmark runs as a program: Warp's own words about the driver are not to be seen."""

@@ -82,6 +82,7 @@ def test_a_device_describes_itself(device):
     assert devices.pack_width(device) == (devices.PACK_CPU if device == "cpu" else devices.PACK_CUDA)
 
 
+@pytest.mark.long
 def test_starting_says_nothing():
     """A machine without a GPU is an ordinary one: no line about a missing driver, on either stream."""
     done = subprocess.run([sys.executable, "-c", "from kernels import device; device.names()"], capture_output=True, text=True,

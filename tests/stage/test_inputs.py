@@ -146,6 +146,7 @@ def test_an_image_of_too_many_pixels_is_not_decoded(folders, name, content):
         images.read_recorded(inside / name)
 
 
+@pytest.mark.long
 def test_frames_that_are_swapped_for_links_while_they_are_read(folders):
     """What 22 of 24 tries did with the path: each stack has the frames of the capture, or the job fails."""
     inside, outside = folders

@@ -70,6 +70,7 @@ def test_without_noise_only_the_chords_between_pixels_are_left(device):
     assert np.abs(sphere(points)).max() < 2.1e-4  # (2.5 mm / cos 78°)² / 8 R = 0.18 mm at the most grazing pixels, and voxels
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("voxels", [2.0, 4.0, 8.0])
 def test_a_small_ball_before_a_wall_is_whole(device, voxels):
     """Views that see the wall past the ball see the voxels beside it to be empty, and they are: the surface lies behind them."""
@@ -84,6 +85,7 @@ def test_a_small_ball_before_a_wall_is_whole(device, voxels):
     assert np.median(np.abs(np.linalg.norm(points, axis=1) - 0.03)) < 0.15 * voxel
 
 
+@pytest.mark.long
 def test_bricks_meet_without_seams_and_crops_change_nothing(device, sphere_shots):
     """A surface over eight bricks is the surface of one, moved: every vertex lies on an edge that two bricks compute alike."""
     voxel = 2.5e-3
@@ -123,6 +125,7 @@ def two_plates(points):
     return np.min([np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) for q in distances], axis=0)
 
 
+@pytest.mark.long
 def test_a_gap_and_a_step_are_not_bridged(device):
     images = [range_image(shot, SIGMA) for shot in around(two_plates)]
     points, _, _ = fuse(images, 1.25e-3, *BOX, device=device)

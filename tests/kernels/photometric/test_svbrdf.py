@@ -297,6 +297,7 @@ def test_nearby_shapes_are_lobes():
     assert len(nearby_shapes(Diffuse(rough=0.5))) == 4
 
 
+@pytest.mark.long
 def test_more_rounds_are_an_option(device):
     """Options reach the kernel: one round of re-weighting is worse on shadows than five."""
     normal = tilted(100)

@@ -56,6 +56,7 @@ def test_nearest_points_of_rays():
     assert np.isnan(nearest_points(np.zeros(3), np.array([[1.0, 0, 0]]), np.ones((1, 3)), np.array([[1.0, 0, 0]])).point).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("along", ["row", "column"])
 @pytest.mark.parametrize("width", [0.8, 2.0, 5.0])
 def test_the_centre_of_a_stripe(device, along, width):

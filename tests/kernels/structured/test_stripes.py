@@ -29,6 +29,7 @@ def decode(stack, patterns, device, *, saturated=None, noise=NOISE, extent=WIDTH
     return result(decoded, stack.shape[-1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pixels", [1, 31, 4097])
 @pytest.mark.parametrize("code, options", [("binary", {}), ("gray", {}), ("gray", {"stripe_px": 3}), ("gray", {"inverses": False}),
                                            ("gray", {"references": False}), ("xor", {}), ("xor", {"base_bit": 1}),
@@ -52,6 +53,7 @@ def test_lecture_example(device):
     assert coordinate.numpy()[0] == 5.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("code", ["binary", "gray", "xor"])
 @pytest.mark.parametrize("options", [{}, {"inverses": False}, {"references": False}])
 def test_values_are_those_of_the_twin_on_noisy_mixtures(code, options, device):

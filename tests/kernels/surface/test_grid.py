@@ -12,6 +12,7 @@ def visited(sweep):
     return np.sort(np.concatenate([np.arange(begin, min(begin + walk.span, walk.end), walk.step) for begin in begins]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (7, 10), (131, 257), (300, 301)])
 @pytest.mark.parametrize("layout", ["cpu", "cuda:0"])
 def test_every_pixel_is_visited_once(size, layout):

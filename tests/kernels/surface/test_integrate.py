@@ -178,6 +178,7 @@ def test_mirrored_picture_gives_mirrored_heights(device):
     assert np.abs(one - other).max() < 3e-6 * np.ptp(shape.z)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["sphere", "bumps", "perspective"])
 def test_iterations_do_not_grow_with_the_picture(kind, device):
     for n in (64, 1024):

@@ -25,6 +25,7 @@ def flying(distance, device, sigma=0.002, status=None, **options):
     return mark_flying(*inputs, *distance.shape, **options).numpy().reshape(distance.shape)
 
 
+@pytest.mark.long
 def test_a_column_between_two_walls_flies_and_no_other(device):
     distance = np.full((9, 12), 2.0)
     distance[:, 6:] = 5.0

@@ -123,6 +123,7 @@ def test_the_error_under_lights_between_the_captured_is_that_of_relit_frames(rel
     assert f"error    {100 * error:.3g} % RMS of pictures under lights from between" in outcome.out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "name", "count", "most"), [
     # cast shadows and the edge of a ball lit up to 75 degrees are what is lost; figures of this run, rounded up
     ("ptm", "a.ptm", None, 0.12), ("lrgb-ptm", "a.ptm", None, 0.12), ("hsh", "a.rti", 4, 0.125), ("hsh", "a.rti", None, 0.10),

@@ -50,6 +50,7 @@ def inspect(relit, scan_folder: Path, *arguments):
         return outcome, list(csv.DictReader(table)), json.loads((out / "report.json").read_text())
 
 
+@pytest.mark.long
 def test_planted_defects_are_found_and_nothing_else(relit, tmp_path, golden):
     """The defects lie in the frame of the golden board, whose stage errs by up to a pixel."""
     outcome, rows, report = inspect(relit, board(tmp_path / "b", faulty, seed=2), "--golden", golden)
@@ -85,6 +86,7 @@ def test_a_good_board_with_missing_pixels_does_not_pass_as_a_whole(relit, tmp_pa
     assert passed.code == 0 and "verdict  pass" in passed.out
 
 
+@pytest.mark.long
 def test_what_must_be_found_and_cannot_is_not_inspected(relit, tmp_path, golden):
     """The smallest window has a σ of √2 / 3 σ: a defect of 3 σ in it cannot be told at 5.8 + 1.6 of that, one of 5 σ can."""
     folder = board(tmp_path / "b", SURFACE, seed=4)
@@ -93,6 +95,7 @@ def test_what_must_be_found_and_cannot_is_not_inspected(relit, tmp_path, golden)
     assert outcome.code == 1 and report["comparison"]["pixels"]["inspected"] < 15_000
 
 
+@pytest.mark.long
 def test_regions_of_a_design_are_decided(relit, tmp_path):
     """The design is the exact surface; regions over both defects fail, one beside them passes, one without tiles is not inspected."""
     rows, cols = 210, 230
@@ -124,6 +127,7 @@ def test_regions_of_a_design_are_decided(relit, tmp_path):
     assert refused.code == 2 and "design.json: is not of this board" in refused.err and refused.err.count("\n") == 1
 
 
+@pytest.mark.long
 def test_regions_of_a_golden_board_are_decided(relit, tmp_path, golden):
     """As those of a design; without a golden board there is nothing to judge them on."""
     folder, file = board(tmp_path / "b", faulty, seed=5), tmp_path / "regions.json"
@@ -144,6 +148,7 @@ def test_regions_of_a_golden_board_are_decided(relit, tmp_path, golden):
     assert beyond.code == 2 and "square lies beyond the height map" in beyond.err and not (tmp_path / "o").exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("surface", "options", "words"), [
     (domes(4e-3, 4e-3, seed=9), {}, "is not of this board: the correlation of their heights"),
     (lambda x, y: SURFACE(-x, y), {}, "the board is mirrored against it"),

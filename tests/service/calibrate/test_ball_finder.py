@@ -67,6 +67,7 @@ def measured(folder):
     return np.array([frame["light"]["direction"] for frame in frames])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("camera", "hidden"), [("orthographic", False), ("orthographic", True), ("perspective", False)])
 def test_a_chrome_ball_is_found_and_gives_directions(tmp_path, camera, hidden):
     """Off the centre, among other round and bright things, half behind a book in one case, with noise."""
@@ -79,6 +80,7 @@ def test_a_chrome_ball_is_found_and_gives_directions(tmp_path, camera, hidden):
     assert len(error) >= 5 and error.max() < 0.5, error
 
 
+@pytest.mark.long
 def test_a_grey_ball_is_found_and_gives_directions(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", lambda direction: lambertian(direction, albedo=0.6, irradiance=2.0))
     grey_ball(GreyBallRequest(capture=folder, refine_direction=True))
@@ -86,6 +88,7 @@ def test_a_grey_ball_is_found_and_gives_directions(tmp_path):
     assert error.max() < 0.5, error
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "shade"), [("mirror", lambda d: lambertian(d, albedo=0.6, irradiance=2.0)), ("grey", chrome)])
 def test_a_ball_of_another_kind_is_refused(tmp_path, kind, shade):
     folder = photograph(tmp_path / "capture", "orthographic", shade)
@@ -98,6 +101,7 @@ def test_a_ball_of_another_kind_is_refused(tmp_path, kind, shade):
     assert files_in(folder) == before
 
 
+@pytest.mark.long
 def test_no_ball_is_refused(tmp_path):
     folder = photograph(tmp_path / "capture", "orthographic", chrome, ball=False)
     with pytest.raises(RequestError, match="no mirror ball is found"):

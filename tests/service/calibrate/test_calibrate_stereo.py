@@ -45,6 +45,7 @@ def scene(folder, **changes):
     return folder
 
 
+@pytest.mark.long
 def test_a_board_calibrates_both_cameras(relit, board, tmp_path):
     further = scene(tmp_path)
     outcome = relit("depth", further, "--out", tmp_path / "out")

@@ -37,6 +37,7 @@ def cw(view):
     return cw_frames(tof.correlations(view, 1e6, SETTINGS, seed=1, harmonics=WAVES), SETTINGS)
 
 
+@pytest.mark.long
 def test_wiggling_offset_and_drift_of_a_sweep(tmp_path, relit):
     steps = [(f"d{k}", depth, 0.04, 25.0) for k, depth in enumerate(np.linspace(0.8, 7.5, 40))]
     steps += [(f"w{k}", 2.0 + k, 0.04 + 1e-3 * (warm - 25), warm) for k, warm in enumerate((15.0, 35.0, 45.0))]

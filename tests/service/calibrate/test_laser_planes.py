@@ -53,6 +53,7 @@ def calibrated(relit, folders, *options):
                  *options)
 
 
+@pytest.mark.long
 def test_planes_are_found_and_measure_an_object(relit, tmp_path):
     """Corners are off by 0.1 px, the board by a part of a millimetre: planes by tenths of a degree, depths by millimetres."""
     folders = boards(tmp_path)
@@ -73,6 +74,7 @@ def test_planes_are_found_and_measure_an_object(relit, tmp_path):
     assert maps.mask.sum() > 300 and np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.01
 
 
+@pytest.mark.long
 def test_what_does_not_determine_planes_is_refused(relit, tmp_path):
     folders = boards(tmp_path)
     before = [(folder / "capture.json").read_bytes() for folder in folders]

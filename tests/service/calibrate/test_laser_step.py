@@ -44,6 +44,7 @@ def test_planes_are_found_within_their_sigma(relit, tmp_path, pose, even):
     assert tilts.max() < 3 and depths.max() < 3
 
 
+@pytest.mark.long
 def test_a_block_that_leans_is_within_what_is_said(relit, tmp_path):
     """Two standard deviations of the angle: depths are off by about one in a hundred."""
     folder = photograph(tmp_path / "step", Step(lean=0.5), PLANES)

@@ -59,6 +59,7 @@ def rig(tmp_path_factory):
     return [folder / f"pose{number}" for number in range(5)], points[0]
 
 
+@pytest.mark.long
 def test_a_rig_calibrates_itself_and_measures(relit, rig, tmp_path):
     folders, points = rig
     outcome = relit("calibrate", "procam", *folders, "--board", "9x6", "--square-m", 0.03, "--projector", "256x192")

@@ -44,6 +44,7 @@ def running(monkeypatch, code: str) -> None:
     monkeypatch.setattr(check_process, "COMMAND", (sys.executable, "-c", f"import json, os, signal, sys, time\n{code}"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("registered", [False, True])
 def test_it_finds_what_a_check_finds(registered):
     told = Told()

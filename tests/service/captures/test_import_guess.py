@@ -98,6 +98,7 @@ LAYOUTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
     write, capitals = LAYOUTS[layout]

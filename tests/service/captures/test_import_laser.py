@@ -86,6 +86,7 @@ def as_points(folder):
     return "planes.npy", None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("write", [as_csv, as_text, as_yaml, as_mat, as_json, as_points])
 def test_planes_of_any_file_give_the_true_depth(relit, tmp_path, write):
     """The stripe is 1.2 px wide (standard deviation) and the baseline 0.3 m: the texture

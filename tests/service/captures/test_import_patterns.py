@@ -103,6 +103,7 @@ def test_fewer_bits_than_the_projector_has(relit, tmp_path):
 PERIODS = (16.0, 18.0, 21.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", ["as relit's", "sines that move back, steps slowest", "rows too", "from the number of the pixel",
                                     "an offset between two steps"])
 def test_phases(relit, tmp_path, layout):

@@ -41,6 +41,7 @@ def error(maps, truth=RANGE_M):
 QUARTERS = ("--phases-deg", "0,90,180,270")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", ["an array for each phase", "one array", "MATLAB", "MATLAB, one variable a phase", "raw", "NumPy"])
 def test_one_frequency(relit, tmp_path, layout):
     images, words = correlations([60e6], [0, 90, 180, 270]), ["--signal", "minus"]
@@ -120,6 +121,7 @@ def histograms(shape, scale=1):
     return truth, scale * RNG.poisson(mean).astype(np.int32)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", ["npy", "bins first", "MATLAB", "JSON of a chip with 3x3 zones"])
 def test_histograms(relit, tmp_path, layout):
     truth, counts = histograms((3, 3) if "JSON" in layout else (12, 16), scale=10 if layout == "npy" else 1)

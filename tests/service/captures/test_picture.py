@@ -36,6 +36,7 @@ def frames_of_lights(image):
     return np.argwhere(lines)
 
 
+@pytest.mark.long
 def test_a_light_that_disagrees_is_red_where_it_stands(tmp_path):
     write_capture(tmp_path / "cap", SCENE)
     found, image = drawn(tmp_path / "cap", tmp_path / "a.png")
@@ -70,6 +71,7 @@ def test_the_lights_are_where_the_camera_sees_them(tmp_path):
     assert abs(blue[:, 1].mean()) < 3 and blue[:, 0].mean() == pytest.approx(-REACH, abs=3)
 
 
+@pytest.mark.long
 def test_saturation_is_red_where_it_is(tmp_path):
     write_capture(tmp_path / "cap", SCENE, saturation=10.0)
     whole = SCENE.images[0].copy()
@@ -86,6 +88,7 @@ def test_saturation_is_red_where_it_is(tmp_path):
     assert not ((panel[..., 0] > panel[..., 1] + 0.3) & (panel[..., 0] > panel[..., 2] + 0.3)).any()
 
 
+@pytest.mark.long
 def test_frames_without_directions_are_in_their_order(tmp_path):
     """Patterns; one that cannot be read is crossed in red."""
     frames = [{"image": f"{i}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)]

@@ -49,6 +49,7 @@ def test_json_that_is_nested_too_deeply(relit, tmp_path, text):
     assert outcome.code == 0, outcome.err
 
 
+@pytest.mark.long
 def test_toml_that_is_nested_too_deeply(relit, tmp_path):
     (tmp_path / "relit.toml").write_text(f"a = {'[' * DEEP}{']' * DEEP}")
     assert "relit.toml: is nested too deeply" in sentence(relit("serve", "--config", tmp_path / "relit.toml"))

@@ -215,6 +215,7 @@ def test_every_command_is_a_job_or_says_why_not():
     assert jobs.JOBS.keys() - {"-".join(words) for words in names} == {"pipeline"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", [words for words, _ in commands(PROGRAM)], ids=" ".join)
 def test_a_help_shows_every_word(relit, monkeypatch, words):
     """The names of options too, at the usual width of a terminal."""

@@ -182,6 +182,7 @@ def run_program(*arguments: object) -> subprocess.CompletedProcess:
                           timeout=120, env=environment, cwd=ROOT)
 
 
+@pytest.mark.long
 def test_as_a_program_of_its_own(tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=8, lights=4))
     done = run_program("solve", tmp_path / "cap", "--method", "lambert", "--out", tmp_path / "out")

@@ -84,6 +84,7 @@ def test_images_and_captures_that_are_several(relit, tmp_path: Path):
     assert relit("submit", "calibrate-procam", tmp_path / "none", "--board", "9", "--square-m", "0.03").code == 2
 
 
+@pytest.mark.long
 def test_light_keys_go_with_the_job(relit, owl: str, tmp_path: Path):
     keys = tmp_path / "keys.json"
     keys.write_text('{"schema": "relit.keys/1", "captured": [{"image": "000.exr", "keys": [{"frame": 1, "weight": 1}]}]}')
@@ -96,6 +97,7 @@ def test_light_keys_go_with_the_job(relit, owl: str, tmp_path: Path):
     assert relit("submit", "relight", owl, "--keys", keys).code == 2
 
 
+@pytest.mark.long
 def test_a_job_that_fails_is_one_sentence_and_exit_code_1(relit, owl: str):
     done = relit("submit", "solve", owl, "--method", "gradient", "--wait")
     assert done.code == 1
@@ -108,6 +110,7 @@ def test_a_job_that_fails_is_one_sentence_and_exit_code_1(relit, owl: str):
     assert job in relit("jobs", "list").out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("arguments", "sentence"), [
     (["solve", "missing"], "missing: there is no such file or folder"),
     (["solve", "cap_0123456789abcdefghjk"], "cap_0123456789abcdefghjk"),
@@ -143,6 +146,7 @@ def interrupted(*arguments: str) -> tuple[str, subprocess.CompletedProcess[str]]
     return said(line)["job"], subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
+@pytest.mark.long
 def test_ctrl_c_leaves_the_job_running(relit, owl: str, sky: str):
     job, done = interrupted(owl, "--environment", sky)
     assert done.returncode == 130
@@ -155,6 +159,7 @@ def test_ctrl_c_leaves_the_job_running(relit, owl: str, sky: str):
     assert relit("jobs", "cancel", job).code == 0
 
 
+@pytest.mark.long
 def test_ctrl_c_cancels_the_job_where_that_is_asked(owl: str, sky: str):
     job, done = interrupted(owl, "--environment", sky, "--cancel-on-interrupt")
     assert done.returncode == 130

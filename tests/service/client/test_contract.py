@@ -122,6 +122,7 @@ def everything(client: Client, between: Between, folder: Path, owl: str, sky: st
     client.captures.delete(capture.id)
 
 
+@pytest.mark.long
 def test_what_the_client_sends_is_documented_and_what_it_reads_is_promised(server, key, document, owl, sky, tmp_path: Path):
     recorded = Recorded()
     with Client(server.url, key, transport=recorded) as client:

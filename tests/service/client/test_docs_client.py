@@ -18,6 +18,7 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
 
 
+@pytest.mark.long
 def test_the_program_runs(server, key, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     program, = blocks("python")
     monkeypatch.chdir(tmp_path)
@@ -30,6 +31,7 @@ def test_the_program_runs(server, key, tmp_path: Path, monkeypatch: pytest.Monke
     assert sorted(path.name for path in (tmp_path / "result").iterdir()) == [path.name for path in names["frames"]]
 
 
+@pytest.mark.long
 def test_the_first_command_runs(relit, server, key, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     line = next(line for line in blocks("sh")[1].splitlines() if "submit pipeline" in line)
     small = write_capture(tmp_path / "ball")

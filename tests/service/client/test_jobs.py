@@ -42,6 +42,7 @@ def frames(capture: str, environment: str, count: int, **common: object) -> Reli
     return RelightJob(kind="relight", capture=capture, environment=environment, options=RelightOptions(frames=f"1-{count}"), **common)
 
 
+@pytest.mark.long
 def test_a_job_is_waited_for(client: Client, between: Between, owl: str, sky: str):
     told = Told()
     job = client.jobs.submit(frames(owl, sky, 40, name="wait", priority=70))
@@ -54,6 +55,7 @@ def test_a_job_is_waited_for(client: Client, between: Between, owl: str, sky: st
     assert [path for path in between.sent("GET") if path.endswith("/events")] == [f"/v1/jobs/{job.id}/events"]
 
 
+@pytest.mark.long
 def test_a_failed_job_says_why_and_can_be_tried_again(client: Client, owl: str):
     job = client.jobs.submit(SolveJob(kind="solve", capture=owl, options=SolveOptions(method=Method.GRADIENT)))
     with pytest.raises(JobEnded, match="gradient") as caught:
@@ -69,6 +71,7 @@ def test_a_failed_job_says_why_and_can_be_tried_again(client: Client, owl: str):
         client.jobs.get(job.id)
 
 
+@pytest.mark.long
 def test_a_cancelled_job_ends_and_is_gone_on_with(client: Client, owl: str, sky: str):
     long = client.jobs.submit(frames(owl, sky, 2000))
     behind = client.jobs.submit(frames(owl, sky, 1, priority=10))
@@ -98,6 +101,7 @@ def test_one_token_is_one_job(client: Client, between: Between, owl: str):
     client.jobs.cancel(job.id)
 
 
+@pytest.mark.long
 def test_events_that_break_are_connected_again(client: Client, between: Between, owl: str, sky: str):
     known = []
 
@@ -119,6 +123,7 @@ def test_events_that_break_are_connected_again(client: Client, between: Between,
     assert known[-1] is not None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("answer", [
     lambda request: httpx2.Response(502, text="a proxy", request=request),
     lambda request: httpx2.Response(200, text="<html>", headers={"Content-Type": "text/html"}, request=request),
@@ -147,6 +152,7 @@ def test_waiting_ends_with_patience(server, key, owl: str, sky: str):
             client.jobs.wait(job.id)
 
 
+@pytest.mark.long
 def test_results_are_fetched(client: Client, server, solved: str, tmp_path: Path):
     there = server.data / "projects" / "owls" / "jobs" / solved
     told = Told()
@@ -192,6 +198,7 @@ def test_a_broken_download_is_gone_on_with(server, key, solved: str, tmp_path: P
     assert asked == [None, f"bytes={len(whole) // 2}-"]
 
 
+@pytest.mark.long
 def test_a_file_that_changed_meanwhile_is_fetched_from_its_beginning(client: Client, between: Between, owl: str, tmp_path: Path):
     job = client.jobs.wait(client.jobs.submit(SolveJob(kind="solve", capture=owl, options=SolveOptions(method=Method.LAMBERT))).id)
     asset = client.jobs.wait(client.jobs.submit(ExportJob(kind="export", maps=job.id)).id)

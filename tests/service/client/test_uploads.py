@@ -38,6 +38,7 @@ def assert_equal_files(here: Path, there: Path) -> None:
         assert (here / name).read_bytes() == (there / name).read_bytes(), name
 
 
+@pytest.mark.long
 def test_a_capture_is_sent_once(client: Client, server: Server, between: Between, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     (capture / ".relit").mkdir()
@@ -54,6 +55,7 @@ def test_a_capture_is_sent_once(client: Client, server: Server, between: Between
     assert client.captures.upload(capture).id != first.id
 
 
+@pytest.mark.long
 def test_a_sequence_keeps_its_folders(client: Client, server: Server, tmp_path: Path):
     for step in ("001", "002"):
         write_capture(tmp_path / "walk" / step)
@@ -63,6 +65,7 @@ def test_a_sequence_keeps_its_folders(client: Client, server: Server, tmp_path: 
     assert_equal_files(tmp_path / "walk", kept(server, made.id))
 
 
+@pytest.mark.long
 def test_what_was_deleted_is_sent_anew(client: Client, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     made = []
@@ -74,6 +77,7 @@ def test_what_was_deleted_is_sent_anew(client: Client, tmp_path: Path):
     assert len(set(made)) == 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", [httpx2.WriteError, httpx2.ReadTimeout])
 def test_a_broken_upload_is_gone_on_with(client: Client, server: Server, between: Between, big: Path, error):
     offsets = []
@@ -145,6 +149,7 @@ def test_another_run_goes_on_where_one_was_broken_off(server: Server, key: str, 
     assert taken[0] > 0
 
 
+@pytest.mark.long
 def test_one_failure_stops_the_other_files(client: Client, between: Between, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     refused = threading.Event()
@@ -166,6 +171,7 @@ def test_one_failure_stops_the_other_files(client: Client, between: Between, tmp
     assert len(between.requests) > count
 
 
+@pytest.mark.long
 def test_a_capture_that_cannot_be_used_says_why(client: Client, tmp_path: Path):
     capture = write_capture(tmp_path / "ball")
     (capture / "000.exr").write_bytes(b"no image")
@@ -201,6 +207,7 @@ def test_files_that_cannot_be_sent(client: Client, tmp_path: Path):
     assert "again.exr" in [name for _, name in files_of(capture)]
 
 
+@pytest.mark.long
 def test_what_lies_on_the_server_is_registered(client: Client, server: Server):
     made = client.captures.register(f"{OWL}/")
     assert (made.name, made.state, made.registered) == ("owl", "ready", True)

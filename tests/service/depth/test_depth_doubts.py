@@ -73,6 +73,7 @@ def test_the_response_is_taken_off_digits(relit, tmp_path, light):
     assert (np.abs(maps.depth - light.depth)[maps.mask] > 5 * maps.sigma[maps.mask]).mean() < 0.01
 
 
+@pytest.mark.long
 def test_fog_is_no_surface(relit, tmp_path):
     """What shines through may be solved, and is right; the rest is kept beside it, and a sentence says why."""
     light = write_capture(tmp_path, World(shapes=ROOM.shapes, rig=RIG, fog=0.8, light=1.5, samples=2), GRAY)
@@ -84,6 +85,7 @@ def test_fog_is_no_surface(relit, tmp_path):
     assert maps.confidence[scattered].max() < 0.2
 
 
+@pytest.mark.long
 def test_a_mirror_is_doubted(relit, tmp_path):
     mirrors = World(samples=2, shapes=(Wall((0, 0, -1.6), (0.2, 0.1, 1), texture=0.3), Wall((0, -0.32, 0), (0, 1, 0), 0.5),
                                        Ball((0.0, -0.1, -1.2), 0.16, mirror=True)))
@@ -128,6 +130,7 @@ def test_most_pixels_refused_is_said(relit, tmp_path, light):
     assert maps.confidence[maps.mask].max() < 0.2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("patterns", [GRAY, kary_patterns(WIDTH, "column", base=3, reflected=False),
                                       (*binary_patterns(WIDTH, "column"), *binary_patterns(RIG.projector[1], "row", references=False)),
                                       (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())])

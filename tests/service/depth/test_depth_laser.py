@@ -44,6 +44,7 @@ def off_surface(points):
     return np.abs(-points[:, 2] - truth)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ambient", [True, False])
 def test_spots(relit, tmp_path, ambient):
     targets = [(0.01 * i, 0.01 * j, -1.3) for i in range(-4, 5, 2) for j in range(-3, 4, 2)]
@@ -58,6 +59,7 @@ def test_spots(relit, tmp_path, ambient):
     assert np.abs(maps.range[maps.mask] / maps.depth[maps.mask] - np.linalg.norm(rays, axis=-1)[maps.mask]).max() < 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("upright", [True, False])
 def test_a_sweep_of_stripes(relit, tmp_path, upright):
     write_lasers(tmp_path, SCENE, [plane(x, upright=upright) for x in np.linspace(-0.1, 0.1, 25)], width=1.2e-3, noise=0.005,
@@ -74,6 +76,7 @@ def test_a_sweep_of_stripes(relit, tmp_path, upright):
     assert 0.5 < np.median(np.abs(ratio)) / 0.6745 < 2
 
 
+@pytest.mark.long
 def test_a_dense_sweep_fills_the_map(relit, tmp_path):
     scene = make_scene(sphere=False, camera=CAMERA)
     write_lasers(tmp_path, scene, [plane(x) for x in np.linspace(-0.02, 0.02, 40)], width=1.2e-3, camera=CAMERA)

@@ -94,6 +94,7 @@ def test_counts_in_other_units_have_the_same_sigma(plain, factor, tmp_path):
     assert declared.warnings == ()
 
 
+@pytest.mark.long
 def test_smoothed_histograms_are_told(tmp_path):
     counts = tof.histogram(VIEW, 1500, background=3.0, seed=4)
     smooth = 0.5 * counts + 0.25 * np.roll(counts, 1, axis=2) + 0.25 * np.roll(counts, -1, axis=2)
@@ -120,6 +121,7 @@ def test_nothing_that_a_plain_decode_finds_is_refused(background, plain, tmp_pat
     is_calibrated(ratios(default, view))
 
 
+@pytest.mark.long
 def test_empty_walls_do_not_appear(tmp_path):
     """Half of the image has a return, the other half background alone: one pixel in some hundreds of it may count as solved."""
     counts = np.random.default_rng(5).poisson(0.5, (72, 96, 64)).astype(float)
@@ -157,6 +159,7 @@ def test_light_of_the_camera_itself_is_no_surface(tmp_path):
     assert result.maps.mask.mean() > 0.9
 
 
+@pytest.mark.long
 def test_rows_that_disagree_in_turn_are_unsure(tmp_path):
     """Every second row of the left half was recorded five bins late."""
     counts = tof.histogram(VIEW, 9000, seed=9)

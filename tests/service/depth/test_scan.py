@@ -69,6 +69,7 @@ def test_the_asset_is_a_component_without_a_finding(tmp_path):
     assert [(i.severity.name, i.message) for i in nvidia.ValidationEngine().validate(str(result.usd_path)).issues()] == []
 
 
+@pytest.mark.long
 def test_waveforms_give_several_returns(tmp_path):
     n = 200
     view = View(np.linspace(2, 6, n)[None], np.full((1, n), 0.9), np.ones((1, n)))
@@ -135,6 +136,7 @@ def test_las_without_laspy_says_what_to_install(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_the_command_prints_where_everything_is(tmp_path):
     write(tmp_path, ring())
     command = [sys.executable, "-m", "service.cli.main", "scan", str(tmp_path), "--out", str(tmp_path / "o"), "--las",

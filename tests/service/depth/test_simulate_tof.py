@@ -18,6 +18,7 @@ def scene(folder):
     return maps
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "options", "most_m"), [
     ("cw", ["--modulation-hz", "20e6,80e6", "--no-noise"], 1e-4), ("cw", ["--phases", "3", "--full-well", "1e6"], 0.03),
     ("pulsed", ["--no-noise"], 2e-3), ("pulsed", ["--signal-photons", "40000", "--pulses", "20000"], 0.1),

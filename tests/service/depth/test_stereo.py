@@ -50,6 +50,7 @@ def pixels_off(maps, truth):
         return CAMERA.focal * np.linalg.norm(POSE[:3, 3]) * (1 / maps.depth - 1 / truth)
 
 
+@pytest.mark.long
 def test_a_tilted_plane_and_a_sphere(relit, tmp_path):
     left, right, visible = seen("plane and sphere")
     maps, report = solve(relit, write(tmp_path, left.images, right.images, gain=0.6))
@@ -64,6 +65,7 @@ def test_a_tilted_plane_and_a_sphere(relit, tmp_path):
     assert abs(facts["baseline_m"] - np.linalg.norm(POSE[:3, 3])) < 1e-6
 
 
+@pytest.mark.long
 def test_half_hidden_places_are_refused(relit, tmp_path):
     left, right, visible = seen("one before the other")
     maps, _ = solve(relit, write(tmp_path, left.images, right.images))
@@ -87,6 +89,7 @@ def test_a_regular_grid_of_dots_is_refused(relit, tmp_path):
     assert outcome.code == 2 and "a repeating pattern does not tell depth" in outcome.err
 
 
+@pytest.mark.long
 def test_dark_and_bare_parts_are_refused(relit, tmp_path):
     left, right, _ = seen("dark and bare")
     images = [np.where(np.arange(CAMERA.width) > 240, 0.2, each) for each in (left.images, right.images)]  # bare on the right

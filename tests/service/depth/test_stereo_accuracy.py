@@ -105,6 +105,7 @@ def test_thin_parts_are_right_or_refused(relit, tmp_path, textures):
     assert (maps.mask & (off > 1)).sum() < 0.005 * maps.mask.sum()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pose", [ABOVE, TO_THE_LEFT], ids=["above", "to the left"])
 def test_the_other_camera_may_stand_anywhere_aside(relit, tmp_path, pose):
     left, right = pair((WALL, BALL), 1, 3, pose)
@@ -168,6 +169,7 @@ def test_geometry_and_reflectance_of_one_moment(relit, tmp_path):
     assert both.mean() > 0.7 and after < before
 
 
+@pytest.mark.long
 def test_bands_of_rows_agree_with_the_whole_image(relit, tmp_path, monkeypatch):
     left, right = pair((WALL, BALL))
     folder = scenes.write_pair(tmp_path, recorded(left, 14), recorded(right, 15))

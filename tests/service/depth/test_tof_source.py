@@ -75,6 +75,7 @@ def test_near_and_far_are_ranges_from_the_camera(tmp_path):
     assert (truth > 1.32).any() and (truth < 1.28).any()
 
 
+@pytest.mark.long
 def test_histograms_with_a_source(tmp_path):
     truth = scene()[0]
     counts = tof.histogram(view(), 4000, bins=40, bin_s=0.5e-9, sigma_s=0.4e-9, background=0.1, seed=4)
@@ -83,6 +84,7 @@ def test_histograms_with_a_source(tmp_path):
     assert maps.mask.mean() > 0.99 and np.abs(np.mean(error)) < 3e-4  # 2.5 mm too far without the source
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["cw", "pulsed"])
 def test_what_is_simulated_is_solved_again(kind, tmp_path, relit):
     camera = Camera.model_validate(CAMERA)

@@ -129,6 +129,7 @@ def test_any_name_makes_an_asset(tmp_path, name):
     assert root.GetName().isascii()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stem", ["フクロウ 1", "a[1]", "a@b", "a#b%20", "{geo=mesh}"])
 @pytest.mark.parametrize("suffix", [".usda", ".usdz"])
 def test_any_file_name_makes_an_asset_that_finds_its_files(tmp_path, suffix, stem):

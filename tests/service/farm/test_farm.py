@@ -77,6 +77,7 @@ def test_frames_of_a_farm_are_those_of_one_run(relit, shots, monkeypatch):
     assert (shots / "some cache").is_dir()
 
 
+@pytest.mark.long
 @needs_openjd
 def test_a_task_that_fails_fails_the_job(relit, shots, monkeypatch):
     monkeypatch.chdir(shots)

@@ -40,6 +40,7 @@ def test_points_on_a_line_are_no_circle(points):
         fit_circle(points)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize(("binary", "tolerance_px"), [(False, 0.02), (True, 0.05)])
 def test_a_ball_from_its_mask(name, binary, tolerance_px):

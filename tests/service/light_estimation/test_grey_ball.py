@@ -98,6 +98,7 @@ def test_balls_that_show_nothing():
         fit_direction(0 * image, None, view)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 @pytest.mark.parametrize(("declared", "recorded_as", "named"), [
     ("lin_rec709_scene", "lin_rec709_scene", None), ("srgb_texture", "srgb_texture", None),

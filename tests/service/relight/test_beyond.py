@@ -79,6 +79,7 @@ def test_the_share_of_such_light_is_said(relit, scene, tmp_path):
         assert share == pytest.approx(100, abs=2)
 
 
+@pytest.mark.long
 def test_nothing_is_said_where_the_light_was_captured(relit, tmp_path):
     write_dome(tmp_path / "cap", SURFACE, directions=LIGHTS)
     sky(tmp_path, 25)

@@ -99,6 +99,7 @@ def test_bad_maps_are_a_sentence(relit, scene, tmp_path):
         assert not (tmp_path / "f.1.exr").exists()
 
 
+@pytest.mark.long
 def test_a_finished_range_is_the_undisturbed_one_to_the_last_bit(relit, scene, tmp_path, monkeypatch):
     """Frames of a range that are made later, among others, are the same: plain in all weightings, and guided."""
     monkeypatch.setattr("kernels.relight.directions.latlong.SAMPLE_PITCH_DEGREES", 4.0)  # bits are compared: few samples show it as well

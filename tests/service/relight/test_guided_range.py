@@ -66,6 +66,7 @@ def keys(folder, **content):
     return "--keys", folder / "keys.json"
 
 
+@pytest.mark.long
 def test_frames_are_those_made_alone(relit, scene, tmp_path):
     """Under a turning and tilting environment, a small disc and a wide one, and a captured image. Alone, a frame takes the environment as
     1024 samples; in a range it is spread over a grid. Each is within a few parts in a thousand of very many samples."""
@@ -151,6 +152,7 @@ def test_directions_behind_all_pixels_of_a_portion_are_left_out(relit, scene, tm
         np.testing.assert_allclose(frames[number], every[number], rtol=2 * HALF, atol=1e-5)
 
 
+@pytest.mark.long
 def test_small_lights_of_few_frames_at_a_time_light_alike(relit, scene, tmp_path, monkeypatch):
     """The horizons of a perspective camera and of lights far apart differ where they are interpolated, at the edges of few shadows."""
     together = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--spin-degrees", "20")

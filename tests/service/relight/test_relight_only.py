@@ -49,6 +49,7 @@ def sky(path):
     return write_exr(path, np.random.default_rng(5).random((16, 32, 3)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [
     ("--spin-degrees", "360"), ("--spin-degrees", "77", "--weights", "smooth", "--color-space", "lin_ap1_scene", "--aov", "mask"),
 ], ids=["kernel", "smooth"])

@@ -44,6 +44,7 @@ def large(monkeypatch):
     monkeypatch.setattr(combine, "BLOCK_BYTES", 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [
     (), ("--compression", "piz", "--exposure", "1", "--color-space", "lin_ap1_scene"), ("--compression", "dwaa"),
     ("--aov", "mask", "--matte", "soft"), ("--aov", "lights"),

@@ -43,6 +43,7 @@ def rotation_onto(a, b):
     return rotation_about(np.cross(a, b), np.degrees(np.arccos(np.clip(a @ b, -1, 1)))) if abs(a @ b) < 1 else np.eye(3) * (a @ b)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows, cols", [(90, 180), (64, 128), (720, 1440), (1, 1), (2, 1), (1, 700)])
 @pytest.mark.parametrize("direction", [cap(50, 180), cap(96, 90), STAGE], ids=["around", "half", "rings"])
 def test_a_constant_map_is_shared_out_whole(rows, cols, direction, device):
@@ -110,6 +111,7 @@ def test_shares_reproduce_the_direction(direction, device):
         np.testing.assert_allclose(got / np.linalg.norm(got, axis=1, keepdims=True), place, atol=SHARE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows, cols, seed", [(7, 14, None), (16, 32, 1), (360, 720, 2)])
 def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     """With the same samples, triangles by trying all threes of lights, and shares by inversion."""
@@ -150,6 +152,7 @@ def test_a_sun_moves_without_a_jump(seed, device):
     assert bound / 2 < np.abs(np.diff(got, axis=0)).max() < bound + SHARE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", [DOME, STAGE, RINGS, cap(96, 90), cap(331, 60), scattered(50, 3), cap(4, 50), cap(50, 20)],
                          ids=["dome", "stage", "rings", "half", "front", "any", "four in front", "narrow"])
 def test_a_sun_moves_without_a_jump_where_lights_are_missing_too(direction, device):
@@ -160,6 +163,7 @@ def test_a_sun_moves_without_a_jump_where_lights_are_missing_too(direction, devi
         assert fine < 0.2 * coarse
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", [cap(40, 180), STAGE, CUBE, cap(96, 90), cap(331, 60)],
                          ids=["even", "rings", "cube", "half", "front"])
 @pytest.mark.parametrize("seed", range(2))

@@ -69,6 +69,7 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     assert not [warning for warning in joined.warnings if warning.startswith("normals:")]
 
 
+@pytest.mark.long
 def test_normals_of_another_surface_are_refused(tmp_path):
     scene = SCENES["disc"]
     shots = fan(scene, count=5, side=(80, 80), sigma=DEPTH_SIGMA)

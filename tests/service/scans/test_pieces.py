@@ -70,6 +70,7 @@ def test_an_exception_of_the_progress_ends_the_work(tmp_path):
     assert not made.counts
 
 
+@pytest.mark.long
 def test_a_registration_that_was_interrupted_goes_on(tmp_path, monkeypatch):
     """Half of the pairs are there, and no scan is prepared again."""
     folder = write(tmp_path / "set", views(figure, 0, 40, 80))

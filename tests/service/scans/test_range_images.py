@@ -20,6 +20,7 @@ def mapped_mib() -> float:
     return next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if line.startswith("RssFile")) / 1024
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not STATUS.exists(), reason="memory is told by /proc")
 def test_what_is_released_leaves_memory_and_can_be_read_again(tmp_path):
     file, listed = read_scan_set(write_scans(tmp_path / "scans", turntable(2, SHAPE[::-1])))

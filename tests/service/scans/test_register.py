@@ -65,6 +65,7 @@ def table_of(seen: tuple[View, ...], *angles: float, **further) -> dict:
                           **further}}
 
 
+@pytest.mark.long
 def test_scans_without_poses_come_together(relit, tmp_path):
     seen = views(figure, 0, 30, 60, 100, 150)
     outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
@@ -127,6 +128,7 @@ def test_a_fixed_turntable_is_kept_and_checked(relit, tmp_path):
     assert "s1 and s2: their surfaces ask for poses that are" in outcome.out + outcome.err
 
 
+@pytest.mark.long
 def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
     seen = views(vase, 0, 40, 80)
     outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")

@@ -52,6 +52,7 @@ def test_the_error_at_rest_falls_by_the_root_of_the_steps():
         assert sigma == pytest.approx(mean, rel=0.15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("speed", [0.02, 0.05, 0.1, 0.2, 0.5, 1, 3, 10])
 @pytest.mark.parametrize("declared", [1.0, 4.0])
 def test_no_motion_makes_the_mean_worse_than_a_step_alone(speed, declared):

@@ -51,6 +51,7 @@ def moving(tmp_path_factory):
     return folder / "out", moments, ~grown(changing, 8), result
 
 
+@pytest.mark.long
 def test_what_is_at_rest_is_joined_over_all_steps(moving):
     """The error falls by the root of the steps. Errors of `robust` that all steps share leave 1.10 of that in the plain mean of seven, and
     the 1 to 2 % of the pixels that begin anew in a step, which are those with the largest errors, up to 1.29."""
@@ -102,6 +103,7 @@ def test_the_reports_say_what_was_joined(moving):
     assert files_in(out / "step00") == {"maps.exr", "report.json", "alone/maps.exr", "alone/report.json", "alone/step.json"}
 
 
+@pytest.mark.long
 def test_a_cut_carries_nothing_over(tmp_path):
     moments = write_sequence(tmp_path / "in", [None] * 6, cut=3, noise=NOISE)
     solve_sequence(request(tmp_path))
@@ -143,6 +145,7 @@ def test_intensities_of_the_first_step_are_those_of_all(tmp_path):
     assert solve_sequence(request(tmp_path)).kept == 3
 
 
+@pytest.mark.long
 def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
     write_sequence(tmp_path / "in", [None] * 3, noise=NOISE, size=24)
     solved, whole = [], one_step.solve

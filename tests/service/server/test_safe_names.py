@@ -78,6 +78,7 @@ def test_the_reason_is_named(path, reason):
     assert any(word in str(refused.value) for word in reason.split("|"))
 
 
+@pytest.mark.long
 def test_a_name_is_shown_so_that_it_does_no_harm():
     assert shown("plain näme.exr") == '"plain näme.exr"'
     assert shown("a\nb\u202ec\0") == '"a\\nb\\u202ec\\x00"'

@@ -158,6 +158,7 @@ def test_a_port_of_the_database_that_is_no_number_is_one_sentence(tmp_path):
         open_database(settings, prepare)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("arguments", "words"), [
     (["--data", "FILE", "--port", "0"], "data FILE: the folder cannot be used (File exists)"),
     (["--data", "NEW", "--port", "PORT"], "cannot listen on host 127.0.0.1, port PORT: Address already"),

@@ -23,6 +23,7 @@ def scene():
     return captures.make_scene(size=24, lights=14)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [Method.ROBUST, Method.SVBRDF])
 def test_a_light_that_points_elsewhere_is_named(tmp_path, scene, method):
     folder = captures.write_capture(tmp_path / "capture", scene)

@@ -48,6 +48,7 @@ SCALED = SCENE.images / SCENE.images.max()
 TURN = np.radians(137)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [Method.LAMBERT, Method.ROBUST])
 @pytest.mark.parametrize("scene", [SCENE, ellipsoid(count=6), ellipsoid(count=4), ellipsoid(largest_degrees=25), ellipsoid(hollow=True),
                                    ellipsoid(count=6, hollow=True), make_scene(size=48, lights=9)],
@@ -60,6 +61,7 @@ def test_a_right_manifest_keeps_its_confidence(tmp_path):
     assert confidence(solved(tmp_path, SCENE)) > SURE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("matrix", "words"), [
     (np.diag([1, -1, 1]), "with y negated"),
     (np.diag([-1, 1, 1]), "with x negated"),
@@ -85,6 +87,7 @@ def test_the_standard_error_of_mirrored_normals_is_the_error_that_they_have(tmp_
     assert np.median(error / result.maps.sigma[mask]) == pytest.approx(1, abs=0.05)  # noise alone, under two degrees of forty
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("scene", "changes", "words"), [
     (SCENE._replace(irradiance=np.ones_like(SCENE.irradiance)), {},
      "frames[].light.irradiance: it is missing or wrong (every"),

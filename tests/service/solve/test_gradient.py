@@ -55,6 +55,7 @@ def solve(relit, folder, *arguments):
     return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
+@pytest.mark.long
 def test_polarised_frames_give_both_normals(relit, tmp_path, diffuse, highlight):
     write(tmp_path, {"cross": diffuse / 2, "parallel": diffuse / 2 + highlight})
     maps, report = solve(relit, tmp_path, "--method", "gradient")

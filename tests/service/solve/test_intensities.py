@@ -76,6 +76,7 @@ def test_right_intensities_stay(tmp_path):
     assert np.median(error) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lights", [8, 14])
 def test_undeclared_intensities_do_no_harm_to_robust_normals(tmp_path, lights):
     """Lights that are all declared alike, though they differ by half: the manifest is still said to be wrong."""

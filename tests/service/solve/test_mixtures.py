@@ -46,6 +46,7 @@ def rgb(path, layer=""):
     return np.stack([channels[layer + c].astype(np.float64) for c in "RGB"], axis=-1)
 
 
+@pytest.mark.long
 def test_a_highlight_on_the_border_of_metal_and_paint(relit, capture, tmp_path):
     """A near light whose highlight lies on the border. With one lobe a pixel the relative error there is 0.11, with two 0.05.
     Tolerance: noise of the gold that pixels share, and the height that the solved normals give."""

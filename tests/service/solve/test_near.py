@@ -38,6 +38,7 @@ def assert_solved(maps, dome, *, angle: float, albedo: float):
     assert (np.abs(maps.diffuse_albedo / dome.albedo - 1)[dome.mask] < albedo).all()
 
 
+@pytest.mark.long
 @DOMES
 @pytest.mark.parametrize("method", ["lambert", "robust"])
 def test_height_at_1_3_radii_where_distant_lights_make_a_bowl(relit, tmp_path, dome, method):
@@ -54,6 +55,7 @@ def test_height_at_1_3_radii_where_distant_lights_make_a_bowl(relit, tmp_path, d
     assert np.sqrt((height_error(maps, dome) ** 2).mean()) > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dome", [SMALL, SMALL_PERSPECTIVE], ids=["orthographic", "perspective"])
 def test_the_general_solver(relit, tmp_path, dome):
     near_lights.write(tmp_path, dome, lamps(dome, 48, RADII))
@@ -103,6 +105,7 @@ def test_near_and_distant_lights_together(relit, tmp_path, dome):
     assert_solved(maps, dome, angle=0.05, albedo=0.003)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["lambert", "robust", "svbrdf"])
 def test_lamps_at_a_thousand_radii_are_distant_lights(relit, tmp_path, method):
     """Their directions over the object differ by 0.06 degrees and their irradiance by 0.2 %."""
@@ -117,6 +120,7 @@ def test_lamps_at_a_thousand_radii_are_distant_lights(relit, tmp_path, method):
     assert np.allclose(maps.diffuse_albedo[maps.mask], distant.diffuse_albedo[maps.mask], rtol=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("device", devices.names())
 def test_every_device_and_a_rim_that_few_lamps_reach(relit, tmp_path, device):
     """Pixels without three lamps stay unsolved, and do not pull the others away."""

@@ -27,6 +27,7 @@ def step_error(maps, shot):
     return (error[0] - error[1]) / np.ptp(points[:, :2], axis=0).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [0.1, 0.6])
 @pytest.mark.parametrize("distance", [None, 4.0])
 def test_a_ball_stands_as_far_before_a_body_as_its_shadows_say(gap, distance, tmp_path):
@@ -80,6 +81,7 @@ def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_pat
     assert 0.9 < report["parts"][1]["pixels"] / (shot.part == 0).sum() < 1.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slope", [0.6, 0.8])
 def test_no_part_is_placed_by_the_shadows_of_one_that_has_no_place(slope, tmp_path):
     """A ring far before a body, and the piece of the body in its hole. No shadow tells where the ring is.
@@ -102,6 +104,7 @@ def test_an_object_without_a_break_has_no_parts(tmp_path):
     assert maps.part is None and report["parts"] == [] and report["warnings"] == []
 
 
+@pytest.mark.long
 def test_metal_before_metal_is_placed_by_svbrdf(tmp_path):
     """Bare metal is dark wherever it does not mirror a light: that is no shadow, and a highlight in shadow is none either."""
     parts = [Part((0.1, 0.15, 0.8), (0.3, 0.3, 0.3), albedo=(0.0, 0.0, 0.0), f0=(0.9, 0.7, 0.4), roughness=0.45),

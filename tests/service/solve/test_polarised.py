@@ -45,6 +45,7 @@ def error(maps, name):
     return angles_degrees(maps.normal, SCENE.surface.normal)[SCENE.of(name)]
 
 
+@pytest.mark.long
 def test_svbrdf_finds_every_material(found):
     """Noise of 1 % under 36 lights turns normals by 0.1°; tolerances are twice what was measured."""
     result, report = found
@@ -69,6 +70,7 @@ def test_errors_are_those_that_sigma_says(found):
     assert np.mean(ratio > 3) < 0.02
 
 
+@pytest.mark.long
 def test_a_metal_has_no_albedo_even_where_nobody_declares_the_leak(tmp_path, found):
     """2 % that leak of F₀ 0.9 look like an albedo of 0.04 · 0.9, which the leak's bound in the report tells."""
     where = SCENE.of("metal")
@@ -138,11 +140,13 @@ def test_what_is_refused(tmp_path, leaking):
     assert not (swapped / "out").exists()
 
 
+@pytest.mark.long
 def test_too_much_leak_is_said(tmp_path):
     result, _ = solved(write_polarised(tmp_path, SCENE, leak=0.005, declared=0.05, noise=NOISE))
     assert any("polarizer_leak: is 0.05" in sentence for sentence in result.warnings)
 
 
+@pytest.mark.long
 def test_near_lights(tmp_path):
     """Glossy ripples under lamps at 1.3 radii: half rounding and the part not yet settled leave 0.1°."""
     dome = near_lights.dome(32)

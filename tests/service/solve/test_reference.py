@@ -96,6 +96,7 @@ def chrome(normal: np.ndarray) -> np.ndarray:
     return np.maximum(normal @ half.T, 0) ** 60 * (normal @ DIRECTIONS.T > 0) + 1e-3
 
 
+@pytest.mark.long
 def test_a_ball_of_another_material_is_named_and_widens_sigma(relit, captures):
     write(captures / "ball", *surface(140, 1.0), 0.5, shade=chrome)
     outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
@@ -113,6 +114,7 @@ def test_a_ball_of_another_material_is_named_and_widens_sigma(relit, captures):
     assert maps.confidence[mask].max() < 0.5
 
 
+@pytest.mark.long
 def test_the_right_ball_raises_no_alarm_under_noise(relit, captures):
     for folder, shape in (("object", surface(SIDE, 0.6)), ("ball", surface(140, 1.0))):
         write(captures / folder, *shape, 0.5, noise=0.02)
@@ -127,6 +129,7 @@ def test_the_right_ball_raises_no_alarm_under_noise(relit, captures):
     assert np.median(maps.confidence[inner]) > 0.6
 
 
+@pytest.mark.long
 def test_what_is_not_estimated_is_absent(relit, captures):
     solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
     channels, _ = exr.read(captures / "out" / "maps.exr")

@@ -114,6 +114,7 @@ def test_info_counts_them_and_finds_no_fault(relit, tmp_path, half_painted):
     assert outcome.code == 0 and f"{LIGHTS} extended light" in outcome.out
 
 
+@pytest.mark.long
 def test_dark_pixels_have_a_status(relit, tmp_path, half_painted):
     radiance = half_painted.copy()
     radiance[:5] = 0

@@ -45,6 +45,7 @@ def by_declaration(tmp_path_factory):
     return found
 
 
+@pytest.mark.long
 def test_the_scale_is_found_and_reported(by_declaration):
     _, _, report = by_declaration["relative"]
     assert report["inputs"]["irradiance_scale"] == "relative"

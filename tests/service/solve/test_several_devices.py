@@ -78,6 +78,7 @@ CAPTURES = [(distant, "lambert"), (distant, "robust"), (distant, "svbrdf"), (nea
             pytest.param(polarised, None, marks=pytest.mark.long)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("write", "method"), CAPTURES, ids=lambda value: getattr(value, "__name__", value or "-"))
 def test_maps_and_findings_are_the_same_to_the_last_bit(tmp_path, small_pieces, monkeypatch, write, method):
     if write in (extended, with_ball):

@@ -130,6 +130,7 @@ def shared_solve(request: dict, out: Path, store: Store) -> tuple[Path, Counting
     return result.maps_path, progress
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("write", "method"), CAPTURES, ids=lambda value: getattr(value, "__name__", value or "-"))
 def test_two_workers_find_the_same_to_the_last_bit_as_one(tmp_path, small_pieces, monkeypatch, write, method):
     if write in (extended, with_ball):
@@ -158,6 +159,7 @@ def test_an_object_that_throws_light_on_itself(tmp_path, small_pieces):
     assert store.done_by("one") and store.done_by("two")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["lambert", "svbrdf"])
 def test_a_worker_that_begins_again_does_only_what_is_left(tmp_path, small_pieces, method):
     """As one that takes over: finished pieces are read, claims of the dead count no more, and broken files are done again."""

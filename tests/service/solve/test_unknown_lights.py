@@ -42,6 +42,7 @@ def glossy(tmp_path_factory):
     return scene, *solved(tmp_path_factory.mktemp("glossy"), scene)
 
 
+@pytest.mark.long
 def test_highlights_tell_normals_without_lights(glossy):
     scene, _, report, error = glossy
     told = report["found"]["unknown_lights"]
@@ -78,6 +79,7 @@ def test_a_matt_object_of_one_albedo_is_told_by_it_and_doubted(tmp_path):
     assert any("no highlights" in warning for warning in result.warnings)
 
 
+@pytest.mark.long
 def test_lights_that_are_placeholders_are_no_bracket_and_choose_svbrdf(tmp_path):
     scene = shiny(ellipsoid(size=40, count=LIGHTS), (0.45, 0.6), 0.08)
     _, report, error = solved(tmp_path, scene, None)

@@ -31,6 +31,7 @@ def written(tmp_path_factory) -> list[dict]:
     return [View(folder / name).facts for name in "ab"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("title", "of"), [
     ("key", lambda facts: [facts]), ("key of `layers[]`", lambda facts: facts["layers"]),
     ("key of `frames[]`", lambda facts: facts["frames"]), ("key of `relight`", lambda facts: [facts["relight"]]),

@@ -57,6 +57,7 @@ def inside(found: View) -> np.ndarray:
     return found.block(facts["matte"], "u1", facts["rows"], facts["cols"]) == 255
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("terms", [3, 8, LIGHTS])
 def test_a_captured_image_comes_back_with_the_error_that_is_said(folder, terms):
     found = show(folder, terms=terms)

@@ -186,6 +186,7 @@ def test_what_is_refused(relit, tmp_path, words, sentence):
     assert files_in(tmp_path / "out") == set()
 
 
+@pytest.mark.long
 def test_a_run_again_replaces_and_an_interrupted_one_leaves_no_view(tmp_path, monkeypatch):
     """view.json is written last and taken away first: it never describes other blocks."""
     write_dome(tmp_path / "cap", dome(), lights=8)

@@ -19,6 +19,7 @@ tangential = st.floats(-0.005, 0.005)
 plane = st.floats(-0.5, 0.5)
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(k=st.tuples(coefficient, coefficient, coefficient), p=st.tuples(tangential, tangential), x=plane, y=plane)
 def test_undo_is_the_inverse_of_apply(k, p, x, y):

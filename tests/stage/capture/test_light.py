@@ -11,6 +11,7 @@ from stage.capture.light import DistantLight, ExtendedLight, Light, PointLight
 component = st.floats(-1e6, 1e6).filter(lambda c: c == 0 or abs(c) > 1e-6)
 
 
+@pytest.mark.long
 @settings(deadline=None)
 @given(st.tuples(component, component, component).filter(any))
 def test_direction_is_kept_with_length_one(vector):

@@ -47,6 +47,7 @@ def test_negative_zero_is_zero():
     check_radiance("a.exr", np.full((1, 1, 3), -0.0, np.float32))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("filtered", [False, True])
 @pytest.mark.parametrize("seed", range(2))
 def test_noise_around_zero_is_kept(seed, filtered):

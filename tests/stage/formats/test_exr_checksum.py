@@ -11,6 +11,7 @@ PARTS = [exr.Part(name, {f"{name}.{channel}": np.arange(30, dtype=np.float16).re
          for name in ("one", "two")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("parts", [PARTS[:1], PARTS])
 def test_every_flipped_bit_is_found(tmp_path, parts):
     path = tmp_path / "a.exr"

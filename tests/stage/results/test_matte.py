@@ -43,6 +43,7 @@ def test_coverage_of_a_hard_mask_is_estimated_from_the_images(tmp_path, options,
     assert set(np.unique(matte.factor)) == {0, 1}  # the images hold radiance times coverage already
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", [cv2.dilate, cv2.erode])
 def test_a_mask_that_is_a_pixel_off_has_the_same_coverage(tmp_path, change):
     scene = render_covered(size=64)
@@ -65,6 +66,7 @@ def test_a_rim_that_is_black_under_every_light_follows_the_mask(tmp_path):
     assert matte.coverage[whole].min() > 0.4 and matte.coverage[whole].mean() > 0.99  # the filter rounds the tip of the ellipse
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("blur_px", [1.2, 3.0])
 def test_an_object_out_of_focus_has_a_wide_border(tmp_path, blur_px):
     scene = render_covered(size=80, lights=16)
@@ -109,6 +111,7 @@ def test_partial_values_of_a_mask_are_the_coverage(tmp_path):
         assert np.abs(matte.factor - expected)[partly].mean() < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("background", [0.0, 0.4])
 @pytest.mark.parametrize("covered", [0.25, 0.625])
 def test_partial_values_without_a_pixel_of_the_background_alone(tmp_path, background, covered):

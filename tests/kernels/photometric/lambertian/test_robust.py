@@ -202,6 +202,7 @@ def test_every_pixel_is_solved_whatever_their_number(pixels, device):
     np.testing.assert_array_equal(part.albedo, whole.albedo[-pixels:])
 
 
+@pytest.mark.long
 def test_the_layout_of_cuda_gives_the_same():
     """Packs of four, one light after another: the kernel that CUDA runs, on the CPU."""
     radiance, direction, irradiance = noisy(64, 24, 0.03, 3)

@@ -45,6 +45,7 @@ def test_a_mirror_is_as_sure_as_its_errors_are_small(device, tables, sharpness):
     assert np.median(fit.confidence) > (0.8 if sharpness == WIDE else 0.5)
 
 
+@pytest.mark.long
 def test_a_mirror_that_sees_one_narrow_source_or_none_is_unsure(device, tables):
     """A mirror pixel reads one source 8 degrees wide at most: noise is all it has for the rest."""
     radiance = twin.mirror(NORMALS, VIEW, CENTRES, NARROWEST, f0=0.9)
@@ -57,6 +58,7 @@ def test_a_mirror_that_sees_one_narrow_source_or_none_is_unsure(device, tables):
     assert blind.sum() > 5 and (fit.sigma[blind] > 15).mean() > 0.8
 
 
+@pytest.mark.long
 def test_a_metal_between_narrow_sources_stays_right(device, tables):
     fit = solve(twin.ggx(NORMALS, VIEW, CENTRES, NARROWEST, alpha=0.25, f0=0.8), device, tables, NARROWEST, 0.01)
     error = angle_degrees(fit.normal, NORMALS)

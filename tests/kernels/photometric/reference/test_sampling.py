@@ -38,6 +38,7 @@ def ggx(alpha: float, f0: float, normal: np.ndarray = NORMALS, view: np.ndarray 
     return twin.ggx(normal, view, CENTRES, SHARPNESS, alpha=alpha, f0=f0)
 
 
+@pytest.mark.long
 def test_a_mirror(device, tables):
     fit = solve(mirror(0.9), device, tables)
     error = angle_degrees(fit.normal, NORMALS)
@@ -48,6 +49,7 @@ def test_a_mirror(device, tables):
     assert np.median(fit.confidence) > 0.8 and np.isfinite(fit.residual).all()
 
 
+@pytest.mark.long
 def test_a_painted_surface(device, tables):
     colour = np.array([0.7, 0.4, 0.1])
     fit = solve(LAMBERT[..., None] * colour, device, tables)
@@ -89,6 +91,7 @@ def test_brightness_scales_reflectance_alone(device, tables):
     assert np.allclose(2 * once.diffuse_albedo, twice.diffuse_albedo, atol=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("surface", ["mirror", "plastic"])
 def test_another_view_reads_the_same_table(device, tables, surface):
     """6 degrees off the table's view: a mirror is exact, a lobe to first order."""

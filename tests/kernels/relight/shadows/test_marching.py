@@ -44,6 +44,7 @@ def check(given, wanted, got, places, *, most, reach):
     return moved
 
 
+@pytest.mark.long
 @settings(max_examples=30, deadline=None)
 @given(count=st.integers(1, 200), seed=st.integers(0, 99), most=st.integers(1, 30), reach=st.floats(0.01, 3.0), part=st.floats(0, 1))
 def test_groups(count, seed, most, reach, part):

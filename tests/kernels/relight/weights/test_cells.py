@@ -39,6 +39,7 @@ def test_cells_are_the_polygons_of_spherical_voronoi(direction, device):
     assert (np.abs(cells.solid_angle[0] - areas) < BEND * 1.5 * np.sqrt(areas * (4 * np.pi - areas))).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", [AXES, CUBE, icosahedron(), dodecahedron(), ring(2, 0), ring(40, 0)],
                          ids=["octahedron", "cube", "icosahedron", "dodecahedron", "halves", "40 lunes"])
 @pytest.mark.parametrize("seed", [None, 0, 1])
@@ -51,6 +52,7 @@ def test_symmetric_lights_have_equal_cells(direction, seed, device):
     np.testing.assert_allclose(cells.solid_angle[0], equal, atol=BEND * 2 * np.pi + 4 * np.radians(1 / 32) ** 2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rows, cols, seed", [(7, 14, None), (16, 32, 1), (30, 20, 2)])
 def test_energies_are_those_of_the_twin(rows, cols, seed, device):
     """Which sends whole samples of a sixth of a degree or less to the nearest light."""

@@ -118,6 +118,7 @@ def test_an_empty_histogram_is_a_status_and_all_of_them_an_error(device):
         place(np.zeros((2, 64)), device)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma_s", [0.7e-9, 1.2e-9, 3e-9])
 def test_the_pulse_is_estimated(sigma_s, device):
     counts = tof.histogram(tof.room(24, 32), 20000, sigma_s=sigma_s, seed=5).reshape(-1, 64)
@@ -126,6 +127,7 @@ def test_the_pulse_is_estimated(sigma_s, device):
     assert estimate_pulse(histograms, counts).pulse.step == pytest.approx(truth.step, rel=0.06)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("photons", [6, 20])
 def test_few_photons_do_not_make_the_pulse_narrow(photons, device):
     """A time fitted to each histogram of n photons takes a part 1/n of their variance: 0.91 of the width at six, were it not counted in."""

@@ -43,6 +43,7 @@ def test_confidence_after_the_vote_is_no_less_than_the_share_of_right_peaks(devi
         assert part.sum() < 50 or (~right)[part].mean() <= 1.1 * (1 - voted.confidence[part]).mean() + 2e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("background", [0.02, 0.5, 5.0])
 def test_background_alone_makes_no_surface(background, device):
     counts = np.random.default_rng(2).poisson(background, (64, 64, BINS)).astype(float)
@@ -77,6 +78,7 @@ def test_residuals_beyond_photon_noise_are_measured(device):
     assert np.median(narrow) > 30
 
 
+@pytest.mark.long
 def test_pulses_are_counted_from_the_histograms(device):
     view = tof.room(24, 32)
     for pulses in (None, 800):

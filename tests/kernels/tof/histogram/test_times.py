@@ -98,6 +98,7 @@ def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, d
         assert 1.4826 * np.median(np.abs(part)) == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "photons", "pulses"), [(0.8, 8, None), (0.8, 100, None), (0.15, 12, None), (3.0, 40, None),
                                                                (0.8, 900, 300)])
 def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):

@@ -111,6 +111,7 @@ def test_levels_are_smaller_keep_their_border_and_stay_on_the_surface(camera):
         np.testing.assert_allclose(np.linalg.norm(level.normals, axis=1), 1, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(6))
 def test_levels_are_manifold(seed):
     rng = np.random.default_rng(seed)

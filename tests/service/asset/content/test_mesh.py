@@ -183,6 +183,7 @@ def test_a_coarser_mesh_bridges_neither_gap_nor_break_nor_hole():
         assert not (rows.min() <= 40 <= rows.max() and cols.min() <= 41 <= cols.max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("step", [1, 2, 3])
 @pytest.mark.parametrize("seed", range(8))
 def test_meshes_are_manifold(seed, step):

@@ -39,6 +39,7 @@ def test_full_disk_in_a_texture_leaves_no_trace(older, tmp_path, monkeypatch):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.long
 def test_a_disk_that_really_refuses(tmp_path):
     whole = write_asset(SURFACES["everything"], tmp_path / "whole.glb", name="A").path
     target = tmp_path / "out" / "a.glb"

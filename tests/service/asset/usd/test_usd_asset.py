@@ -65,6 +65,7 @@ def test_usd_validators_find_nothing(maps, suffix, tmp_path):
     assert [(e.GetName(), e.GetMessage()) for e in errors] == []
 
 
+@pytest.mark.long
 @every_suffix
 @every_surface
 def test_nvidia_validator_finds_no_failure(maps, suffix, tmp_path):
@@ -207,6 +208,7 @@ def test_failure_of_the_last_rename_brings_the_older_textures_back(ball, older, 
     assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
 def test_failure_of_any_rename_brings_both_older_folders_back(ball, older, tmp_path, monkeypatch):
     if older:

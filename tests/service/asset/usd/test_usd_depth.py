@@ -57,6 +57,7 @@ def opened(path, geo=None):
     return usd_stage
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("geometry", list(Geometry))
 @pytest.mark.parametrize("known", [True, False])

@@ -9,6 +9,7 @@ from stage.results.depth_maps import DepthMaps
 from tests.scenes.surfaces import make_ball
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
 def test_levels_are_variants_with_the_material_of_the_mesh(suffix, tmp_path):
     report = write_asset(make_ball(64), tmp_path / f"ball{suffix}", name="Ball", levels=2)

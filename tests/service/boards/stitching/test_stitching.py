@@ -116,6 +116,7 @@ def test_one_place_that_does_not_repeat_settles_pads_of_one_pitch():
     assert np.ptp(shift, axis=0).max() < 0.2 * PIXEL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("change", "words"), [
     (lambda views: [v if k != 3 else v._replace(height=v.height[:, ::-1]) for k, v in enumerate(views)], "tile t3: is mirrored"),
     (lambda views: [v._replace(told=(v.told[0] * 1e3, v.told[1] * 1e3)) for v in views],

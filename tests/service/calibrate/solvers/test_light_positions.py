@@ -42,6 +42,7 @@ def test_the_stated_uncertainty_is_that_of_many_trials():
     assert np.sqrt((np.array(error) ** 2).sum(axis=1).mean()) == pytest.approx(found.uncertainty, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("projection", "camera"), [
     ("orthographic", {"pixel_size": 0.001}), ("perspective", {"focal": 400.0})])
 def test_lights_near_two_rendered_balls(projection, camera):

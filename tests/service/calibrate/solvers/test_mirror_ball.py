@@ -31,6 +31,7 @@ def test_reflection_is_about_the_normal():
     assert angles_degrees(half, light) == pytest.approx(angles_degrees(light, viewer) / 2)  # the normal is half way, no more
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_directions_in_front(name):
     """A 60 px ball: 1 px is 1.9° of reflection. A spot of a dozen pixels has its centroid to 0.03 px, the outline's centre

@@ -99,6 +99,7 @@ def board_image(pose, device=CAMERA, oversample=3):
     return radiance.reshape(device.height, oversample, device.width, oversample).mean(axis=(1, 3))
 
 
+@pytest.mark.long
 def test_corners_are_found_below_a_pixel():
     pose = next(poses(1))
     found = find_corners(board_image(pose).astype(np.float32), BOARD)

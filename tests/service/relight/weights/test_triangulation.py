@@ -27,6 +27,7 @@ def planes(corners):
     return normal, (normal * corners[:, 0]).sum(axis=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("direction", LAYOUTS.values(), ids=LAYOUTS)
 @pytest.mark.parametrize("seed", [None, 0])
 def test_triangles_cover_the_sphere_once(direction, seed):

@@ -90,6 +90,7 @@ def found_in(kind: str, image: np.ndarray, scan: Scan) -> tuple[Target, ...]:
     return placed(board_in(image, BOARD) if kind == "board" else markers_in(image, kind), scan)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["board", "aruco4", "apriltag36h11"])
 def test_marks_place_scans_of_a_flat_wall(kind):
     """The wall has no shape: its marks alone give the poses, as wrong as they say."""

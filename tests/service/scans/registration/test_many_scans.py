@@ -57,6 +57,7 @@ def test_scans_are_thinned_to_a_bound(monkeypatch):
     assert shift < 1 * MM and turn < 0.2
 
 
+@pytest.mark.long
 def test_a_part_seen_from_near_is_joined_to_the_whole_where_it_has_a_start():
     """An arm alone, with pixels of 3 mm beside pixels of 8 mm."""
     views = seen(figure, 0, 30, 60, rows=160)

@@ -75,6 +75,7 @@ def test_errors_are_as_large_as_the_covariances_say():
     assert 2 < np.mean(squares) < 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [0.02 * MM, 2 * MM])
 def test_small_and_large_noise(sigma):
     views = seen(figure, 0, 40, sigma=sigma)
@@ -92,6 +93,7 @@ def test_point_sets_without_a_camera_come_together():
     assert len(wrong) == 3 and np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.2 * MM
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", list(SYMMETRIC))
 @pytest.mark.parametrize("known", [False, True], ids=["searched", "from starts"])
 def test_what_looks_the_same_after_a_motion_is_refused(name, known):
@@ -119,6 +121,7 @@ def test_a_handle_is_enough_where_the_start_is_near():
     assert np.degrees(np.linalg.norm(step[:3])) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("points_only", [False, True])
 def test_other_objects_and_other_sides_are_not_joined(points_only):
     for views in (seen(figure, 0) + seen(vase, 0), seen(figure, 0, 180)):

@@ -11,6 +11,7 @@ from tests.scenes.turntable import figure, pillar, urn, vase
 from tests.service.scans.registration.test_registration import jug, off, registered, scan_of, seen, statues
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("body", "alike"), [(figure, False), (vase, True), (jug, True), (urn, True), (pillar, True)])
 def test_a_body_is_known_by_what_it_looks_like_turned(body, alike):
     for view in seen(body, 0, 45, rows=80):
@@ -27,6 +28,7 @@ def test_a_body_joined_to_its_turned_self_is_named():
     assert found.alike_turned == (0, 1)
 
 
+@pytest.mark.long
 def test_a_statue_with_a_symmetric_body_is_named_and_a_figure_is_not():
     assert registered(statues(18, 120, (0, 1))).alike_turned == (0, 1)
     assert registered(seen(figure, 0, 40, rows=80)).alike_turned == ()

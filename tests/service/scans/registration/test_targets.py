@@ -53,6 +53,7 @@ def true_within(views: list[View], found: Registration) -> None:
         assert np.sqrt(np.trace(covariance[:3, :3])) < np.radians(0.1)
 
 
+@pytest.mark.long
 def test_a_vase_on_a_turntable_is_placed_by_targets_and_not_by_its_shape():
     views, scans = vases()
     with pytest.raises(ScanError, match="looks the same when it is turned about an axis"):

@@ -90,6 +90,7 @@ def problem(response: httpx2.Response) -> dict:
     return response.json()
 
 
+@pytest.mark.long
 def test_every_route_but_those_of_health_asks_for_a_key(site):
     with site.server.client() as client:
         for method, path in operations(site):
@@ -244,6 +245,7 @@ def test_the_numbers_name_no_project_and_no_identifier(site):
         assert word not in text
 
 
+@pytest.mark.long
 def test_a_service_without_keys_answers_this_machine(server, client):
     port = server.url.rpartition(":")[2]
     for host in ("localhost", f"localhost:{port}", "127.0.0.1", "127.5.0.1:80", f"[::1]:{port}"):

@@ -98,6 +98,7 @@ def test_studies_that_cannot_be(client):
     refused(ask(kind="inspect-board", capture=f"cap_{'0' * 20}", regions=REGIONS), 422, "regions are given without golden")
 
 
+@pytest.mark.long
 def test_boards_that_cannot_be(server, client, tile, tmp_path: Path):
     away = upload(server, client, tile | {"board.json": tile["board.json"].replace(b'"tile"', b'"../tile"')}, "refused")
     assert "leads out of the folder of the file" in away["problem"]

@@ -90,6 +90,7 @@ def greys(folder: Path = Path()) -> list[str]:
     return [str(folder / f"grey{number}.exr") for number in range(len(LEVELS))]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["dark", "flat-field", "white-balance", "saturation", "response"])
 def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_path, kind):
     here = Path(shutil.copytree(sensor, tmp_path / "cap"))
@@ -125,6 +126,7 @@ def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     compare(client, job, tmp_path, {"tof.json": "camera.json"}, {})
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("away", ["../../{other}/d0", "/etc", "d0/../../{other}/d0", "none"])
 def test_a_sweep_of_another_capture(server, client, tmp_path, away):
     """What it names beside its own captures may be of another project."""
@@ -217,6 +219,7 @@ def test_images_that_are_not_there(server, client, uploaded):
     refused(missing, 404, "captures: cap_00000000000000000000 is not in this project")
 
 
+@pytest.mark.long
 def test_the_brightness_of_lights(server, client, dome):
     job = submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
     finish(server, client, job)
@@ -227,6 +230,7 @@ def test_the_brightness_of_lights(server, client, dome):
     assert measured["options"]["capture"] == measured["capture"] == dome
 
 
+@pytest.mark.long
 def test_a_ball_that_is_not_given(server, client, dome):
     job = submit(client, kind="calibrate-mirror-ball", capture=dome)
     assert "ball" in finish(server, client, job, "failed")["error"]

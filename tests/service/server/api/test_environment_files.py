@@ -28,6 +28,7 @@ def test_an_uploaded_file_is_sent(server, client):
     assert answer.content == FILE.read_bytes() and 'filename="sky.exr"' in answer.headers["content-disposition"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["link", "gone"])
 def test_a_registered_file_that_became_a_link_is_not_sent(server, client, registered, tmp_path, how):
     file = registered / f"{how}.exr"

@@ -40,6 +40,7 @@ def watched(client: httpx2.Client, job: str, **headers: str) -> list[dict]:
         return [event for event in told(response.iter_lines()) if "comment" not in event]
 
 
+@pytest.mark.long
 def test_a_job_is_followed_to_its_end(server, client, dome, sky):
     job = client.post("/v1/jobs", json={"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-120"}}).json()
     found = watched(client, job["id"])

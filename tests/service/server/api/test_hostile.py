@@ -213,6 +213,7 @@ def test_fuzzed_images_through_uploads(server, client, tmp_path):
         assert ended["error"] is None or "001.exr" in ended["error"], ended["error"]
 
 
+@pytest.mark.long
 def test_a_registered_capture_that_changed_is_not_read(server, client, registered):
     folder = write_capture(registered / "changing")
     capture = client.post("/v1/captures", json={"name": "changing", "folder": str(folder)}).raise_for_status().json()["id"]

@@ -73,6 +73,7 @@ def test_bodies_that_are_no_request_are_refused(client, body):
     assert answer.json()["status"] == answer.status_code
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", [
     "../capture.json", "a/../../b", "/etc/passwd", "C:/x", "\\\\server\\share", "a\\b", "nul\0", "new\nline", "\u202egnp.exe",
     "zero\u200bwidth",

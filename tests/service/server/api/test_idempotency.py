@@ -48,6 +48,7 @@ def count(client: httpx2.Client) -> int:
     return len(client.get("/v1/jobs", params={"limit": 500, "state": "queued"}).json()["jobs"])
 
 
+@pytest.mark.long
 def test_the_same_request_again_is_the_same_job(client, capture):
     token = {"Idempotency-Key": new_id("test")}
     before = count(client)
@@ -156,6 +157,7 @@ def database(request, tmp_path) -> Iterator[Database]:
     made.close()
 
 
+@pytest.mark.long
 def test_at_once_on_either_database(database):
     together = threading.Barrier(AT_ONCE)
 

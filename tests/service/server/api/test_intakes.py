@@ -39,6 +39,7 @@ def test_a_registered_capture_is_checked_at_once_and_stays_where_it_lies(server,
     assert (folder / "capture.json").is_file()
 
 
+@pytest.mark.long
 def test_a_registered_capture_that_was_mended_is_checked_again(server, client, registered):
     folder = write_capture(registered / "mended")
     kept = (folder / "001.exr").read_bytes()
@@ -58,6 +59,7 @@ def test_a_sequence_of_captures_is_one(server, client, registered):
     assert (ready["facts"]["captures"], ready["facts"]["frames"]) == (2, 8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["captures", "environments"])
 def test_what_has_no_file_is_refused(server, client, kind):
     made = client.post(f"/v1/{kind}", json={"name": "empty"}).json()["id"]
@@ -73,6 +75,7 @@ def test_captures_are_listed_in_pages(client):
     assert all(item["id"].startswith("env_") for item in client.get("/v1/environments").json()["items"])
 
 
+@pytest.mark.long
 def test_a_capture_that_a_job_reads_is_not_deleted(server, client, registered):
     folder = write_capture(registered / "read")
     made = client.post("/v1/captures", json={"name": "read", "folder": str(folder)}).json()["id"]

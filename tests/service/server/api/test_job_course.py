@@ -7,6 +7,7 @@ import pytest
 from tests.service.server.api.job_calls import NOBODY, finish, has_made, made_by, refused, submit
 
 
+@pytest.mark.long
 def test_a_job_that_fails_says_why_and_is_tried_again(server, client, dome):
     job = submit(client, kind="depth", capture=dome)  # has lights, and no patterns
     failed = finish(server, client, job, "failed")
@@ -55,6 +56,7 @@ def test_a_cancelled_job_goes_on_with_what_is_done(server, client, dome, sky):
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == {path.name: path.read_bytes() for path in undisturbed.iterdir()}
 
 
+@pytest.mark.long
 def test_the_highest_priority_goes_first(server, client, long, dome):
     before = submit(client, **long, priority=100)
     has_made(client, before, 1)  # the worker is busy
@@ -77,6 +79,7 @@ def test_the_highest_priority_goes_first(server, client, long, dome):
     refused(client.patch(f"/v1/jobs/{raised['id']}", json={"priority": 1}), 409, "is succeeded")
 
 
+@pytest.mark.long
 def test_what_a_job_reads_stays_until_it_has_ended(server, client, long, solved):
     job = submit(client, kind="export", maps=solved, priority=0)
     if client.delete(f"/v1/jobs/{solved}").status_code == 204:
@@ -84,6 +87,7 @@ def test_what_a_job_reads_stays_until_it_has_ended(server, client, long, solved)
     finish(server, client, job)
 
 
+@pytest.mark.long
 def test_a_job_that_is_cancelled_and_deleted_while_it_runs_is_no_error_in_the_log(server, client, dome, sky):
     """DBOS wrote a traceback, since the workflow that it ends is not there any more."""
     job = submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-300"})["id"]
@@ -101,6 +105,7 @@ def texts(client: httpx2.Client, job: dict) -> list[str]:
     return [f"{entry['attempt']} {entry['text']}" for entry in entries]
 
 
+@pytest.mark.long
 def test_the_log_says_what_happened(server, client, dome, long):
     solved = finish(server, client, submit(client, kind="solve", capture=dome, options={"method": "lambert"}))
     found = texts(client, solved)

@@ -11,6 +11,7 @@ from service.server.database.engine import storable
 from tests.service.server.api.job_calls import NOBODY, finish, refused, submit
 
 
+@pytest.mark.long
 def test_what_a_job_reads_has_to_be_there_and_ready(server, client, dome, sky, solved, rig):
     receiving = client.post("/v1/captures", json={"name": "to come"}).raise_for_status().json()["id"]
     waiting = submit(client, kind="depth", capture=rig)

@@ -2,9 +2,12 @@
 
 import zlib
 
+import pytest
+
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 
 
+@pytest.mark.long
 def test_a_pipeline_solves_exports_and_relights(server, client, dome, sky):
     job = submit(client, kind="pipeline", capture=dome, environment=sky, solve={"method": "lambert"},
                  relight={"frames": "1-3", "spin_degrees": 360})
@@ -34,6 +37,7 @@ def test_an_export_brings_lights_along(server, client, dome, sky, solved):
     assert rig.content.count(b"def DistantLight") >= 4
 
 
+@pytest.mark.long
 def test_a_depth(server, client, rig):
     job = submit(client, kind="depth", capture=rig, options={"normals": True, "max_residual_px": 2.5}, name="the rig")
     assert (job["request"]["name"], job["request"]["options"]["max_residual_px"]) == ("the rig", 2.5)
@@ -45,6 +49,7 @@ def test_a_depth(server, client, rig):
     assert made_by(client, exported) == {"asset.usdc", *layers, "asset_textures/base_color.png"}
 
 
+@pytest.mark.long
 def test_a_relight_guided_by_maps_and_lit_by_keys(server, client, dome, solved):
     keys = {"schema": "relit.keys/1", "lights": [{"name": "sun", "keys": [
         {"frame": 3, "direction": [0, 0, 1], "irradiance": [1, 1, 1]}, {"frame": 5, "direction": [0.5, 0, 1], "irradiance": [2, 1, 1]}]}]}
@@ -53,6 +58,7 @@ def test_a_relight_guided_by_maps_and_lit_by_keys(server, client, dome, solved):
     assert made_by(client, job) == {"keys.json", "frame.0003.exr", "frame.0004.exr", "frame.0005.exr"}
 
 
+@pytest.mark.long
 def test_a_shade_under_near_lights(server, client, solved, sky):
     lamp = {"position_m": [0, 0, 300], "intensity": [1e5, 1e5, 1e5]}
     for light in (lamp, "0,0,300,1e5,1e5,1e5"):
@@ -61,6 +67,7 @@ def test_a_shade_under_near_lights(server, client, solved, sky):
         assert made_by(client, job) == {"picture.exr"}
 
 
+@pytest.mark.long
 def test_a_view_of_maps_of_a_depth_and_of_a_capture_alone(server, client, dome, solved, rig):
     depth = submit(client, kind="depth", capture=rig)
     finish(server, client, depth)

@@ -33,6 +33,7 @@ def site(tmp_path_factory) -> Iterator[tuple[Server, str]]:
         yield server, key
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", [b"{", MANY, b"[" * 100_000, b'{"name": "x"}'], ids=["broken", "many", "deep", "good"])
 def test_a_body_of_whoever_has_no_key_is_not_parsed(site, body):
     server, _ = site

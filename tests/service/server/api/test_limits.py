@@ -64,6 +64,7 @@ def refused(response: httpx2.Response, status: int, words: str, *, later: bool =
         assert int(response.headers["Retry-After"]) >= 1
 
 
+@pytest.mark.long
 def test_a_key_that_asks_too_often_waits_and_others_do_not(small, client):
     server, database = small
     for _ in range(BURST):
@@ -219,6 +220,7 @@ def test_files_that_are_too_large_or_too_many(client):
     refused(begin("Yw==", 1), 413, f"more than {FILES} are not taken")
 
 
+@pytest.mark.long
 def test_without_space_nothing_new_is_taken_and_the_service_says_so(tmp_path):
     """What is there can be read on."""
     with serving(tmp_path, "--anonymous", "--device", "none", roots=str(SAMPLES), min_free_bytes=str(10**18)) as server, \

@@ -36,6 +36,7 @@ def scan_files(shots: int = 90) -> dict[str, bytes]:
             "shots.npy": file.getvalue()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("options", "file"), [({}, "basis.exr"), ({"basis": "hsh", "count": 4}, "basis.rti")])
 def test_a_basis(server, client, dome, options, file):
     job = submit(client, kind="basis", capture=dome, options=options)
@@ -62,6 +63,7 @@ def test_a_scan(server, client):
     assert "capture.json" in finish(server, client, solve, "failed")["error"]
 
 
+@pytest.mark.long
 def test_scans_that_cannot_be(server, client, registered):
     files = scan_files()
     cut = upload(server, client, files | {"shots.npy": files["shots.npy"][:-8]}, "refused")

@@ -53,6 +53,7 @@ def operations(document) -> dict[str, dict]:
     return {operation["operationId"]: operation for operation in found}
 
 
+@pytest.mark.long
 def test_the_document_is_served_and_says_what_it_is_of(server, client, document):
     served = client.get("/v1/openapi.json").raise_for_status().json()
     assert served == document

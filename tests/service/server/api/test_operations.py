@@ -103,6 +103,7 @@ def test_requests_are_counted_by_route_and_not_by_path(server, client):
     assert "job_0000" not in client.get("/metrics").text and "wp-login" not in client.get("/metrics").text
 
 
+@pytest.mark.long
 def test_numbers_of_jobs_workers_and_the_process(server, client, owl, sky):
     done = client.post("/v1/jobs", json={"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-2"}}).json()
     server.wait(client, f"/v1/jobs/{done['id']}", ("succeeded",))
@@ -163,6 +164,7 @@ def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, 
     assert [line for line in server.lines() if line["level"] == "error"] == []
 
 
+@pytest.mark.long
 def test_a_job_is_followed_through_the_log(server, client, owl):
     job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
     server.wait(client, f"/v1/jobs/{job}", ("succeeded",))

@@ -20,6 +20,7 @@ def site(tmp_path_factory):
         database.close()
 
 
+@pytest.mark.long
 def test_captures(site):
     client, _ = site
     with client("larch") as larch, client("willow") as willow:

@@ -56,6 +56,7 @@ def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
         connection.close()
 
 
+@pytest.mark.long
 def test_results_name_no_place_of_the_server(server, client, dome, sky):
     """Whoever may read a project need not learn where the server keeps it; captures are named by their identifiers."""
     jobs = [{"kind": "pipeline", "capture": dome, "environment": sky, "guided": True, "relight": {"frames": "1-2"},
@@ -73,6 +74,7 @@ def test_results_name_no_place_of_the_server(server, client, dome, sky):
     assert report["options"]["capture"] == dome
 
 
+@pytest.mark.long
 def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):
     seen: dict[str, bytes] = {}
     while client.get(f"/v1/jobs/{frames}").json()["state"] not in ENDED:
@@ -286,6 +288,7 @@ def test_a_range_is_cut_to_the_file(start, beyond, size):
             _part(f"bytes={start}-{start + beyond}", file)
 
 
+@pytest.mark.long
 @given(st.text())
 def test_any_range_and_any_tag_can_be_said(text):
     with suppress(ApiError):

@@ -54,6 +54,7 @@ def registered(server, client, depths) -> str:
     return finish(server, client, submit(client, kind="register", depths=depths, options={"reference": depths[0]}))["id"]
 
 
+@pytest.mark.long
 def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, registered):
     assert made_by(client, {"id": registered}) == {"scan-set.json", "report.json"}
     found = client.get(f"/v1/jobs/{registered}/results/scan-set.json").json()
@@ -65,6 +66,7 @@ def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, regis
     assert str(server.data) not in json.dumps(report) and "/relit-scans-" not in json.dumps(report)
 
 
+@pytest.mark.long
 def test_registered_depths_become_one_mesh(client, server, depths, registered):
     job = submit(client, kind="fuse", registered=registered, options={"texture_px": 128, "texture_faces": 1000})
     finish(server, client, job)

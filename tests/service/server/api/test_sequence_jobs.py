@@ -66,6 +66,7 @@ def test_the_results_become_one_asset_with_time_samples(server, client, solved, 
                 f"format: is {unfit}, the asset of a sequence is one of usdz")
 
 
+@pytest.mark.long
 def test_one_step_is_looked_at(server, client, sequence, solved, dome):
     def ask(**request):
         return client.post("/v1/jobs", json={"kind": "view", "capture": sequence, **request})
@@ -85,6 +86,7 @@ def test_one_step_is_looked_at(server, client, sequence, solved, dome):
     refused(ask(maps=one, step=1), 422, f"maps: {one} is of one capture, and {sequence} is a sequence")
 
 
+@pytest.mark.long
 def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
     job = submit(client, kind="pipeline", capture=sequence, environment=sky, format="usdz", guided=True, solve={"method": "lambert"},
                  sequence={"temporal": False})
@@ -95,6 +97,7 @@ def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
     assert not any("alone" in name for name in made)
 
 
+@pytest.mark.long
 def test_a_depth_of_a_sequence(server, client, tmp_path):
     patterns = [*depths.BLACK_WHITE, *depths.phase_patterns("column", 16), *depths.gray_patterns("column", stripe=16)]
     for step in range(2):
@@ -126,6 +129,7 @@ def test_what_takes_one_capture_is_given_one(server, client, sequence, solved, d
     assert "frames_per_second: is 30, --frame-rate 12: leave one out" in finish(server, client, other, "failed")["error"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("path", "words"), [
     ("../step00", "steps[0].path leads out of the capture's folder"), ("/etc", "steps[0].path leads out of the capture's folder"),
     ("nothing", "nothing/capture.json"),

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 
 from service.calibrate.stereo import stereo
 from service.requests.calibrate import StereoRequest
@@ -17,6 +18,7 @@ from tests.service.server.api.test_calibrating import sent
 BOARD = {"board": "9x6", "square_m": 0.03}
 
 
+@pytest.mark.long
 def test_a_board_calibrates_cameras_as_the_command_does(server, client, tmp_path):
     folder = write_board(tmp_path / "board", 4)
     identifier = sent(server, client, folder)
@@ -36,6 +38,7 @@ def test_a_board_calibrates_cameras_as_the_command_does(server, client, tmp_path
     refused(client.post("/v1/jobs", json={"kind": "calibrate-stereo", "capture": identifier, "options": {"board": "9x6"}}), 422, "")
 
 
+@pytest.mark.long
 def test_depth_of_two_cameras(server, client, tmp_path):
     parts, texture = [Plane((0, 0, -1.1), (0.2, 0.1, 1))], [scenes.dots(7)]
     rng = np.random.default_rng(0)
@@ -48,6 +51,7 @@ def test_depth_of_two_cameras(server, client, tmp_path):
     assert report["method"] == "stereo" and report["pixels"]["ok"] > 0.8 * report["pixels"]["mask"]
 
 
+@pytest.mark.long
 def test_depth_beside_a_second_camera_under_one_projector(server, client, tmp_path):
     truth = two_captures(tmp_path)
     first, second = (sent(server, client, tmp_path / name) for name in ("first", "second"))

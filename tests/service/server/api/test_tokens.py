@@ -129,6 +129,7 @@ def test_the_provider_may_change_its_keys(issuer, reader, monkeypatch):
     assert reader.caller(old, None) is None
 
 
+@pytest.mark.long
 def test_tokens_with_unknown_keys_do_not_flood_the_provider(issuer, reader):
     assert reader.caller(issuer.token(), None)
     for number in range(20):

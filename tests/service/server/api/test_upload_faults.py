@@ -139,6 +139,7 @@ def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
         assert stored(server, place, "file.bin").read_bytes() == content
 
 
+@pytest.mark.long
 def test_limits_and_projects(tmp_path):
     with serving(tmp_path, "--device", "none", max_upload_bytes=str(MIB), max_capture_files="2", min_free_bytes="0",
                  upload_hours="0.0005") as server:

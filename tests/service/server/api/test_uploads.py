@@ -254,6 +254,7 @@ def test_files_are_listed_in_pages(client, tus, capture):
     assert second["next"] is None
 
 
+@pytest.mark.long
 def test_a_capture_that_was_refused_is_mended(server, client, tus, capture):
     sample = SAMPLES / "lambert"
     for path in sample.iterdir():

@@ -56,6 +56,7 @@ def test_a_job_is_done_step_by_step(idle_harness, runner, monkeypatch):
     assert (row["state"], row["finished_steps"]) == (jobs.SUCCEEDED, NAMES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("function", ["begin", "find", "is_claimed", "finish_step", "end"])
 def test_a_database_that_is_away_for_a_moment_is_waited_for(idle_harness, runner, monkeypatch, function):
     made, claim = runner
@@ -129,6 +130,7 @@ def test_a_worker_that_was_given_up_for_dead_publishes_nothing(idle_harness, run
     assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, [])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("end", ["stopped", "done", "failed"])
 def test_what_a_step_wrote_after_its_job_was_deleted_is_removed(idle_harness, runner, monkeypatch, end):
     """A writer that is under way makes the folder of the results again, as `stage.files.replacing` makes missing folders."""

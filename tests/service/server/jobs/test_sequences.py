@@ -67,6 +67,7 @@ def run(job: Job, context: WorkerContext, name: str) -> None:
     context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Silent())
 
 
+@pytest.mark.long
 def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence, undisturbed, tmp_path, monkeypatch):
     """Each finds what the other has left in the store, and joins without solving again."""
     job = solve_of(idle_harness, sequence)
@@ -86,6 +87,7 @@ def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence
     assert str(tmp_path).encode() not in (store / "step03" / "alone" / "report.json").read_bytes()
 
 
+@pytest.mark.long
 def test_without_joining_there_are_the_steps_alone(idle_harness, sequence):
     job = solve_of(idle_harness, sequence, temporal=False, frame_rate=12.5)
     context = context_of(idle_harness, idle_harness.settings, sequence)

@@ -56,6 +56,7 @@ def only_step(harness, request, roots, settings=None):
     return step
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["002.exr", "capture.json", "mask.png"])
 def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harness, capture, tmp_path, monkeypatch, name):
     from service.solve import solve as product
@@ -77,6 +78,7 @@ def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harnes
         step_of(idle_harness, capture, (capture.parent,)).run(Silent())
 
 
+@pytest.mark.long
 def test_the_worker_decodes_no_image_of_a_capture(idle_harness, capture, monkeypatch):
     from stage.formats import images
 
@@ -87,6 +89,7 @@ def test_the_worker_decodes_no_image_of_a_capture(idle_harness, capture, monkeyp
     assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
 
 
+@pytest.mark.long
 def test_the_folder_is_closed_when_the_step_ends(idle_harness, capture):
     before = len(os.listdir("/proc/self/fd"))
     step = step_of(idle_harness, capture, (capture.parent,))
@@ -96,6 +99,7 @@ def test_the_folder_is_closed_when_the_step_ends(idle_harness, capture):
     assert (idle_harness.results("job_0123456789abcdefghjk") / "maps.exr").exists()
 
 
+@pytest.mark.long
 def test_a_check_refuses_a_capture_beyond_the_pixels_of_its_project(idle_harness, capture):
     """The capture has five images of 8 × 8."""
     def checked(most):

@@ -52,11 +52,13 @@ def watch(monkeypatch, tmp_path, worker, until, stall_s=WAIT_S):
         made.stop()
 
 
+@pytest.mark.long
 def test_one_that_is_never_ready_waits_longer_each_time(monkeypatch, tmp_path, log):
     watch(monkeypatch, tmp_path, stand_ins.never_ready, lambda _: len(log.of("worker is gone")) == 4)
     assert [facts["again_in_s"] for facts in log.of("worker is gone")][:4] == [PAUSES_S[1], PAUSES_S[2], PAUSES_S[2], PAUSES_S[2]]
 
 
+@pytest.mark.long
 def test_one_that_was_ready_is_started_again_at_once_however_often_it_dies(monkeypatch, tmp_path, log):
     watch(monkeypatch, tmp_path, stand_ins.ready_and_dead, lambda _: len(log.of("worker is gone")) == 4)
     assert [facts["again_in_s"] for facts in log.of("worker is gone")][:4] == [0.0] * 4

@@ -110,6 +110,7 @@ def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_p
         assert made.row(job)["state"] == jobs.QUEUED
 
 
+@pytest.mark.long
 def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):
     gone = Claim(job, 1, "gone")
     for _ in range(2):  # one who died between the two halves of taking over leaves them to the next
@@ -177,6 +178,7 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, job
     lock.close()
 
 
+@pytest.mark.long
 def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_job(idle_harness, job):
     """The job came through that stage once, so that something else kills the workers; but not without end."""
     database, gone = idle_harness.database, Claim(job, 1, "gone")

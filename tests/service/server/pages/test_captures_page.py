@@ -25,6 +25,7 @@ def stored(server, name: str) -> dict:
         return found | {"files": client.get(f"/v1/captures/{found['id']}/files").json()["files"]}
 
 
+@pytest.mark.long
 def test_a_folder_is_uploaded_whole(server, page, folder):
     page.goto("/captures")
     page.set_input_files("#folder", folder)
@@ -91,6 +92,7 @@ def test_a_stopped_upload_is_continued_with_what_is_missing(server, page, folder
         assert [item["name"] for item in client.get("/v1/captures").json()["items"]].count(folder.name) == 1
 
 
+@pytest.mark.long
 def test_a_folder_without_images_is_refused_here(page, tmp_path):
     folder = tmp_path / "notes"
     folder.mkdir()
@@ -100,6 +102,7 @@ def test_a_folder_without_images_is_refused_here(page, tmp_path):
     page.get_by_text("notes: the folder has no images").wait_for()
 
 
+@pytest.mark.long
 def test_a_folder_without_a_manifest_is_refused_here(page, folder):
     (folder / "capture.json").unlink()
     page.goto("/captures")
@@ -107,6 +110,7 @@ def test_a_folder_without_a_manifest_is_refused_here(page, folder):
     page.get_by_text("the folder has no capture.json: relit import writes one").wait_for()
 
 
+@pytest.mark.long
 def test_a_broken_manifest_is_named(page, folder):
     manifest = json.loads((folder / "capture.json").read_text())
     manifest["frames"][3]["light"]["direction"] = [0, 0]
@@ -118,6 +122,7 @@ def test_a_broken_manifest_is_named(page, folder):
     assert "frames" in fault.inner_text() and "direction" in fault.inner_text()
 
 
+@pytest.mark.long
 def test_an_environment_is_uploaded(server, page):
     page.goto("/captures")
     page.set_input_files("#file", SAMPLES / "owl" / "environment.exr")

@@ -48,6 +48,7 @@ def slow_job(client, capture: str, sky: str) -> str:
         "frames": "1-300", "spin_degrees": 360}}).raise_for_status().json()["id"]
 
 
+@pytest.mark.long
 def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
@@ -102,6 +103,7 @@ def test_forms_of_several_captures_and_images(page, capture):
     form.locator(".fault", has_text="Images: ").wait_for()
 
 
+@pytest.mark.long
 def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
     """Both are run as they are shown, and make the same request as the form."""
     page.goto(f"/captures/{capture}")
@@ -140,6 +142,7 @@ def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, c
     page.locator("#state").get_by_text("attempt 2").wait_for(timeout=JOB_MS)
 
 
+@pytest.mark.long
 def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
     with server.client() as client:
         job = slow_job(client, capture, sky)
@@ -175,6 +178,7 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
         page.close()
 
 
+@pytest.mark.long
 def test_the_list_follows_all_jobs(server, page, capture):
     page.goto("/jobs")
     with server.client() as client:

@@ -22,6 +22,7 @@ def key_of(server: Server, scope: str) -> str:
     return re.search(r"relit_\S+", done.stdout)[0] if "relit_" in done.stdout else done.stdout.split()[-1]
 
 
+@pytest.mark.long
 def test_the_page_asks_for_a_key_and_keeps_it_in_the_tab(browser, locked):
     context = new_context(browser, base_url=locked.url)
     page = context.new_page()

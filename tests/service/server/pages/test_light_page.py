@@ -31,6 +31,7 @@ def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     assert_same(shown, *rendered(opened, solved, tmp_path))
 
 
+@pytest.mark.long
 def test_dragging_on_the_picture_moves_the_light(opened):
     box = opened.locator("canvas.picture").bounding_box()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -60,6 +61,7 @@ def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solve
     opened.locator("[data-shows=speed]", has_text="pictures a second").wait_for(timeout=60_000)
 
 
+@pytest.mark.long
 def test_nothing_is_drawn_while_nothing_changes(page, solved):
     page.add_init_script("""const draw = WebGL2RenderingContext.prototype.drawArrays;
       globalThis.drawn = 0;
@@ -77,15 +79,18 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
     page.wait_for_function("(before) => drawn === before + 1", arg=before)
 
 
+@pytest.mark.long
 def test_the_first_page_opens_on_what_can_be_lit(page, solved):
     page.goto("/")
     page.wait_for_url("**/light/cap_*")
 
 
+@pytest.mark.long
 def test_the_view_transform_is_named(opened):
     opened.get_by_text("Shown through sRGB (linear Rec.709, clipped, no tone mapping)").wait_for()
 
 
+@pytest.mark.long
 def test_arrow_keys_move_the_light(opened):
     before = opened.evaluate("() => relit.state().light.direction")
     opened.locator("canvas.dome").focus()
@@ -114,6 +119,7 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
     assert_same(shown, encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
 
+@pytest.mark.long
 def test_light_from_beyond_the_captured_is_said(opened):
     """The lights of the sample are in front; light from behind is none of theirs."""
     opened.evaluate("() => relit.set([0, 0, -1])")

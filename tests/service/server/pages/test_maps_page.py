@@ -39,6 +39,7 @@ def numbers(said: str, title: str) -> list[float]:
     return [float(each) for each in re.search(rf"{title} ([^;a-z]+)", said)[1].replace("−", "-").split(",")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("layer", "title"), [("normal", "Normals"), ("diffuse_albedo", "Diffuse albedo"), ("height", "Height")])
 def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, title):
     """Four significant digits are shown."""
@@ -51,6 +52,7 @@ def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, tit
         assert "status: " in said
 
 
+@pytest.mark.long
 def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     unsure = (maps.status == 15) & (maps.mask == 0)
     assert unsure.any(), "the capture was solved so that some pixels are unsure"

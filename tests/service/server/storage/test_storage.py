@@ -82,6 +82,7 @@ def test_a_workspace_file_written_again_is_published_again(storage):
     assert opened is not None and opened.read_bytes() == b"other"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0, 1, PIECE_BYTES, PIECE_BYTES + 1, 3 * PIECE_BYTES])
 def test_files_of_every_size(storage, tmp_path, size):
     content = bytes(range(256)) * (size // 256) + bytes(size % 256)
