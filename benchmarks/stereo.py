@@ -17,8 +17,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from service.depth.stereo.rectification import rectify
 from service.depth.stereo.rectified_frames import RectifiedFrames, smoothed
 from service.depth.stereo.stereo_pair import Disparity, match
-from stage.capture.camera import Camera
-from stage.capture.other_camera import OtherCamera
+from stage.capture.camera import Camera, OtherCamera
 from tests.scenes import stereo as scenes
 from tests.scenes.depth import entry_of
 from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere

@@ -8,6 +8,10 @@ StageError
 ├── ScanError        scans of one object cannot be placed; the message names them
 ├── ResultError      a result file such as maps.exr lacks a layer; the message names file and layer
 └── StorageError     the file system refuses for lack of space or permission; the message names path and reason
+
+Every function of stage/ that reads or writes a file raises StorageError where the file system refuses. Every reader raises ImageError (of
+pixels), ResultError (of results) or ManifestError (of JSON) where a file is damaged, truncated or not what it should be. Docstrings name
+further reasons only.
 """
 
 from collections.abc import Iterable, Iterator

@@ -17,16 +17,12 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces `path` when the block ends without an error and is removed otherwise.
 
     Args:
-        path: the file.
         flush: whether to wait until the file is on the disk. False for a file that its reader checks and can make again: it may be damaged
             after a power failure.
 
     Convention:
         The temporary file lies in the same folder and has the same suffix, because writers choose a format by the suffix.
         Missing parent folders are made.
-
-    Raises:
-        StorageError: the folder or file cannot be written.
     """
     target = Path(path)
     with storage("write", target):
@@ -47,11 +43,7 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 text file whole or not at all.
-
-    Raises:
-        StorageError: the folder or file cannot be written.
-    """
+    """Write a UTF-8 text file whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

@@ -64,11 +64,7 @@ class Source:
             yield link
 
     def check_pixels(self, width: int, height: int) -> None:
-        """Check that an image may be decoded.
-
-        Raises:
-            ImageError: it has more pixels than are allowed.
-        """
+        """Check that an image may be decoded."""
         if self.max_pixels is not None and width * height > self.max_pixels:
             raise ImageError(f"{self.path}: has {width}x{height} pixels, {self.max_pixels} are allowed")
 
@@ -84,7 +80,6 @@ def confined(folder: Path, root: Path, *, max_pixels: int | None = None) -> Iter
 
     Raises:
         ManifestError: the folder is a link, or leads through one.
-        StorageError: the folder cannot be opened.
     """
     with storage("read", folder):
         top = os.open(root, os.O_CLOEXEC | os.O_DIRECTORY | getattr(os, "O_PATH", os.O_RDONLY))
@@ -118,7 +113,6 @@ def opened(path: str | Path) -> Iterator[Source]:
 
     Raises:
         ManifestError: the path leads out of a confined folder.
-        StorageError: the file cannot be opened.
     """
     given = Path(path)
     folder = _folder_of(given)
@@ -132,12 +126,7 @@ def opened(path: str | Path) -> Iterator[Source]:
 
 
 def read_bytes(path: str | Path, most: int = -1) -> bytes:
-    """Return the content of a file, or its first `most` bytes.
-
-    Raises:
-        ManifestError: the path leads out of a confined folder.
-        StorageError: the file cannot be read.
-    """
+    """Return the content of a file, or its first `most` bytes."""
     with opened(path) as source, storage("read", path):
         return source.file.read(most)
 

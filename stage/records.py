@@ -25,15 +25,8 @@ def read_record(path: str | Path, model: type[Record], schema: str, further: Cal
     """Read a JSON file and check it against a model.
 
     Args:
-        path: the file.
-        model: the model of its content.
-        schema: the value that its key `schema` must have.
         further: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report
             because it stops at the first fault of a long list.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, has another schema, or fields are wrong; a sentence for each names file and field.
     """
     text = inputs.read_bytes(path)
     try:
@@ -65,12 +58,7 @@ def schema_of(model: type[BaseModel]) -> str:
 
 
 def describe(error: ValidationError, name: FieldName | None = None) -> str:
-    """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults.
-
-    Args:
-        error: with one fault or more.
-        name: names the field; None: as `field_name` does.
-    """
+    """Return the first fault of a pydantic error as `field: what is wrong`, with the count of the other faults."""
     faults = faults_of(error, name)
     return faults[0] + (f" (and {len(faults) - 1} more)" if len(faults) > 1 else "")
 
@@ -79,7 +67,6 @@ def faults_of(error: ValidationError, name: FieldName | None = None, within: tup
     """Return the faults of a pydantic error, each as `field: what is wrong`.
 
     Args:
-        error: with one fault or more.
         name: names the fields; None: as `field_name` does.
         within: the place of what was validated, in the content of the file.
     """
@@ -113,6 +100,16 @@ def _said(fault: Any) -> str:
             return f"lacks the key {fault['ctx']['discriminator'].strip(chr(39))}"
         case _:
             return f"is {_short(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+
+
+def faults_of_each(data: dict[str, Any], key: str, model: type[BaseModel]) -> Iterator[str]:
+    """Yield the faults of every entry of a list in a JSON object, where pydantic stops at the first, as sentences without the file."""
+    entries = data.get(key)
+    for index, entry in enumerate(entries if isinstance(entries, list) else ()):
+        try:
+            model.model_validate(entry)
+        except ValidationError as error:
+            yield from faults_of(error, within=(key, index))
 
 
 def field_name(location: tuple[int | str, ...]) -> str:

@@ -75,7 +75,6 @@ def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarr
 
     Args:
         axis: a unit vector.
-        degrees: the angle.
 
     Returns:
         [3, 3] float64 for column vectors: rotated = rotation @ direction.

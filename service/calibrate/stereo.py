@@ -11,10 +11,9 @@ from service.calibrate.solvers.procam import Lens, find_corners
 from service.calibrate.solvers.stereo import SharedView, StereoPose, alike_order, calibrate_lens, calibrate_pose
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import StereoRequest
-from stage.capture.camera import Camera
+from stage.capture.camera import Camera, OtherCamera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest
-from stage.capture.other_camera import OtherCamera
 from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.errors import ManifestError
 

@@ -1,11 +1,11 @@
-"""The camera of a manifest: its projection, its lens distortion, and the conversion between pixels and camera-frame points."""
+"""The cameras of a manifest: projection, lens distortion, the conversion between pixels and camera-frame points, other cameras."""
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
-from stage.model import Positive, Resolution, Strict
+from stage.model import FirstFault, Positive, Resolution, Strict, Text
 from stage.pixels import Crop
 from stage.transforms import Transform, pixel_centres
 
@@ -116,10 +116,6 @@ class Camera(Strict):
         """Return `plane_coordinates` of some rows of the image that cannot be written to.
 
         Without distortion they are views of one row and of one column, and take no memory.
-
-        Args:
-            first_row: the first of the rows.
-            rows: their number; None: all from the first on.
         """
         count = self.height - first_row if rows is None else rows
         u, v = np.arange(self.width) + 0.5, np.arange(first_row, first_row + count) + 0.5
@@ -170,7 +166,6 @@ class Camera(Strict):
 
         Args:
             height: [rows, cols] camera-frame z, negative in front of a perspective camera, of the whole image or of some of its rows.
-            first_row: the first of these rows.
 
         Returns:
             [rows, cols, 3] float32, in the unit of `height`.
@@ -197,3 +192,40 @@ class Camera(Strict):
         for axis, values in enumerate((x, y, height)):
             points[..., axis] = values
         return points
+
+
+class OtherCamera(Strict):
+    """A perspective camera beside the camera of the capture, with the intrinsics and conventions of that camera."""
+
+    name: Text
+    """The name of the camera, for reports and messages."""
+    resolution: Resolution
+    """The size of every image of this camera."""
+    focal_px: tuple[Positive, Positive] | None = None
+    """The focal lengths along u and v. None: not measured yet, and `camera_from_other` neither; `relit calibrate stereo` measures both."""
+    principal_px: tuple[float, float] | None = None
+    """The principal point, as of the camera; None: the centre of the image."""
+    distortion: Distortion | None = None
+    """The lens distortion; None: none."""
+    camera_from_other: Transform | None = None
+    """The place of this camera in the camera frame, with the translation in metres; it looks along its own -z. None: not measured yet."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.focal_px is None) != (self.camera_from_other is None):
+            given, missing = ("focal_px", "camera_from_other") if self.camera_from_other is None else ("camera_from_other", "focal_px")
+            raise ValueError(f"{missing} is missing beside {given}: give both, or neither before relit calibrate stereo measures them")
+        return self
+
+    @property
+    def camera(self) -> Camera:
+        """The camera alone, in its own frame."""
+        return Camera(projection="perspective", resolution=self.resolution, focal_px=self.focal_px, principal_px=self.principal_px,
+                      distortion=self.distortion)
+
+
+class StereoImages(Strict):
+    """What the other cameras saw at the moment of a frame, under projected texture without a code."""
+
+    images: Annotated[tuple[Text, ...], Field(min_length=1), FirstFault]
+    """The image of each of `other_cameras`, in their order; files of the folder that no other frame has."""

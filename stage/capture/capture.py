@@ -31,16 +31,7 @@ LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, Gradie
 
 
 def check_same_pixels(path: Path, camera: Camera, capture: "Capture") -> None:
-    """Check that results have the pixels of a capture.
-
-    Args:
-        path: of the results, for the message.
-        camera: of the results.
-        capture: as it is read.
-
-    Raises:
-        ResultError: the results have another size, or are of another part of the images.
-    """
+    """Check that results have the pixels of a capture."""
     if camera.resolution != capture.camera.resolution:
         theirs, ours = ("x".join(map(str, each.resolution)) for each in (camera, capture.camera))
         raise ResultError(f"{path}: is {theirs}, the capture {ours}: these are not its maps (--crop gives the part of the images that was "
@@ -76,7 +67,6 @@ class Capture:
         Raises:
             ManifestError: the manifest is wrong, or the crop leads out of the images; the message names the field.
             ImageError: a file has the wrong size or is no image; the message names the file.
-            StorageError: a file cannot be read.
         """
         given = Path(path)
         folder = given.parent if given.name == FILE_NAME else given
@@ -137,30 +127,19 @@ class Capture:
         """Read the recorded values of an image that holds radiance, in the part of it that the capture is about.
 
         Args:
-            name: of the image.
             keep_half: True to leave half values as the file has them, too.
 
         Returns:
             [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
 
         Raises:
-            ImageError: the file is unreadable, or a value is NaN, infinite or negative beyond the noise of the image and not to be
-                clipped; the message names the file.
+            ImageError: a value is NaN, infinite, or negative beyond the noise of the image and not to be clipped.
         """
         return self.part_of(self.recorded_whole(name, keep_half=keep_half))
 
     def recorded_whole(self, name: str, *, keep_half: bool = False) -> np.ndarray:
-        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have.
-
-        Args:
-            name, keep_half: as of `recorded`.
-
-        Returns:
-            [rows, cols, 3] as `recorded`.
-
-        Raises:
-            ImageError: as `recorded`.
-        """
+        """Read the recorded values of a whole image that holds radiance, of any size, as those of other cameras have: [rows, cols, 3] as
+        `recorded`."""
         path = self.file(name)
         pixels = images.read_recorded(path)
         if pixels.dtype.kind == "u":
@@ -179,27 +158,14 @@ class Capture:
         return image if self.pixels.crop is None else np.ascontiguousarray(self.pixels.crop.of(image))
 
     def mask(self) -> np.ndarray:
-        """Read the mask of the object.
-
-        Returns:
-            [rows, cols] bool, True on the object; all True when the manifest names no mask.
-
-        Raises:
-            ImageError: the mask is empty or unreadable.
-        """
+        """Read the mask of the object: [rows, cols] bool, True on the object; all True when the manifest names no mask."""
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=bool)
         return images.read_mask(self.file(self.manifest.mask), self.image_resolution, self.pixels.crop)
 
     def mask_values(self) -> np.ndarray:
-        """Read the mask of the object with its partial values.
-
-        Returns:
-            [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when the manifest names no mask.
-
-        Raises:
-            ImageError: the mask is unreadable.
-        """
+        """Read the mask of the object with its partial values: [rows, cols] float32, 0…1, how much of each pixel is the object; all 1 when
+        the manifest names no mask."""
         if self.manifest.mask is None:
             return np.ones((self.camera.height, self.camera.width), dtype=np.float32)
         return self.part_of(images.read_mask_values(self.file(self.manifest.mask), self.image_resolution))

@@ -79,12 +79,7 @@ def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedL
 
 
 def lights_from_centre(capture: Capture) -> DistantLights:
-    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object.
-
-    Raises:
-        ManifestError: a light is neither distant nor a point light, there is none, or a point light stands at an impossible
-            position.
-    """
+    """Return every light as a distant light: a point light by its direction and irradiance at the centre of the object."""
     if not capture.lit_by(PointLight):
         return distant_lights(capture)
     placed = place_lights(capture)
@@ -92,10 +87,6 @@ def lights_from_centre(capture: Capture) -> DistantLights:
 
 
 def check_surface(capture: Capture) -> None:
-    """Check that the images have more than one pixel, because a surface needs two.
-
-    Raises:
-        ManifestError: the images have one pixel.
-    """
+    """Check that the images have more than one pixel, because a surface needs two."""
     if capture.camera.width * capture.camera.height == 1:
         raise ManifestError(f"{capture.folder / FILE_NAME}: camera.resolution: is 1x1: a surface needs two pixels or more")

@@ -6,18 +6,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from stage.capture.camera import Camera
+from stage.capture.camera import Camera, OtherCamera, StereoImages
 from stage.capture.light import Light
-from stage.capture.other_camera import OtherCamera, StereoImages
 from stage.capture.projector import AnyProjector
 from stage.capture.ranging import Laser, TimeOfFlight
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.model import FirstFault, Positive, Strict, Text, Vector
 from stage.patterns.codes import Pattern
-from stage.records import faults_of, read_record
+from stage.records import faults_of_each, read_record
 
 SCHEMA = "relit.capture/1"
 FILE_NAME = "capture.json"
@@ -137,21 +136,12 @@ class Manifest(Strict):
 
 
 def read_manifest(path: str | Path) -> Manifest:
-    """Read and check a capture.json.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.
-    """
+    """Read and check a capture.json."""
     return read_record(path, Manifest, SCHEMA, _frame_faults)
 
 
 def write_manifest(manifest: Manifest, path: str | Path) -> None:
-    """Write a capture.json whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a capture.json whole or not at all."""
     write_text(path, manifest_text(manifest))
 
 
@@ -169,22 +159,13 @@ def _frame_faults(data: dict[str, Any]) -> Iterator[str]:
     frames = data.get("frames")
     if not isinstance(frames, list):
         return
-    for index, frame in enumerate(frames):
-        try:
-            Frame.model_validate(frame)
-        except ValidationError as error:
-            yield from faults_of(error, within=("frames", index))
+    yield from faults_of_each(data, "frames", Frame)
     given = [frame if isinstance(frame, dict) else {} for frame in frames]
     yield from _between_frames([frame.get("image") for frame in given], [frame.get("exposure_s") is not None for frame in given])
 
 
 def _between_frames(names: Sequence[Any], timed: Sequence[bool]) -> Iterator[str]:
-    """Yield the faults that frames have together: an image of two frames, and an exposure that some lack.
-
-    Args:
-        names: the image of each frame; what is no text has a fault of its own.
-        timed: whether each frame has an exposure.
-    """
+    """Yield the faults that frames have together: an image of two frames, and an exposure that some lack."""
     first: dict[str, int] = {}
     for index, image in enumerate(names):
         if not isinstance(image, str):

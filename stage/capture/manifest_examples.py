@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from stage.capture.camera import Camera, Distortion
+from stage.capture.camera import Camera, Distortion, OtherCamera, StereoImages
 from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
 from stage.capture.manifest import SCHEMA, Frame, Manifest
-from stage.capture.other_camera import OtherCamera, StereoImages
 from stage.capture.projector import Projector, UncalibratedProjector
 from stage.capture.ranging import ContinuousWave, LaserPlane, LaserRay, Pulsed
 from stage.model import Strict

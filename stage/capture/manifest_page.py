@@ -46,7 +46,7 @@ HEAD = """# Every field of capture.json
 
 *After reading this page you can look up any field of a manifest: its range, its default and an example.*
 
-*This page is made from the program by `python -m stage.capture.manifest_page`. [capture.md](capture.md) explains what the fields mean
+*This page is made from the program by `python -m stage.capture.manifest_page`. [capture.md](capture.md) explains what the fields mean \
 together.*
 
 The camera frame has x to the right, y up and z towards the viewer. A text has one line and is not blank. A key that is not listed is

@@ -44,11 +44,7 @@ class LightPlaces(NamedTuple):
 
 
 def light_places(capture: Capture) -> LightPlaces:
-    """Return where the lights of the stack of a capture are, all of which must be distant or point lights.
-
-    Raises:
-        ManifestError: a light is of another type, or there is none.
-    """
+    """Return where the lights of the stack of a capture are, all of which must be distant or point lights."""
     where = capture.folder / FILE_NAME
     lights = []
     for index, frame in enumerate(capture.manifest.frames):
@@ -85,7 +81,6 @@ def place_lights(capture: Capture) -> PlacedLights:
     Raises:
         ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
             object.
-        ImageError: the mask is empty or unreadable.
     """
     where = capture.folder / FILE_NAME
     frames, place, strength, lobe = light_places(capture)

@@ -58,15 +58,7 @@ def first_in_place(place: np.ndarray) -> np.ndarray:
 
 
 def check_pairs(capture: Capture, place: np.ndarray) -> None:
-    """Check that every light has both images of a polarised pair, or that none is polarised.
-
-    Args:
-        capture: whose distant and point lights are checked.
-        place: [lights, 3] or [lights, 4], of these lights.
-
-    Raises:
-        ManifestError: an image of a pair is missing, or some lights are not polarised; names the first frame.
-    """
+    """Check that every light has both images of a polarised pair, or that none is polarised; `place` as in `first_in_place`."""
     if not capture.is_polarised:
         return
     where = capture.folder / FILE_NAME

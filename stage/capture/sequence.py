@@ -77,15 +77,7 @@ class Sequence(NamedTuple):
     """True if a file says the rate and times; else the steps are folders in order of name."""
 
     def step(self, number: int, path: Path) -> TimeStep:
-        """Return the step of a number, from 1, of a sequence that was checked before.
-
-        Args:
-            number: of the step.
-            path: of the sequence, for the message.
-
-        Raises:
-            ManifestError: it has fewer steps by now.
-        """
+        """Return the step of a number, from 1, of a sequence that was checked before."""
         if number > len(self.steps):
             raise ManifestError(f"{path}: has {len(self.steps)} steps now, and had more when it was checked")
         return self.steps[number - 1]
@@ -110,11 +102,7 @@ def is_sequence(path: Path) -> bool:
 
 
 def capture_folders(folder: Path) -> list[Path]:
-    """Return the folders in a folder that hold a capture, in order of name.
-
-    Raises:
-        StorageError: the folder cannot be read.
-    """
+    """Return the folders in a folder that hold a capture, in order of name."""
     with storage("read", folder):
         return sorted(inside for inside in folder.iterdir() if (inside / FILE_NAME).is_file())
 
@@ -125,10 +113,6 @@ def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequ
     Args:
         path: a sequence.json, its folder, or a folder of captures.
         frames_per_second: of a folder of captures; a file says its own.
-
-    Raises:
-        ManifestError: sequence.json is wrong, or says another rate than is given.
-        StorageError: it cannot be read.
     """
     file = path if path.is_file() else path / SEQUENCE_FILE
     if not file.is_file():
@@ -145,23 +129,14 @@ def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequ
 
 
 def write_sequence(sequence: Sequence, path: Path) -> None:
-    """Write a sequence.json whose steps are the folders of their names beside it.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
+    """Write a sequence.json whose steps are the folders of their names beside it."""
     content = SequenceFile(schema="relit.sequence/1", frames_per_second=sequence.frames_per_second,
                            steps=tuple(Step(path=step.name, time_s=step.time_s) for step in sequence.steps))
     write_text(path, content.model_dump_json(by_alias=True, indent=2) + "\n")
 
 
 def check_alike(sequence: Sequence) -> list[Manifest]:
-    """Check that the captures of a sequence are of one camera, colour space and scale of light, and return their manifests.
-
-    Raises:
-        ManifestError: two differ, or a capture.json is wrong; names folder and field.
-        StorageError: a folder cannot be read.
-    """
+    """Check that the captures of a sequence are of one camera, colour space and scale of light, and return their manifests."""
     manifests = []
     for step in sequence.steps:
         if not (step.folder / FILE_NAME).is_file():
@@ -176,13 +151,7 @@ def check_alike(sequence: Sequence) -> list[Manifest]:
 
 
 def difference(manifest: Manifest, other: Manifest, fields: Iterable[str]) -> Difference | None:
-    """Return the first of some fields in which two manifests differ, or None.
-
-    Args:
-        manifest: the one.
-        other: the other.
-        fields: names, with dots between those that lead to a value.
-    """
+    """Return the first of some fields in which two manifests differ, or None."""
     for field in fields:
         value, there = attrgetter(field)(manifest), attrgetter(field)(other)
         if value != there:

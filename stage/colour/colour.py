@@ -66,14 +66,9 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
 
     Args:
         pixels: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue.
-        source: the interchange name of the colour space of `pixels`.
-        target: the interchange name of the colour space of the result.
 
     Returns:
         Float32 in the shape of `pixels`; of one channel, the red channel of the converted grey.
-
-    Raises:
-        ValueError: OpenColorIO does not know one of the names.
     """
     if source == target:
         return pixels
@@ -92,20 +87,13 @@ def rgb_matrix(source: str, target: str) -> np.ndarray:
 
     Returns:
         [3, 3] float32: rgb in `target` = matrix @ rgb in `source`.
-
-    Raises:
-        ValueError: OpenColorIO does not know one of the names.
     """
     primaries = np.eye(3, dtype=np.float32)[None]  # one row of three pixels: red, green and blue
     return np.ascontiguousarray(convert(primaries, source, target)[0].T)
 
 
 def pixels_of(buffer: oiio.ImageBuf) -> np.ndarray:
-    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32.
-
-    Raises:
-        ValueError: OpenImageIO has put an error message in the place of the pixels.
-    """
+    """Return the pixels of an OpenImageIO buffer, [rows, cols, channels] float32."""
     pixels = buffer.get_pixels(oiio.FLOAT)
     if pixels is None:
         raise ValueError(buffer.geterror())

@@ -28,11 +28,7 @@ def is_linear(space: str) -> bool:
 
 
 def linear_space(space: str) -> str:
-    """Return the name of the scene-linear space that has the primaries of `space`: the working space of a capture.
-
-    Raises:
-        ValueError: `space` is not a ColorSpaceName.
-    """
+    """Return the name of the scene-linear space that has the primaries of `space`: the working space of a capture."""
     if space not in get_args(ColorSpaceName):
         raise ValueError(f"{space} is not a colour space that relit knows")
     return _LINEAR_OF.get(space, space)

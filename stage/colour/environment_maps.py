@@ -17,7 +17,6 @@ def check_environment(path: Path) -> None:
 
     Raises:
         ImageError: not EXR or HDR, or not twice as wide as high.
-        StorageError: the file cannot be opened.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
@@ -38,10 +37,6 @@ def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None =
     Returns:
         [rows, cols, 3] float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has
         a channel that is 0.
-
-    Raises:
-        ImageError: impossible values (counted), or a colour space that is not known.
-        StorageError: the file cannot be opened.
     """
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:

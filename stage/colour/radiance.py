@@ -41,7 +41,6 @@ def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend 
     """Check that no value is NaN, infinite, or further below zero than the noise of the image.
 
     Args:
-        path: of the image, for messages.
         pixels: [rows, cols, channels] floating point.
         remedy: what the message about negative values says can be done.
         stray: the part of the pixels that may be below the noise, such as RAW_STRAY.
@@ -62,11 +61,7 @@ def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend 
 
 
 def check_finite(path: str | Path, pixels: np.ndarray) -> None:
-    """Check that no value is NaN or infinite.
-
-    Raises:
-        ImageError: some values are; the message counts the pixels and names the first.
-    """
+    """Check that no value is NaN or infinite."""
     if _is_plain_half(pixels):
         return
     infinite = ~np.isfinite(pixels)
@@ -89,11 +84,7 @@ def clip_negative(pixels: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def clipping_sentences(clipped: Mapping[str, int]) -> list[str]:
-    """Return a sentence about values that were set to 0; none where nothing was.
-
-    Args:
-        clipped: the number of pixels with such a value, by the names of the images that have any.
-    """
+    """Return a sentence about values that were set to 0; none where nothing was."""
     if not clipped:
         return []
     most = max(clipped, key=lambda name: clipped[name])

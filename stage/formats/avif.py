@@ -35,7 +35,6 @@ def header_of(path: str | Path, stream: BinaryIO) -> AvifHeader:
     Raises:
         ImageError: the file is no AVIF image, truncated, damaged, an image sequence, or one that is turned, mirrored or cropped after
             decoding.
-        StorageError: the file cannot be read.
     """
     with storage("read", path):
         meta, is_whole = _meta(stream)
@@ -58,18 +57,7 @@ def header_of(path: str | Path, stream: BinaryIO) -> AvifHeader:
 
 
 def decode(path: str | Path, stream: BinaryIO, header: AvifHeader) -> np.ndarray:
-    """Decode an AVIF image that is open, without alpha.
-
-    Args:
-        path: of the file, for messages.
-        header: of `header_of`.
-
-    Returns:
-        [rows, cols, 1 or 3] uint8, or float32 fractions of full scale of deeper images.
-
-    Raises:
-        ImageError: the image cannot be decoded, or has another size than its header says.
-    """
+    """Decode an AVIF image that is open, without alpha: [rows, cols, 1 or 3] uint8, or float32 fractions of full scale of deeper images."""
     import cv2  # a tenth of a second that captures of other images need not wait
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # OpenCV writes on the terminal what it raises too

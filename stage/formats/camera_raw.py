@@ -45,11 +45,7 @@ class RawHeader(NamedTuple):
 
 
 def header_of(source: inputs.Source) -> RawHeader:
-    """Read the size, the orientation and the exposure of a camera raw file that is open.
-
-    Raises:
-        ImageError: the file is damaged or of no known camera, or rawpy is not installed.
-    """
+    """Read the size, the orientation and the exposure of a camera raw file that is open."""
     with _parsed(source) as raw:
         return _header(source, raw)
 
@@ -125,15 +121,11 @@ def demosaic(mosaic: np.ndarray, colour: np.ndarray) -> np.ndarray:
 def rec709_from_camera(path: str | Path) -> np.ndarray:
     """Return the matrix from the colours of a sensor, once white is balanced, to linear values with the primaries of Rec.709.
 
-    Args:
-        path: a camera raw file.
-
     Returns:
         [3, 3] float64, whose rows add up to 1: what is white stays white.
 
     Raises:
         ImageError: neither the file nor LibRaw knows the colours of this camera.
-        StorageError: the file cannot be opened.
 
     Source:
         The matrices of cameras are those of Adobe's DNG Specification, ColorMatrix1 and 2, normalised as dcraw does.

@@ -30,10 +30,6 @@ def sound(value: float) -> float | None:
 def exposure_times(where: str, exposures: Mapping[str, Exposure]) -> dict[str, float]:
     """Return the exposure time of every image, in seconds.
 
-    Args:
-        where: the manifest, for messages.
-        exposures: the settings of each image, by its name.
-
     Raises:
         ManifestError: an image has no exposure time, or images differ in f-number or sensitivity; the message names them.
     """

@@ -14,8 +14,7 @@ from stage import inputs
 from stage.errors import ImageError, StorageError, storage
 from stage.files import replacing
 from stage.formats import exr_checksum
-from stage.formats.exr_chunks import missing_bytes
-from stage.formats.exr_scan import scan_header
+from stage.formats.exr_scan import missing_bytes, scan_header
 
 HALF_MAX = 65504.0
 """The largest half value."""
@@ -72,7 +71,6 @@ def read_header(path: str | Path) -> Header:
 
     Raises:
         ImageError: the file is not an EXR, is truncated, or has deep data, parts of different sizes, or one channel in several parts.
-        StorageError: the file cannot be opened.
     """
     with inputs.opened(path) as source:
         return header_of(source)
@@ -114,10 +112,6 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
     Returns:
         The channels by name, each [rows, cols] in its stored type, and the attributes of the first part's header by name.
-
-    Raises:
-        ImageError: the file is not a readable EXR of flat data.
-        StorageError: the file cannot be opened.
     """
     with inputs.opened(path) as source:
         header = header_of(source)
@@ -145,13 +139,7 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
     """Write an EXR file of one part whole or not at all.
 
     Args:
-        path: the file.
         channels: the channels by name, each [rows, cols] float16 or float32.
-        color_space, compression: as in Part.
-        metadata: further attributes.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
     """
     write_parts(path, [Part("", channels, color_space, compression)], metadata=metadata)
 
@@ -160,13 +148,9 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
     """Write an EXR file whole or not at all: of several parts, or, where there is one part, a file without parts.
 
     Args:
-        path: the file.
         parts: with names that differ, and channels that differ and have one size.
         metadata: further attributes of the first part; `pixelAspectRatio` and `framesPerSecond` are written to every part.
         checksum: True to write a checksum of the file too, by which `stage.formats.exr_checksum` finds every change of it.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
     """
     if checksum:
         metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
@@ -176,16 +160,7 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
 
 
 def encode(temporary: Path, parts: Sequence[Part], *, metadata: Mapping[str, Any], path: str | Path) -> None:
-    """Encode an EXR file into a temporary file.
-
-    Args:
-        temporary: the file that is written.
-        parts, metadata: as of `write_parts`.
-        path: the file that it is for, which messages name.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Encode an EXR file into a temporary file."""
     written: list[tuple[dict[str, Any], dict[str, np.ndarray], str]] = []
     for part in parts:
         header: dict[str, Any] = {"compression": part.compression, "type": OpenEXR.scanlineimage, "colorInteropID": part.color_space}
@@ -214,11 +189,7 @@ def _start_threads() -> None:
 
 
 def finish(temporary: Path, *, path: str | Path, checksum: bool) -> None:
-    """Check that a temporary file is whole, and put its checksum into it where one is wanted.
-
-    Raises:
-        StorageError: the disk took only part of the file; the message names `path`.
-    """
+    """Check that a temporary file is whole, and put its checksum into it where one is wanted."""
     try:
         read_header(temporary)
     except ImageError as error:

@@ -25,11 +25,7 @@ _LEAD = ATTRIBUTE.encode() + b"\0string\0" + struct.pack("<i", DIGITS)
 
 
 def write_checksum(path: Path) -> None:
-    """Put the checksum of a file into its attribute, which was written as UNSET.
-
-    Raises:
-        StorageError: the file cannot be written, or its header has no such attribute.
-    """
+    """Put the checksum of a file into its attribute, which was written as UNSET."""
     place, checksum = _place_and_checksum(path)
     if place is None:
         raise StorageError(f"cannot write {path}: its header has no {ATTRIBUTE}")
@@ -39,11 +35,7 @@ def write_checksum(path: Path) -> None:
 
 
 def is_intact(path: Path) -> bool:
-    """Return whether every byte of a file is as it was written; False where the file has no checksum.
-
-    Raises:
-        StorageError: the file cannot be read.
-    """
+    """Return whether every byte of a file is as it was written; False where the file has no checksum."""
     place, checksum = _place_and_checksum(path)
     if place is None:
         return False

@@ -19,8 +19,7 @@ import numpy as np
 from stage.errors import storage
 from stage.files import replacing
 from stage.formats import exr, exr_checksum
-from stage.formats.exr_chunks import SCANLINES_PER_CHUNK
-from stage.formats.exr_scan import SEVERAL_PARTS
+from stage.formats.exr_scan import SCANLINES_PER_CHUNK, SEVERAL_PARTS
 
 BLOCK_ROWS = 32
 """Every block but the last has a multiple of so many rows: the chunks of all compressions that Relit writes with divide it."""
@@ -39,14 +38,7 @@ class RowFile:
     """An EXR file that takes rows from the top to the bottom."""
 
     def __init__(self, temporary: Path, *, path: Path, rows: int, metadata: Mapping[str, Any]) -> None:
-        """Begin a file.
-
-        Args:
-            temporary: the file that is written.
-            path: the file that it is for, which messages name.
-            rows: of the whole picture.
-            metadata: as of `exr.write_parts`.
-        """
+        """Begin a file."""
         self._temporary, self._path, self._rows, self._metadata = temporary, path, rows, metadata
         self._taken = 0
         self._table = 0
@@ -58,10 +50,6 @@ class RowFile:
         Args:
             parts: those of the picture, with the same channels in every call, each [rows, cols]; rows must be a multiple of BLOCK_ROWS
                 unless they are the last.
-
-        Raises:
-            ValueError: rows that are not the last are no multiple, or there are too many.
-            StorageError: the file cannot be written.
         """
         rows = len(next(iter(parts[0].channels.values())))
         if self._taken + rows > self._rows or (rows % BLOCK_ROWS and self._taken + rows < self._rows):
@@ -96,15 +84,7 @@ class RowFile:
         self._taken += rows
 
     def close(self, *, checksum: bool) -> None:
-        """Write what the file ends with, once it has all rows.
-
-        Args:
-            checksum: as of `exr.write_parts`.
-
-        Raises:
-            ValueError: rows are missing.
-            StorageError: the file cannot be written.
-        """
+        """Write what the file ends with, once it has all rows."""
         if self._taken < self._rows:
             raise ValueError(f"{self._rows - self._taken} of {self._rows} rows are missing")
         with storage("write", self._path), open(self._temporary, "r+b") as file:
@@ -115,16 +95,7 @@ class RowFile:
 
 @contextmanager
 def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: bool = False) -> Iterator[RowFile]:
-    """Yield a file that takes the rows of a picture; it exists when the block ends without an error, whole, and else not at all.
-
-    Args:
-        rows: of the picture.
-        metadata, checksum: as of `exr.write_parts`.
-
-    Raises:
-        ValueError: rows are missing at the end.
-        StorageError: the file cannot be written; nothing is left behind.
-    """
+    """Yield a file that takes the rows of a picture; it exists when the block ends without an error, whole, and else not at all."""
     if checksum:
         metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
     with replacing(path) as temporary:

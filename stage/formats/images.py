@@ -62,12 +62,7 @@ def decoded_by(decoder: Decoder) -> Iterator[None]:
 
 
 def read_header(path: str | Path) -> ImageHeader:
-    """Read the size and the channels of an image.
-
-    Raises:
-        ImageError: relit does not read such files, the file is truncated (EXR and PNG), or it has no grey or RGB channels.
-        StorageError: the file cannot be opened.
-    """
+    """Read the size and the channels of an image."""
     if _elsewhere:
         return _elsewhere[-1].header(Path(path))
     _check_suffix(path)
@@ -105,10 +100,6 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
     Returns:
         [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel.
-
-    Raises:
-        ImageError: the file is damaged, or relit does not read such files.
-        StorageError: the file cannot be opened.
     """
     recorded = read_recorded(path)
     return np.take(fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
@@ -116,11 +107,7 @@ def read_pixels(path: str | Path) -> np.ndarray:
 
 @cache
 def fractions(kind: np.dtype) -> np.ndarray:
-    """Return the fraction of full scale that each integer of an image stands for: [256] or [65536] float32, as OpenImageIO computes it.
-
-    Args:
-        kind: uint8 or uint16.
-    """
+    """Return the fraction of full scale that each integer of an image stands for: [256] or [65536] float32, as OpenImageIO computes it."""
     full = np.iinfo(kind).max
     return np.arange(full + 1, dtype=np.float32) * np.float32(1 / full)
 
@@ -131,10 +118,6 @@ def read_recorded(path: str | Path) -> np.ndarray:
     Returns:
         [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
         returns them; grey images repeat their one channel.
-
-    Raises:
-        ImageError: the file is damaged, or relit does not read such files.
-        StorageError: the file cannot be opened.
     """
     if _elsewhere:
         return _elsewhere[-1].recorded(Path(path))
@@ -183,11 +166,6 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
 def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None = None) -> np.ndarray:
     """Read a mask, which is True where the first channel of an image is above one half.
 
-    Args:
-        path: the image.
-        resolution: the width and height that the mask must have.
-        crop: the part of the mask that is returned; None: all of it.
-
     Returns:
         [rows, cols] bool.
 
@@ -204,15 +182,8 @@ def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None =
 def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
     """Read the values of a mask: the first channel of an image, where partial values stand for pixels that the object covers in part.
 
-    Args:
-        path: the image.
-        resolution: the width and height that the mask must have.
-
     Returns:
         [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0.
-
-    Raises:
-        ImageError: the mask has another size or is unreadable.
     """
     check_resolution(path, resolution)
     values = read_pixels(path)[..., 0].astype(np.float32)
@@ -263,15 +234,7 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
 
 
 def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared: str = "camera.resolution") -> ImageHeader:
-    """Check that an image has the width and height that a camera declares, and return its header.
-
-    Args:
-        resolution: width and height.
-        declared: the field that declares them, for the message.
-
-    Raises:
-        ImageError: the size differs.
-    """
+    """Check that an image has the width and height that a camera declares, and return its header."""
     header = read_header(path)
     if (header.width, header.height) != resolution:
         turned = "" if header.orientation == UPRIGHT else f" once it is {TURNS[header.orientation].words} (EXIF orientation)"

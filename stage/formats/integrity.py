@@ -23,13 +23,7 @@ def check_png(path: str | Path, stream: BinaryIO, *, contents: bool) -> None:
     """Check that the chunks of a PNG file follow each other up to the end chunk.
 
     Args:
-        path: of the file, for messages.
-        stream: the file.
         contents: True compares the checksum of every chunk; False reads the lengths and types of the chunks only.
-
-    Raises:
-        ImageError: the file is not a PNG, is truncated, or is damaged.
-        StorageError: the file cannot be read.
 
     Source: W3C, "Portable Network Graphics (PNG) Specification", third edition, section 5.
     """
@@ -55,14 +49,6 @@ def check_png(path: str | Path, stream: BinaryIO, *, contents: bool) -> None:
 
 def check_jpeg(path: str | Path, stream: BinaryIO) -> None:
     """Check that the segments of a JPEG file follow each other up to the end marker; data after the marker is ignored.
-
-    Args:
-        path: of the file, for messages.
-        stream: the file.
-
-    Raises:
-        ImageError: the file is not a JPEG, or is truncated.
-        StorageError: the file cannot be read.
 
     Source: ITU-T recommendation T.81, annex B.
     """

@@ -19,12 +19,7 @@ RATIOS = {1: (1, 1), 2: (12, 10), 3: (4, 3), 4: (3, 2), 5: (16, 9), 6: (5, 4), 7
 
 
 def resolution(path: str | Path) -> tuple[int, int]:
-    """Return the width and height of a JPEG XL image.
-
-    Raises:
-        ImageError: the file is not a JPEG XL file, or its header is damaged or truncated.
-        StorageError: the file cannot be read.
-    """
+    """Return the width and height of a JPEG XL image."""
     with inputs.opened(path) as source:
         return resolution_of(path, source.file)
 

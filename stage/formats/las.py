@@ -49,16 +49,11 @@ def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, sho
         intensity: [n]; negative values become 0. Integers up to 65535 are kept, other values are scaled to the largest.
         time_s: [n] time of the shot of each point, on the clock of the scan; written as gps_time (GPS week time: seconds, no date).
         shot: [n] index of the shot of each point; the points of one shot are numbered by their range, the nearest first.
-        range_m: [n] metres, the range of each point.
-        path: the file.
+        range_m: [n] the range of each point.
         provenance: texts that are kept in a record beside the scale of intensity.
 
     Returns:
         The scale and the offset of the coordinates, and the scale of intensity.
-
-    Raises:
-        ResultError: there is no point.
-        StorageError: the file cannot be written.
 
     Source:
         ASPRS, "LAS Specification 1.4 - R15", 2019: point data record format 6.

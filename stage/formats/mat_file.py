@@ -42,7 +42,6 @@ def read_mat(path: Path) -> dict[str, Value]:
 
     Raises:
         ManifestError: the file is not a whole .mat file of version 5; the message says what it is.
-        StorageError: the file cannot be read.
     """
     data = inputs.read_bytes(path)
     if data.startswith(b"MATLAB 7.3") or data.startswith(b"\x89HDF"):

@@ -15,13 +15,10 @@ def array_shape(path: str | Path, stream: BinaryIO, max_pixels: int | None = Non
     """Return the shape of a .npy file of real numbers, and leave the stream at its beginning.
 
     Args:
-        path: of the file, for messages.
-        stream: the file.
         max_pixels: the most rows × columns, its first two sides; None for any.
 
     Raises:
         ImageError: the file is no .npy file, not of real numbers, has too many pixels, or does not hold as many bytes as its header says.
-        StorageError: the file cannot be read.
     """
     with storage("read", path):
         try:

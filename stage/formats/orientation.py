@@ -60,13 +60,6 @@ def check_agreement(where: str, orientations: Mapping[str, int]) -> None:
     """Check that all frames of a capture are turned in the same way.
 
     A camera that looks straight down guesses its orientation anew for each photograph.
-
-    Args:
-        where: the manifest, for the message.
-        orientations: of each image, by its name.
-
-    Raises:
-        ManifestError: two images differ; the message names them.
     """
     first: dict[int, str] = {}
     for name, orientation in orientations.items():

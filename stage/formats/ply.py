@@ -28,14 +28,6 @@ class PointCloud(NamedTuple):
 def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
     """Write a point cloud as PLY whole or not at all: position, normal, colour and intensity, the last three when they are known.
 
-    Args:
-        cloud: the points.
-        path: the file.
-        comments: comments for the header, one line each.
-
-    Raises:
-        StorageError: the file cannot be written.
-
     Source:
         Turk, "The PLY Polygon File Format", 1994.
     """
@@ -56,8 +48,6 @@ def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int |
 
     Args:
         vertex: the type of a vertex, whose fields are float32, uint16 or uint8.
-        count: the number of vertices.
-        comments: one line each.
         faces: the number of faces, lists of int32 vertex numbers behind the vertices; None: the file has none.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
@@ -68,12 +58,7 @@ def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int |
 
 
 def read_ply(path: str | Path) -> PointCloud:
-    """Read a PLY file that Relit wrote.
-
-    Raises:
-        ResultError: the file has another layout, or is truncated.
-        StorageError: the file cannot be read.
-    """
+    """Read a PLY file that Relit wrote."""
     with storage("read", path), open(path, "rb") as stream:
         start = stream.read(MAX_HEADER)
         end = start.find(b"end_header\n")

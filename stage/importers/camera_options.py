@@ -54,11 +54,7 @@ class View:
 
 
 def view_of_file(view: View, camera: Path | None, resolution: tuple[int, int]) -> tuple[View, str]:
-    """Return the camera of a file or of the options, and words for it.
-
-    Raises:
-        ManifestError: both give it, or the principal point of the file lies outside the image.
-    """
+    """Return the camera of a file or of the options, and words for it."""
     if camera is None:
         return view, view.describe()
     if view.focal_px is not None or view.principal_px is not None or view.distortion is not None:
@@ -100,11 +96,7 @@ class Selected(NamedTuple):
 
 
 def select(folder: Path, selection: Selection) -> Selected:
-    """Return the images of a folder by what they are.
-
-    Raises:
-        ManifestError: there is no image, an image that was named does not exist, or more than one could be the mask.
-    """
+    """Return the images of a folder by what they are."""
     names = image_names(folder)
     mask = only_image(folder, names, selection.mask, MASK_WORDS, "mask")
     ambient = only_image(folder, names, selection.ambient, AMBIENT_WORDS, "ambient")
@@ -122,11 +114,7 @@ def select(folder: Path, selection: Selection) -> Selected:
 
 
 def refuse_twins(folder: Path, names: Sequence[str]) -> None:
-    """Refuse images that are one photograph, as cameras write it twice: camera raw and JPEG under one name.
-
-    Raises:
-        ManifestError: names two such images.
-    """
+    """Refuse images that are one photograph, as cameras write it twice: camera raw and JPEG under one name."""
     raws = {Path(name).stem.lower(): name for name in names if path_is_raw(name)}
     twin = next((name for name in names if not path_is_raw(name) and Path(name).stem.lower() in raws), None)
     if twin is not None:
@@ -142,11 +130,7 @@ def words_of(name: str) -> frozenset[str]:
 
 
 def only_image(folder: Path, names: list[str], given: str | None, words: frozenset[str], what: str) -> str | None:
-    """Return the image that was named, or else the only one with one of the words in its name, or None.
-
-    Raises:
-        ManifestError: the image that was named does not exist, or several have the words.
-    """
+    """Return the image that was named, or else the only one with one of the words in its name, or None."""
     if given is not None:
         if given not in names:
             raise ManifestError(f"{folder}: --{what} {given}: there is no such image in the folder")
@@ -169,14 +153,8 @@ OPENCV: Axes = ("right", "down", "away")
 
 
 def camera_from_table(axes: Axes) -> np.ndarray:
-    """Return the matrix that takes vectors of a table to the camera frame.
-
-    Returns:
-        [3, 3] float64 for column vectors; it mirrors when the axes are left-handed.
-
-    Raises:
-        ManifestError: two axes lie on one line.
-    """
+    """Return the matrix that takes vectors of a table to the camera frame: [3, 3] float64 for column vectors; it mirrors when the axes are
+    left-handed."""
     matrix = np.array([WAYS[way] for way in axes], dtype=np.float64).T
     if np.linalg.matrix_rank(matrix) < 3:
         raise ManifestError(f"--axes {','.join(axes)}: two of them lie on one line: give one of right, left, one of up, down and one of "

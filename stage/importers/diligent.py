@@ -8,25 +8,13 @@ scale is unknown.
 from pathlib import Path
 
 from stage.capture.manifest import SCHEMA
-from stage.errors import ManifestError, storage
-from stage.importers.layout import image_resolution, read_table, write_capture
+from stage.errors import ManifestError
+from stage.importers.layout import image_resolution, read_lines, read_table, write_capture
 
 
 def import_folder(source: Path, destination: Path) -> Path:
-    """Write a capture.json for an object of the DiLiGenT benchmark.
-
-    Args:
-        source: the folder of the object.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: a text file is missing, has the wrong count of rows, or names an image that does not exist.
-    """
-    with storage("read", source / "filenames.txt"):
-        lines = (source / "filenames.txt").read_text(encoding="utf-8", errors="replace").splitlines()
-    names = [line.strip() for line in lines if line.strip()]
+    """Write a capture.json for an object of the DiLiGenT benchmark."""
+    names = [line for _, line in read_lines(source / "filenames.txt")]
     directions = read_table(source / "light_directions.txt", 3)
     intensities = read_table(source / "light_intensities.txt", 3)
     for name, table in (("light_directions.txt", directions), ("light_intensities.txt", intensities)):

@@ -52,12 +52,8 @@ def made(layout: str, reason: str, words: list[object], source: Path, *, solve: 
     """Return a guess.
 
     Args:
-        layout: what the folder seems to be.
-        reason: why.
         words: the layout and arguments of `relit import`.
-        source: the folder of the capture.
         solve: whether `relit solve` makes the result; else `relit depth`.
-        assumed: what the files do not say.
     """
     program = "solve" if solve else "depth"
     return Guess(layout, reason, assumed, shlex.join(["relit", "import", *map(str, words)]),

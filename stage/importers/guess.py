@@ -42,11 +42,7 @@ FEWEST_PHOTOS = 4
 
 
 def guess(source: Path) -> Guess:
-    """Return what the files of a folder seem to be.
-
-    Raises:
-        ManifestError: nothing fits, or the folder is a capture already.
-    """
+    """Return what the files of a folder seem to be."""
     with storage("read", source):
         names = tuple(natural_order(path.name for path in source.iterdir() if path.is_file() and not path.name.startswith(".")))
     if FILE_NAME in names:

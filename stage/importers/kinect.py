@@ -44,9 +44,6 @@ def import_folder(source: Path, destination: Path, *, packet: Path | None = None
         packet: the packet; None: the only file of the size of a packet.
         p0: the response with the P0 tables; None: the only file with p0 in its name.
         view: the camera, as libfreenect2's IrCameraParams have it; None: orthographic.
-
-    Raises:
-        ManifestError: packet or tables are not there, or have another size; the message names the file.
     """
     packet = packet or _only(source, "depth packet", "--packet", lambda path: path.stat().st_size in PACKET_BYTES)
     p0 = p0 or _only(source, "file of P0 tables", "--p0", lambda path: "p0" in path.name.lower() and path.stat().st_size >= P0_BYTES)
@@ -84,11 +81,7 @@ def companding() -> np.ndarray:
 
 
 def decode(path: Path) -> np.ndarray:
-    """Return the readings of a packet, upright: [9, 424, 512] int32; the first and the last column are 0.
-
-    Raises:
-        ManifestError: the file has another size than a packet.
-    """
+    """Return the readings of a packet, upright: [9, 424, 512] int32; the first and the last column are 0."""
     content = inputs.read_bytes(path)
     if len(content) not in PACKET_BYTES:
         raise ManifestError(f"{path}: has {len(content)} bytes, a depth packet of a Kinect v2 has {IMAGES * IMAGE_BYTES}")
@@ -106,11 +99,7 @@ def decode(path: Path) -> np.ndarray:
 
 
 def read_p0(path: Path) -> np.ndarray:
-    """Return the P0 tables of the three frequencies: [3, 424, 512] float64, units of P0_RADIANS, upright.
-
-    Raises:
-        ManifestError: the file is too short.
-    """
+    """Return the P0 tables of the three frequencies: [3, 424, 512] float64, units of P0_RADIANS, upright."""
     content = inputs.read_bytes(path)
     if len(content) < P0_BYTES:
         raise ManifestError(f"{path}: has {len(content)} bytes, the response with the P0 tables of a Kinect v2 has {P0_BYTES} or more")

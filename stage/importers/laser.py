@@ -35,15 +35,11 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
 
     Args:
         view: the camera, as far as options say it.
-        camera: a file with its matrix; None: as `view` says.
         planes: the file of the planes; None: every frame gets a placeholder.
         form: what four coefficients of a plane mean, one of `plane_table.FORMS`.
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.
         unit_m: the metres in one unit of the planes; needed with `planes`.
         selection: which images are frames; None: all but the mask and the one without the laser.
-
-    Raises:
-        ManifestError: the camera is not known, planes cannot be read or do not fit the images; the message names the file.
     """
     given = selection or Selection()
     off = only_image(source, image_names(source), given.ambient, OFF_WORDS, "ambient")
@@ -84,11 +80,7 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
 
 
 def _matched(path: Path, table: PlaneTable, names: list[str]) -> tuple[list[int], str]:
-    """Return which image each plane belongs to, and how it was found.
-
-    Raises:
-        ManifestError: planes and images do not fit each other.
-    """
+    """Return which image each plane belongs to, and how it was found."""
     count = len(table.values)
     if table.names is not None:
         stems = {Path(name).stem.lower(): index for index, name in enumerate(names)}

@@ -7,7 +7,7 @@ import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import OpenImageIO as oiio
@@ -21,6 +21,8 @@ from stage.files import replacing
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
 from stage.records import describe
+
+T = TypeVar("T")
 
 PREVIOUS_NAME = "capture.previous.json"
 """The name under which a capture.json is kept that an import replaces by another."""
@@ -48,37 +50,33 @@ def image_names(folder: Path) -> list[str]:
                              if path.suffix.lower() in images.SUFFIXES and not path.name.startswith("."))
 
 
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines of a text file that are not blank, without white space around them, each with its number from 1."""
+    text = inputs.read_bytes(path).decode("utf-8-sig", "replace")
+    return [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+
+
+def first_of(values: Mapping[str, T], names: Iterable[str]) -> T | None:
+    """Return the value under the first of several names that there is; None where there is none."""
+    return next((values[name] for name in names if name in values), None)
+
+
 def read_table(path: Path, columns: int) -> np.ndarray:
-    """Read a text file with rows of numbers that white space separates.
-
-    Returns:
-        [rows, columns] float64.
-
-    Raises:
-        ManifestError: a row has another count of numbers, or a number is not finite; the message names file and line.
-    """
-    with storage("read", path):
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    """Read a text file with rows of numbers that white space separates: [rows, columns] float64."""
     rows = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
+    for number, line in read_lines(path):
         try:
             row = [float(part) for part in line.split()]
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():
-            raise ManifestError(f"{path}: line {number}: {line.strip()[:60]!r} is not {columns} numbers")
+            raise ManifestError(f"{path}: line {number}: {line[:60]!r} is not {columns} numbers")
         rows.append(row)
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ManifestError: the file is no JSON.
-    """
+    """Return the content of a JSON file."""
     try:
         return json.loads(inputs.read_bytes(path).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -92,11 +90,7 @@ def image_resolution(path: Path) -> tuple[int, int]:
 
 
 def color_space_of(path: Path) -> ColorSpaceName:
-    """Return sRGB for an image of 8-bit integers, and scene-linear for any other.
-
-    Raises:
-        ManifestError: the file is no image.
-    """
+    """Return sRGB for an image of 8-bit integers, and scene-linear for any other."""
     if path.suffix.lower() == ".exr" or path_is_raw(path):
         return "lin_rec709_scene"
     source = oiio.ImageInput.open(str(path))
@@ -128,7 +122,6 @@ def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
     Raises:
         ManifestError: a file is missing, lies outside `source`, or differs from a file of its name in `destination`; then no file
             is placed.
-        StorageError: the file system refuses.
     """
     wanted = []
     for name in names:
@@ -158,18 +151,9 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
     A capture.json that was there and differs is kept as PREVIOUS_NAME.
 
     Args:
-        data: the manifest as plain data.
         table: the file that the manifest was made from; errors name it.
-        destination: the folder of the capture.
         folder: the folder of the images; None: that of `table`.
         arrays: what the .npy files of these names hold, which are written; the other files are placed.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: a value is invalid, or `place_images` refuses a file.
-        StorageError: the file system refuses.
     """
     try:
         manifest = Manifest.model_validate(data)

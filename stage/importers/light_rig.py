@@ -12,7 +12,7 @@ import numpy as np
 from stage.capture.camera import Distortion
 from stage.errors import ManifestError
 from stage.formats.mat_file import read_mat_arrays
-from stage.importers.layout import read_json
+from stage.importers.layout import first_of, read_json
 from stage.importers.opencv_file import lens, read_matrices
 
 POSITIONS = ("s", "positions", "position", "locations", "pos")
@@ -56,9 +56,6 @@ def read_rig(path: Path) -> LightRig:
         path: a .mat file with S (positions) and, if they are known, Dir, Phi and mu; or a .json file with these keys, with `positions`,
             `directions`, `intensities` and `mu`, or with a list `lights` of objects of `position`, `direction`, `intensity`, `mu` and
             `image`.
-
-    Raises:
-        ManifestError: the file holds no positions, or its arrays do not fit each other.
     """
     fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
@@ -77,11 +74,7 @@ def read_rig(path: Path) -> LightRig:
 
 
 def read_camera_matrix(path: Path) -> CameraMatrix:
-    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json).
-
-    Raises:
-        ManifestError: the file holds no matrix of a camera.
-    """
+    """Read the intrinsics of a camera from a .mat file of MATLAB (K, or its transpose) or from an OpenCV file (.yml, .xml, .json)."""
     matlab = path.suffix.lower() == ".mat"
     matrices = read_mat_arrays(path) if matlab else read_matrices(path)
     name = next((name for name in CAMERA_MATRIX if name in matrices), None)
@@ -93,7 +86,7 @@ def read_camera_matrix(path: Path) -> CameraMatrix:
     if k[0, 0] <= 0 or k[1, 1] <= 0:
         raise ManifestError(f"{path}: {name}: its focal lengths are {k[0, 0]:g} and {k[1, 1]:g}: they must be above 0")
     shift = MATLAB_CENTRE if matlab else OPENCV_CENTRE
-    coefficients = next((matrices[name] for name in CAMERA_LENS if name in matrices), None)
+    coefficients = first_of(matrices, CAMERA_LENS)
     glass = None if coefficients is None or not np.any(coefficients) else lens(coefficients, path, "camera")
     return CameraMatrix((float(k[0, 0]), float(k[1, 1])), (float(k[0, 2]) + shift, float(k[1, 2]) + shift), glass,
                         "1, 1 (MATLAB)" if matlab else "0, 0 (OpenCV)")

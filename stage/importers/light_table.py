@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage import inputs
 from stage.errors import ManifestError
 from stage.formats.mat_file import read_mat_arrays
-from stage.importers.layout import read_json
+from stage.importers.layout import first_of, read_json, read_lines
 from stage.text import name_fault
 from stage.tof.raw_frames import read_array
 
@@ -49,9 +48,6 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
             each light; or a .json file with a list of lights or an object of lights by image name.
         variable: the variable of a .mat file, or the key of a JSON object; None: the only one that can be meant.
         run: whether lights are rows or columns of a table of numbers; None: as its shape says.
-
-    Raises:
-        ManifestError: the file holds no table of lights, or its shape leaves open where the lights are; the message names file and line.
     """
     suffix = path.suffix.lower()
     if suffix == ".mat":
@@ -66,18 +62,14 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
     return _from_text(path, run)
 
 
-def read_strengths(path: Path, *, variable: str | None = None) -> np.ndarray:
+def read_strengths(path: Path) -> np.ndarray:
     """Read the strength of each light from a file of its own: rows of one or three numbers.
 
     Returns:
         [lights, 3] float64.
-
-    Raises:
-        ManifestError: the file holds something else.
     """
     if path.suffix.lower() == ".mat":
-        name, values = _variable(path, read_mat_arrays(path), variable,
-                                 sides=(1, 3))
+        name, values = _variable(path, read_mat_arrays(path), None, sides=(1, 3))
         return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")
     _, rows, _ = _rows(path)
     try:
@@ -137,9 +129,7 @@ def _checked(table: LightTable, place: Callable[[int], str]) -> LightTable:
 
 def _rows(path: Path) -> tuple[list[str] | None, list[tuple[int, list[str]]], int | None]:
     """Return the headings of a text file in small letters, the number and the parts of each line, and the count in its first line."""
-    text = inputs.read_bytes(path).decode("utf-8-sig", "replace")
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
-    lines = [(number, line) for number, line in lines if line and not line.startswith(COMMENTS)]
+    lines = [(number, line) for number, line in read_lines(path) if not line.startswith(COMMENTS)]
     separator = next((mark for mark in (";", ",", "\t") if any(mark in line for _, line in lines)), None)
 
     def split(line: str) -> list[str]:
@@ -259,16 +249,16 @@ def _light(path: Path, index: int, key: str | None, entry: Any) -> tuple[str | N
     if not isinstance(entry, dict):
         raise ManifestError(f"{path}: light {index + 1} is {str(entry)[:60]}: give a list of three numbers, or an object")
     small = {str(name).lower(): value for name, value in entry.items()}
-    vector = next((small[name] for name in VECTOR_KEYS if name in small), None)
+    vector = first_of(small, VECTOR_KEYS)
     if vector is None:
         vector = [small.get(axis) for axis in "xyz"]
     if isinstance(vector, dict):
         vector = [vector.get(axis) for axis in "xyz"]
-    strength = next((small[name] for name in STRENGTH_KEYS if name in small), None)
+    strength = first_of(small, STRENGTH_KEYS)
     strength = [strength] * 3 if isinstance(strength, int | float) else strength
     for what, values in (("direction or position", vector), ("strength", strength)):
         if values is not None and not (isinstance(values, list) and len(values) == 3
                                        and all(isinstance(value, int | float) and abs(value) < MOST for value in values)):
             raise ManifestError(f"{path}: light {index + 1}: its {what} is {str(values)[:60]}: give three numbers")
-    name = key or next((small[name] for name in NAME_KEYS if name in small), None)
+    name = key or first_of(small, NAME_KEYS)
     return (None if name is None else str(name)), [float(value) for value in vector], strength

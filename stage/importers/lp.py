@@ -12,7 +12,7 @@ import numpy as np
 
 from stage.capture.manifest import SCHEMA
 from stage.errors import ManifestError, storage
-from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, write_capture
+from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, read_lines, write_capture
 from stage.text import name_fault
 
 
@@ -21,18 +21,10 @@ def import_folder(source: Path, destination: Path) -> Path:
 
     Args:
         source: the .lp file, or a folder with exactly one .lp file.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: there is no .lp file or more than one, a line is wrong, or an image does not exist.
     """
     path = _find(source)
     folder = path.parent
-    with storage("read", path):
-        text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    lines = read_lines(path)
     if not lines or not lines[0][1].isdecimal():
         raise ManifestError(f"{path}: line {lines[0][0] if lines else 1}: must be the count of images")
     count, rows = int(lines[0][1]), lines[1:]

@@ -32,13 +32,8 @@ def import_folder(source: Path, destination: Path, *, axes: Axes, to_light: bool
     Args:
         axes: where x, y and z of the table point, as seen by the camera.
         to_light: whether the vectors point to the light, as directions and positions seen from the object do; False: along its rays.
-        lights: the table; None: the only one in the folder.
-        variable: of a .mat or JSON table, as `read_light_table` takes it.
-        run: whether lights are rows or columns, as `read_light_table` takes it.
+        variable, run: as `read_light_table` takes them.
         strengths: a file with the strength of each light; None: that in the table, else equal.
-
-    Raises:
-        ManifestError: there is no table or more than one, images and lights do not fit, or a value is wrong; the message names the file.
     """
     path = lights or find_table(source)
     table = read_light_table(path, variable=variable, run=run)
@@ -68,11 +63,6 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
     Args:
         axes: where x, y and z of the rig point, as seen by the camera, whose centre is their origin.
         unit_m: the metres in one unit of the positions.
-        lights: the file of the rig; None: the only table in the folder.
-        camera: a file with the matrix of the camera; None: as `view` says.
-
-    Raises:
-        ManifestError: the rig or the camera cannot be read, images and lights do not fit, or a value is wrong; the message names the file.
     """
     path = lights or find_table(source)
     rig = read_rig(path)
@@ -107,11 +97,7 @@ def _entries(rig: LightRig, positions: np.ndarray, matrix: np.ndarray) -> list[d
 
 def import_photos(source: Path, destination: Path, *, selection: Selection | None = None, view: View | None = None,
                   color_space: ColorSpaceName | None = None) -> Imported:
-    """Write a capture.json for images whose lights are yet to be measured.
-
-    Raises:
-        ManifestError: there are fewer than three images; the message names the folder.
-    """
+    """Write a capture.json for images whose lights are yet to be measured."""
     chosen = select(source, selection or Selection())
     names = chosen.frames
     if len(names) < LEAST:
@@ -140,11 +126,7 @@ def _written(source: Path, destination: Path, table: Path, names: Sequence[str],
 
 
 def find_table(source: Path) -> Path:
-    """Return the only table of lights in a folder.
-
-    Raises:
-        ManifestError: there is none, or more than one.
-    """
+    """Return the only table of lights in a folder."""
     with storage("read", source):
         found = natural_order(path.name for path in source.iterdir() if path.suffix.lower() in SUFFIXES and path.name != FILE_NAME
                               and not path.name.startswith("."))
@@ -154,11 +136,7 @@ def find_table(source: Path) -> Path:
 
 
 def match(path: Path, table: LightTable, chosen: Selected) -> tuple[list[str], str]:
-    """Return the image of each light, by its name in the table or by order, and words that say which.
-
-    Raises:
-        ManifestError: a name of the table is no image, or the counts differ where no names tell.
-    """
+    """Return the image of each light, by its name in the table or by order, and words that say which."""
     if table.names is None:
         if len(chosen.frames) != len(table.vectors):
             raise ManifestError(f"{path}: has {len(table.vectors)} lights, the folder {len(chosen.frames)} images "

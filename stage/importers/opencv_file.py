@@ -22,10 +22,6 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
 
     Returns:
         The float64 arrays, of one or two dimensions, by their names.
-
-    Raises:
-        ManifestError: the suffix is unknown, or the file cannot be parsed.
-        StorageError: the file cannot be read.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ManifestError(f"{path}: is no OpenCV calibration: its suffix must be one of {', '.join(SUFFIXES)}")
@@ -85,14 +81,9 @@ def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path,
     """Return the matrix that a file holds under the first of several names.
 
     Args:
-        matrices: the matrices of the file by name.
         names: the names in order of preference.
-        path: the file, for the message.
         what: the name of the quantity, for the message.
         shape: the shape that the matrix must have; None allows any.
-
-    Raises:
-        ManifestError: the file has none of the names, or the matrix has another shape or a value that is not finite.
     """
     name = next((name for name in names if name in matrices), None)
     if name is None:
@@ -104,11 +95,7 @@ def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path,
 
 
 def lens(coefficients: np.ndarray, path: Path, what: str) -> Distortion:
-    """Return the distortion of a manifest from OpenCV's vector k1 k2 p1 p2 [k3 …].
-
-    Raises:
-        ManifestError: the vector has fewer than four coefficients, or one beyond k3 that is not zero.
-    """
+    """Return the distortion of a manifest from OpenCV's vector k1 k2 p1 p2 [k3 …]."""
     values = np.asarray(coefficients, dtype=np.float64).ravel()
     if len(values) < 4 or not np.isfinite(values).all() or np.any(values[COEFFICIENTS:]):
         raise ManifestError(f"{path}: the distortion of the {what} must be k1 k2 p1 p2 and, if any, k3; other models are not known")

@@ -30,11 +30,7 @@ PIXEL_CENTRE = 0.5
 
 
 def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
-    """Return the camera and the projector of the manifest from an OpenCV calibration file.
-
-    Raises:
-        ManifestError: a matrix is missing or invalid, or the file is of images of another size.
-    """
+    """Return the camera and the projector of the manifest from an OpenCV calibration file."""
     found = read_matrices(path)
     rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
     translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
@@ -56,11 +52,7 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
 
 
 def projector_size(path: Path) -> tuple[int, int] | None:
-    """Return the width and height of the projector in a calibration file; None where it does not say them.
-
-    Raises:
-        ManifestError: the file cannot be parsed.
-    """
+    """Return the width and height of the projector in a calibration file; None where it does not say them."""
     return _size(read_matrices(path), PROJECTOR_SIZE)
 
 
@@ -107,11 +99,7 @@ class PatternImages:
 
 
 def import_gray(source: Path, destination: Path, *, pictures: PatternImages, gray: GrayStack) -> Imported:
-    """Write a capture.json for a Gray code.
-
-    Raises:
-        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
-    """
+    """Write a capture.json for a Gray code."""
     return _write(source, destination, pictures, gray.entries(pictures.projector), ())
 
 
@@ -120,16 +108,11 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
     """Write a capture.json for phase shifts, with a Gray code that numbers their periods or without.
 
     Args:
-        pictures: the frames of the phases, and the rig.
-        phase: how they were taken.
         gray_images: the names of the images of a Gray code, as the shell matches them; None: there is none.
         gray_stripe_px: the width of its finest stripe in projector pixels.
         gray: how it was taken; its sequence and bits follow from the axes and the images.
         from_centre: whether the waves have column 0 at the centre of the first pixel. The coordinates of the capture are then 0.5 smaller
             than elsewhere, and the principal point of the projector with them.
-
-    Raises:
-        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
     """
     extra: list[tuple[str, Entry]] = []
     if gray_images is not None:
@@ -152,15 +135,9 @@ def import_scanner(source: Path, destination: Path, *, calibration: Path, codec:
     """Write a capture.json for the images of a scanning program, with the calibration that it wrote.
 
     Args:
-        calibration: its calibration file.
         codec: one of CODECS.
-        axes: column, row or both: what was coded.
         unit_m: the metres in one unit of the translation.
         projector: the width and height of the projector; None: as the calibration says.
-        images: the names of the frames, as the shell matches them; None: every image but mask, white and black.
-
-    Raises:
-        ManifestError: images and patterns do not fit, or the calibration cannot be read; the message names the file.
     """
     size = projector or projector_size(calibration)
     if size is None:
@@ -179,12 +156,6 @@ def import_opencv_gray(source: Path, destination: Path, *, projector: tuple[int,
         calibration: an OpenCV file with the intrinsics of camera and projector, R and T; None leaves them to `relit calibrate procam`, and
             the manifest has the size of the projector alone.
         unit_m: the metres in one unit of T.
-
-    Returns:
-        The path of the manifest.
-
-    Raises:
-        ManifestError: the count of images does not fit the projector, or the calibration file lacks a matrix.
     """
     names = image_names(source)
     patterns = GrayStack().entries(projector)

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stage.errors import ManifestError, storage
+from stage.errors import ManifestError
 from stage.formats.images import SUFFIXES as IMAGE_SUFFIXES
 from stage.formats.mat_file import read_mat_arrays
-from stage.importers.layout import read_json
+from stage.importers.layout import first_of, read_json, read_lines
 from stage.importers.opencv_file import read_matrices
 from stage.tof.raw_frames import read_array
 
@@ -35,10 +35,6 @@ class PlaneTable(NamedTuple):
 
         Args:
             form: one of FORMS, for coefficients; None: not told.
-            path: the file, for messages.
-
-        Raises:
-            ManifestError: a normal is zero, or coefficients come without their form.
         """
         normals = self.values[:, :3] if self.values.shape[1] == 4 else self.values[:, 3:]
         length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -59,9 +55,6 @@ def read_planes(path: Path) -> PlaneTable:
     Args:
         path: text or CSV with a row for each plane, an image name before it or none; .npy or .mat with such an array; or a calibration file
             of OpenCV or JSON (.yml, .xml, .json) with one of NAMES, or with a normal and a distance or a point.
-
-    Raises:
-        ManifestError: there are no planes, or a row is no four or six numbers.
     """
     suffix = path.suffix.lower()
     if suffix in TEXT:
@@ -77,11 +70,9 @@ def read_planes(path: Path) -> PlaneTable:
 
 
 def _from_text(path: Path) -> PlaneTable:
-    with storage("read", path):
-        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     rows: list[list[float]] = []
     names: list[str] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in read_lines(path):
         text = line.partition("#")[0].strip()
         if not text:
             continue
@@ -127,11 +118,10 @@ def _objects(path: Path) -> PlaneTable | None:
 
 def _of_parts(path: Path, matrices: dict[str, np.ndarray]) -> PlaneTable:
     """Return the planes that a calibration file holds under the usual names."""
-    whole = next((matrices[name] for name in NAMES if name in matrices), None)
+    whole = first_of(matrices, NAMES)
     if whole is not None:
         return _table(path, whole, None)
-    normal, distance, point = (next((matrices[name] for name in names if name in matrices), None)
-                               for names in (NORMALS, DISTANCES, POINTS))
+    normal, distance, point = (first_of(matrices, names) for names in (NORMALS, DISTANCES, POINTS))
     if normal is None or (distance is None and point is None):
         raise ManifestError(f"{path}: holds {', '.join(matrices) or 'nothing'}: there must be the planes of the laser, as "
                             f"{', '.join(NAMES[:3])}, or as normal and distance or point")

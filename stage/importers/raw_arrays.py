@@ -36,11 +36,7 @@ class ArrayFiles:
     """The width and height of an image of a raw file, or of the pixels of an array that has them in one row."""
 
     def names(self, folder: Path) -> list[str]:
-        """Return the names of the files in natural order.
-
-        Raises:
-            ManifestError: there is none.
-        """
+        """Return the names of the files in natural order."""
         with storage("read", folder):
             found = natural_order(
                 path.name for path in folder.iterdir() if not path.name.startswith(".") and path.name != "capture.json" and path.is_file()
@@ -51,12 +47,7 @@ class ArrayFiles:
         return found
 
     def read(self, path: Path) -> list[np.ndarray]:
-        """Return the arrays of a file, one for each of `variables`, or the only one.
-
-        Raises:
-            ManifestError: the file lacks a variable, holds several, or needs a type and a size; the message names the file.
-            ImageError: a .npy file is damaged.
-        """
+        """Return the arrays of a file, one for each of `variables`, or the only one."""
         suffix = path.suffix.lower()
         if suffix == ".npy":
             return [read_array(path)]

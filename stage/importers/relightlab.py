@@ -31,9 +31,6 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
     Args:
         source: a .relight or .dome file, or a folder with exactly one of them.
         destination: the folder of the capture, which gets links to, or copies of, the images; None: the folder of the images.
-
-    Raises:
-        ManifestError: the file cannot be read, an image has no light, or lights and images do not fit; the message names the file.
     """
     path = _find(source)
     data = _read(path)

@@ -37,11 +37,7 @@ class GrayStack:
     """Number of images that code the columns and the rows, the finest left out where they are fewer than all; None: all."""
 
     def entries(self, projector: tuple[int, int]) -> list[Entry]:
-        """Return the patterns in the order of the images.
-
-        Raises:
-            ManifestError: a part is unknown or given twice, or there are more bits than the projector has.
-        """
+        """Return the patterns in the order of the images."""
         if not self.sequence or len(set(self.sequence)) < len(self.sequence) or not set(self.sequence) <= set(PARTS):
             raise ManifestError(f"--sequence {','.join(self.sequence)}: give some of {', '.join(PARTS)}, each once")
         found: list[Entry] = []
@@ -59,14 +55,7 @@ def gray_entries(axis: str, size: int, given: int | None, *, inverses: str, fine
     """Return the patterns of one axis of a Gray code.
 
     Args:
-        axis: column or row.
-        size: the pixels of the projector along the axis.
-        given: the count of bits, the finest left out; None: all.
-        inverses: pairs, blocks or none.
-        fine_first: whether the finest stripes come first.
-
-    Raises:
-        ManifestError: there are more bits than the projector has.
+        given: the count of bits, the finest left out; None: all. The others are as of `GrayStack`.
     """
     whole = digit_count(size, 2)
     bits = whole if given is None else given
@@ -99,11 +88,7 @@ class PhaseStack:
     offset_deg: float = 0.0
 
     def entries(self) -> list[Entry]:
-        """Return the patterns in the order of the images.
-
-        Raises:
-            ManifestError: the order is none, or the periods of the rows are of another count.
-        """
+        """Return the patterns in the order of the images."""
         if sorted(self.order) != sorted(LOOPS):
             raise ManifestError(f"--order {','.join(self.order)}: give {', '.join(LOOPS)}, each once, what changes slowest first")
         rows = self.row_periods_px or self.periods_px

@@ -46,10 +46,6 @@ def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequ
         arrays: which files, and what they do not say themselves.
         planes: `first` or `last`: where the images are counted in arrays of three dimensions; None: as their shape says.
         source_m: the place of the light source; None: at the camera.
-
-    Raises:
-        ManifestError: there are more or fewer images than frequencies times phases, or they differ in size; the message names the file.
-        ImageError: a file cannot be read.
     """
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
@@ -94,18 +90,10 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
     Args:
         source: the folder of the arrays, or one file.
         destination: the folder of the capture. .npy files of (rows, cols, bins) are placed there; other histograms are written as .npy.
-        bin_s: the width of a bin in seconds.
-        start_s: the time of flight at which the first bin begins.
-        count_scale: the recorded units of one photon; None: they are estimated from the counts.
-        pulses: the laser pulses of each histogram; None: unknown.
-        first_photon_only: whether the detector counts the first photon of a pulse alone.
+        bin_s, start_s, count_scale, pulses, first_photon_only: as of `stage.capture.ranging.Pulsed`.
         bins: `first` or `last`: where the bins are counted.
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.
-
-    Raises:
-        ManifestError: an array is no histogram of pixels, or sizes differ; the message names the file.
-        ImageError: a file cannot be read.
     """
     arrays = arrays or ArrayFiles()
     folder, names = (source.parent, [source.name]) if source.is_file() else (source, arrays.names(source))

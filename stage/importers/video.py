@@ -27,11 +27,7 @@ class FrameRange(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "FrameRange":
-        """Return the range that a text such as 12-600:6 says: first, last and step.
-
-        Raises:
-            ManifestError: the text is no range.
-        """
+        """Return the range that a text such as 12-600:6 says: first, last and step."""
         span, _, step = text.partition(":")
         first, dash, last = span.partition("-")
         if not (first.isdecimal() and (last.isdecimal() or not last) and (step.isdecimal() or not step)) or (dash and not last):
@@ -61,13 +57,10 @@ def unpack(video: Path, folder: Path, frames: FrameRange) -> VideoFrames:
     """Write frames of a video as PNG images of 8 bits, named by their numbers, after all of them were found readable.
 
     Args:
-        video: the file.
         folder: of the images; those that are there already are replaced.
-        frames: which ones.
 
     Raises:
         ManifestError: the file is no video that OpenCV decodes, or it ends before the last frame.
-        StorageError: an image cannot be written.
     """
     with _opened(video) as capture:
         code = int(capture.get(cv2.CAP_PROP_FOURCC))

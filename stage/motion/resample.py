@@ -38,10 +38,6 @@ def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Args:
         image: [rows, cols] or [rows, cols, 3] float32.
         x: [rows, cols] float32, within the image.
-        y: the same.
-
-    Returns:
-        The interpolated values, in the shape of the image.
 
     Source:
         Keys, "Cubic convolution interpolation for digital image processing", IEEE Trans. ASSP 29(6), 1981, eq. 15 (a = -1/2).
@@ -61,7 +57,6 @@ def touched(flags: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Args:
         flags: [rows, cols] bool.
         x: [rows, cols] float32, within the image.
-        y: the same.
 
     Returns:
         [rows, cols] bool.

@@ -42,7 +42,6 @@ def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
     """Return the tracking frames of a capture, which all lights lit.
 
     Args:
-        capture: an opened capture.
         to: the image of the tracking frame to align to; None stands for the middle one, and the later of two middle ones.
 
     Raises:
@@ -65,11 +64,7 @@ def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
 
 
 def intervals(capture: Capture, tracking: Tracking, frames: list[Frame]) -> list[Interval]:
-    """Return the intervals with their frames of a stack: from the reference on in time, then from the reference backwards.
-
-    Raises:
-        ManifestError: a frame lies too far outside the tracking frames; the message names it.
-    """
+    """Return the intervals with their frames of a stack: from the reference on in time, then from the reference backwards."""
     time_of = {frame.image: time for time, frame in enumerate(capture.manifest.frames)}
     members: list[list[tuple[int, float]]] = [[] for _ in tracking.times[1:]]
     for light, frame in enumerate(frames):

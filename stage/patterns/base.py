@@ -37,11 +37,7 @@ def uniform_patterns() -> tuple[UniformPattern, UniformPattern]:
 
 
 def digit_count(stripes: int, base: int) -> int:
-    """Return how many digits in base k number the stripes from 0; at least one.
-
-    Raises:
-        ValueError: no stripe, or a base under 2.
-    """
+    """Return how many digits in base k number the stripes from 0; at least one."""
     if stripes < 1 or base < 2:
         raise ValueError(f"{stripes} stripes in base {base} cannot be numbered: give at least one stripe and base 2")
     digits = 1
@@ -51,32 +47,20 @@ def digit_count(stripes: int, base: int) -> int:
 
 
 def stripe_count(extent: int, stripe_px: float) -> int:
-    """Return how many stripes, whole or begun, cover `extent` projector pixels.
-
-    Raises:
-        ValueError: a stripe of zero width or less.
-    """
+    """Return how many stripes, whole or begun, cover `extent` projector pixels."""
     if not stripe_px > 0:
         raise ValueError(f"stripes of {stripe_px:g} px have no width: give more than 0")
     return int(-(-extent // stripe_px))
 
 
 def check_index(name: str, value: int, count: int, unit: str) -> None:
-    """Refuse the number of a bit, digit or step that lies beyond the last one.
-
-    Raises:
-        ValueError: names the field.
-    """
+    """Refuse the number of a bit, digit or step that lies beyond the last one."""
     if value >= count:
         raise ValueError(f"{name} {value} does not exist in {count} {unit} (0 to {count - 1})")
 
 
 def check_agreement(patterns: Iterable[Any], fields: tuple[str, ...]) -> None:
-    """Refuse frames of one code whose manifest entries disagree about these fields.
-
-    Raises:
-        ManifestError: names the field and two of its values.
-    """
+    """Refuse frames of one code whose manifest entries disagree about these fields."""
     first, *others = patterns
     for field in fields:
         for other in others:

@@ -110,11 +110,7 @@ class BinaryCode(NamedTuple):
 
     @classmethod
     def collect(cls, frames: Mapping[BinaryPattern | XorPattern, int]) -> "BinaryCode":
-        """Sort the frames of one code by bit.
-
-        Raises:
-            ManifestError: a bit or an inverse is missing, or the frames disagree about their stripes.
-        """
+        """Sort the frames of one code by bit."""
         one = next(iter(frames))
         check_agreement(frames, ("bits", "stripe_px", *(("base_bit",) if one.code == "xor" else ())))
         plain, inverses = ({pattern.bit: index for pattern, index in frames.items() if pattern.inverse == inverse}
@@ -146,9 +142,6 @@ def binary_patterns(extent: int, axis: Axis, *, code: Literal["binary", "gray"] 
     """Return the frames of a binary or Gray code, coarsest bit first, each followed by its inverse, then white and black (OpenCV's order).
 
     Args:
-        extent: projector pixels along the axis.
-        axis: of the code.
-        code: which.
         stripe_px: width of the finest stripe.
         inverses: with each frame its inverse, which gives every pixel a threshold of its own.
         references: with white and black.
@@ -159,27 +152,19 @@ def binary_patterns(extent: int, axis: Axis, *, code: Literal["binary", "gray"] 
     return (*frames, *(uniform_patterns() if references else ()))
 
 
-def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float = 1, inverses: bool = True,
-                 references: bool = True) -> tuple[XorPattern | UniformPattern, ...]:
+def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float = 1,
+                 inverses: bool = True) -> tuple[XorPattern | UniformPattern, ...]:
     """Return the frames of a Gray code in stripes that are all narrow, for scenes whose surfaces light each other.
 
     Args:
-        extent: projector pixels along the axis.
-        axis: of the code.
         base_bit: 0 for XOR-02 (no stripe wider than two finest ones), 1 for XOR-04.
-        stripe_px: width of the finest stripe.
-        inverses: with each frame its inverse.
-        references: with white and black.
-
-    Raises:
-        ValueError: no such bit.
     """
     bits = digit_count(stripe_count(extent, stripe_px), 2)
     if not 0 <= base_bit < bits:
         raise ValueError(f"base bit {base_bit} does not exist in {bits} bits (0 to {bits - 1})")
     frames = [XorPattern(code="xor", axis=axis, bit=bit, bits=bits, base_bit=base_bit, stripe_px=stripe_px, inverse=inverse)
               for bit in reversed(range(bits)) for inverse in ((False, True) if inverses else (False,))]
-    return (*frames, *(uniform_patterns() if references else ()))
+    return (*frames, *uniform_patterns())
 
 
 def _describe(pattern: BinaryPattern | XorPattern) -> str:

@@ -52,10 +52,6 @@ def draw(pattern: Pattern, resolution: tuple[int, int]) -> np.ndarray:
     Convention: coordinates are continuous, 0 at the outer edge of the first pixel; pixel c has its centre at c + 0.5. A code's level is
     taken at u along its axis and v across it.
 
-    Args:
-        pattern: the manifest entry.
-        resolution: width and height of the projector.
-
     Returns:
         [rows, cols] or, in colours, [rows, cols, 3] float32, 0…1, linear light.
     """
@@ -71,13 +67,6 @@ def collect(patterns: Sequence[Pattern | None]) -> Collected:
 
     Args:
         patterns: the entry of each frame; None for frames that are something else.
-
-    Returns:
-        The codes, complete.
-
-    Raises:
-        ManifestError: two frames show one pattern, a bit or digit or its inverse is missing, or the frames of one code disagree
-            about their stripes; the message names it.
     """
     first: dict[Pattern, int] = {}
     for index, pattern in enumerate(patterns):

@@ -96,11 +96,7 @@ class KaryCode(NamedTuple):
 
     @classmethod
     def collect(cls, frames: Mapping[KaryPattern, int]) -> "KaryCode":
-        """Sort the frames of one code by digit.
-
-        Raises:
-            ManifestError: a digit is missing, or the frames disagree about their stripes, levels or colours.
-        """
+        """Sort the frames of one code by digit."""
         one = next(iter(frames))
         check_agreement(frames, ("base", "digits", "stripe_px", "reflected", "levels", "colors"))
         found = {pattern.digit: index for pattern, index in frames.items()}
@@ -123,7 +119,6 @@ def digits_of(code: np.ndarray, base: int, digits: int, *, reflected: bool) -> n
 
     Args:
         code: [...] whole numbers from 0.
-        base: k.
         digits: how many; more significant ones are cut off.
         reflected: a digit t becomes k - 1 - t where the more significant digits, as shown, add up to an odd number: neighbours
             then differ in one digit, by one (k-ary Gray code). With odd k the plain digits above add up to odd at the same time.
@@ -147,16 +142,9 @@ def kary_patterns(extent: int, axis: Axis, *, base: int, reflected: bool = True,
     """Return the frames of base-k digits, most significant first, then white and black, without which levels cannot be told.
 
     Args:
-        extent: projector pixels along the axis.
-        axis: of the code.
-        base: k.
         reflected: k-ary Gray code, in which neighbouring stripes differ in one digit by one.
-        stripe_px: width of the finest stripe.
         levels: [k] grey level of each digit value, linear light; None (and no colors): even steps from 0 to 1.
         colors: [k] colour of each digit value, in place of levels.
-
-    Raises:
-        ValueError: a base below 2, or levels or colours of another count.
     """
     if levels is None and colors is None:
         levels = [value / max(base - 1, 1) for value in range(base)]
@@ -168,11 +156,7 @@ def kary_patterns(extent: int, axis: Axis, *, base: int, reflected: bool = True,
 
 
 def palette(base: int) -> tuple[Rgb, ...]:
-    """Return colours far apart for so many digit values: red, green, blue; for other counts corners of the colour cube.
-
-    Raises:
-        ValueError: not 2 to 8.
-    """
+    """Return colours far apart for so many digit values: red, green, blue; for other counts corners of the colour cube."""
     if not 2 <= base <= len(CUBE):
         raise ValueError(f"{base} colours are not told apart by a palette: choose 2 to {len(CUBE)}, or give colors")
     return PRIMARIES if base == 3 else CUBE[:base]

@@ -75,11 +75,7 @@ class ModulatedCode(NamedTuple):
 
     @classmethod
     def collect(cls, frames: Mapping[ModulatedPattern, int]) -> "ModulatedCode":
-        """Sort the frames of one period by step and carrier step.
-
-        Raises:
-            ManifestError: a frame is missing, or the frames disagree about their steps or carrier.
-        """
+        """Sort the frames of one period by step and carrier step."""
         one = next(iter(frames))
         check_agreement(frames, ("steps", "carrier_steps", "carrier_period_px", "offset_rad"))
         grid = {(pattern.step, pattern.carrier_step): index for pattern, index in frames.items()}

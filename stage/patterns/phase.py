@@ -99,14 +99,7 @@ def raised_cosine(turns: np.ndarray) -> np.ndarray:
 
 
 def joint_periods(extent: int) -> tuple[float, ...]:
-    """Return three periods about 18 pixels whose phases at any two places of a projector are far apart.
-
-    Args:
-        extent: projector pixels along the axis.
-
-    Raises:
-        ValueError: a projector too large for any set here.
-    """
+    """Return three periods about 18 pixels whose phases at any two places of a projector are far apart."""
     for periods, covered in JOINT:
         if extent <= covered:
             return periods
@@ -117,12 +110,8 @@ def phase_patterns(axis: Axis, periods_px: Sequence[float], steps: int = 4) -> t
     """Return every step of every period.
 
     Args:
-        axis: of the code.
         periods_px: any number of periods, in projector pixels.
         steps: of each, 3 or more, evenly spaced.
-
-    Raises:
-        ValueError: no period, or one given twice.
     """
     if not periods_px or len(set(periods_px)) < len(periods_px):
         listed = ", ".join(f"{period:g}" for period in periods_px) or "(none)"
@@ -139,12 +128,8 @@ def micro_patterns(extent: int, axis: Axis, *, periods: int = 5, mean_period_px:
 
     Args:
         extent: projector pixels along the axis, over which no two places look alike.
-        axis: of the code.
         periods: how many, 3 or more; there are two more frames than periods.
         mean_period_px: about which the periods lie.
-
-    Raises:
-        ValueError: too few periods.
     """
     chosen = micro_periods(extent, periods, mean_period_px)
     first = [PhasePattern(code="phase", axis=axis, period_px=chosen[0], step=step, steps=3) for step in range(3)]

@@ -72,11 +72,7 @@ def line_count(columns: int) -> int:
 
 
 def kary_count(columns: int, base: int = 2) -> int:
-    """Return ⌈log_k(N + 1)⌉: images that number N stripes in base k when code 0 is not used.
-
-    Raises:
-        ValueError: no stripe, or a base under 2.
-    """
+    """Return ⌈log_k(N + 1)⌉: images that number N stripes in base k when code 0 is not used."""
     return digit_count(columns + 1, base) if columns >= 1 else digit_count(columns, base)
 
 
@@ -119,11 +115,7 @@ def modulated_sigma(period_px: float, steps: int, carrier_steps: int, noise: flo
 
 
 def depth_sigma(rig: Rig, column_sigma_px: float) -> float:
-    """Return the standard deviation of the depth, σ_Z = Z² σ_u / (f b), metres.
-
-    Raises:
-        ValueError: a distance, baseline or focal length that is not above zero.
-    """
+    """Return the standard deviation of the depth, σ_Z = Z² σ_u / (f b), metres."""
     for name, value in (("baseline", rig.baseline_m), ("distance", rig.distance_m), ("focal length", rig.focal_px)):
         if not value > 0:
             raise ValueError(f"the {name} is {value:g}: give more than 0")
@@ -131,16 +123,7 @@ def depth_sigma(rig: Rig, column_sigma_px: float) -> float:
 
 
 def tabulate(costs: Iterable[Cost], *, frame_rate: float, rig: Rig | None = None) -> tuple[Plan, ...]:
-    """Return the table: what each code costs in time and, with a rig, how precise its depth is.
-
-    Args:
-        costs: of each code.
-        frame_rate: images a second.
-        rig: for the depth; None: columns alone.
-
-    Raises:
-        ValueError: a frame rate that is not above zero, or a rig without distance, baseline or focal length.
-    """
+    """Return the table: what each code costs in time and, with a rig, how precise its depth is."""
     if not frame_rate > 0:
         raise ValueError(f"the frame rate is {frame_rate:g}: give images a second, more than 0")
     return tuple(Plan(cost.name, cost.minimum, cost.images, cost.images / frame_rate, cost.column_sigma_px,

@@ -56,7 +56,7 @@ class RampCode(NamedTuple):
         return f"the {self.axis} ramp needs its opposite or a white frame: give one"
 
 
-def ramp_patterns(axis: Axis, *, references: bool = True) -> tuple[RampPattern | UniformPattern, ...]:
-    """Return the ramp up and the ramp down; with references white and black too."""
+def ramp_patterns(axis: Axis) -> tuple[RampPattern | UniformPattern, ...]:
+    """Return the ramp up and the ramp down, then white and black."""
     return (RampPattern(code="ramp", axis=axis, direction="up"), RampPattern(code="ramp", axis=axis, direction="down"),
-            *(uniform_patterns() if references else ()))
+            *uniform_patterns())

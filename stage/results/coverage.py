@@ -81,7 +81,6 @@ def cover(readings: Readings, mask: np.ndarray, whole: np.ndarray, border: np.nd
     """Estimate the coverage of border pixels.
 
     Args:
-        readings: of the capture.
         mask: [rows, cols] bool, which stands where there is no estimate.
         whole: [rows, cols] bool, the pixels that the object covers wholly.
         border: [n, 2] rows and columns of the pixels to estimate.
@@ -117,11 +116,8 @@ def before_dark(readings: Readings, border: np.ndarray, whole: np.ndarray, clear
     """Return [n] bool: the background beside a border pixel is dark in comparison with the object there.
 
     Args:
-        readings: of the capture.
-        border: [n, 2] rows and columns.
         whole: [rows, cols] bool, pixels of the object alone.
         clear: [rows, cols] bool, pixels of the background alone.
-        far: the distance up to which the background counts, in pixels.
     """
     if not (len(border) and clear.any() and whole.any()):
         return np.zeros(len(border), dtype=bool)
@@ -137,7 +133,6 @@ def mixed_with_dark(readings: Readings, border: np.ndarray, coverage: np.ndarray
     What they have beyond their coverage of the object's radiance is the background's.
 
     Args:
-        readings: of the capture.
         border: [n, 2] rows and columns, at least one.
         coverage: [rows, cols] 0…1, below 1 at the border.
         whole: [rows, cols] bool, pixels of the object alone, at least one.

@@ -42,7 +42,6 @@ def same_surface(first: np.ndarray, second: np.ndarray, distance_px: float | np.
     Args:
         first, second: depths in metres, of one shape; their order does not matter.
         distance_px: the distance between their two pixels, in pixels.
-        camera: a perspective or orthographic camera.
 
     Returns:
         bool in the shape of the depths.
@@ -60,7 +59,6 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
     Args:
         depth: [rows, cols] metres, above zero in the mask.
         mask: [rows, cols] bool, True where there is a depth.
-        camera: of the whole image.
         offset: rows downwards, at least 0, and columns to the right, which may be negative.
         sigma: [rows, cols] metres, standard deviation of the depth; values that are not finite count as 0. None: 0 everywhere.
 
@@ -105,11 +103,7 @@ def _along(depth: np.ndarray, sigma: np.ndarray | None, mask: np.ndarray, camera
 
 
 def _continues(value: np.ndarray, sigma: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return [n] bool: True where noise explains the difference across the middle, or the line of one side leads to the other.
-
-    Args:
-        value, sigma, present: what `_along` returns.
-    """
+    """Return [n] bool: True where noise explains the difference across the middle, or the line of one side leads to the other."""
     before, after = slice(0, SIDE), slice(None, SIDE - 1, -1)  # both towards the middle
     around = np.nanmedian(np.where(present, sigma, np.nan), axis=0)  # pixels that mix two surfaces are less sure than those around them
     least = np.minimum(np.minimum(sigma[SIDE], sigma[SIDE - 1]), around)

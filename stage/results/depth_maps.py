@@ -54,11 +54,7 @@ class DepthMaps:
         return {name: getattr(self, name) for name in LAYERS if getattr(self, name) is not None}
 
     def write(self, path: str | Path) -> None:
-        """Write depth.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status` and COORDINATES.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Write depth.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status` and COORDINATES."""
         estimated = self.mask if self.estimated is None else self.mask | self.estimated
         channels = {}
         for name, values in self.layers().items():
@@ -72,12 +68,7 @@ class DepthMaps:
         """Read a depth.exr that Relit wrote.
 
         Args:
-            path: the file.
             unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
-
-        Raises:
-            ResultError: the layer of the mask or of the depth is missing, or the metadata holds no camera.
-            ImageError: the file is not a readable EXR.
         """
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=DEPTH_FILE)
@@ -113,11 +104,7 @@ class CoordinateMaps:
     provenance: dict[str, str] = field(default_factory=dict)
 
     def write(self, path: str | Path) -> None:
-        """Write depth.exr without layers of depth, whole or not at all.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Write depth.exr without layers of depth, whole or not at all."""
         values = {name: getattr(self, name, None) for name in LAYERS}
         channels = {LAYERS[name][0]: layer.astype(LAYERS[name][1]) for name, layer in values.items() if layer is not None}
         exr.write(path, channels, color_space=exr.DATA, metadata=result_metadata(self.camera, self.provenance))

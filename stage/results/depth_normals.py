@@ -25,7 +25,6 @@ def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, sigma:
     Args:
         depth: [rows, cols] metres.
         mask: [rows, cols] bool, True where there is a depth.
-        camera: whose depth it is.
         sigma: [rows, cols] metres, standard deviation of the depth, by which noise is told from a break; None: there is no noise.
         radius: the radius of the neighbourhood in pixels; 1 is 3×3 pixels.
 

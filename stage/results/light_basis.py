@@ -43,14 +43,8 @@ def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarra
     """Write the basis images as layers `basis.NNN.{R,G,B}`, which are 0 outside the mask, and the mask as `mask.Y`.
 
     Args:
-        path: the EXR file.
         layers: K images, each [3, rows, cols] float16 or float32.
         mask: [rows, cols] bool.
-        color_space: the scene-linear colour space of the images.
-        metadata: further string attributes.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
     """
     channels = {f"{layer_name(k)}.{name}": np.where(mask, plane, 0).astype(plane.dtype)
                 for k, layer in enumerate(layers) for name, plane in zip("RGB", layer, strict=True)}
@@ -63,14 +57,7 @@ def facts_path(path: str | Path) -> Path:
 
 
 def write_facts(path: str | Path, facts: Mapping[str, Any]) -> Path:
-    """Write the JSON file beside a basis.
-
-    Returns:
-        The path of the JSON file.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
-    """
+    """Write the JSON file beside a basis."""
     target = facts_path(path)
     write_text(target, json.dumps({"schema": SCHEMA, **facts}) + "\n")
     return target

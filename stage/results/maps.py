@@ -80,11 +80,7 @@ class SurfaceMaps:
         return replace(self, **changed)
 
     def write(self, path: str | Path) -> None:
-        """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`.
-
-        Raises:
-            StorageError: the file cannot be written.
-        """
+        """Write maps.exr whole or not at all, with pixels that are not estimated 0 in every layer but `status`."""
         kept = self.mask if self.estimated is None else self.mask | self.estimated
         channels: dict[str, np.ndarray] = {}
         for name, values in self.layers().items():
@@ -99,13 +95,8 @@ class SurfaceMaps:
         """Read a maps.exr that Relit wrote.
 
         Args:
-            path: the file.
             unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
             layers: the layers to read beside `mask`; the others are None.
-
-        Raises:
-            ResultError: a layer is incomplete or not finite, or the metadata holds no camera.
-            ImageError: the file is not a readable EXR.
         """
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=MAPS_FILE)

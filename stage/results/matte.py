@@ -86,15 +86,7 @@ class Matte(NamedTuple):
 
 
 def matte_of(capture: Capture, stack: Stack) -> Matte:
-    """Return the matte of a capture.
-
-    Args:
-        capture: its mask says where the object is.
-        stack: its images, as recorded or aligned.
-
-    Raises:
-        ImageError: the mask is empty or unreadable.
-    """
+    """Return the matte of a capture."""
     mask, given = capture.mask(), capture.mask_values()
     readings = Readings(stack, mask.shape[1])
     if ((given > PARTIAL[0]) & (given < PARTIAL[1])).any() and given.max() >= PARTIAL[1]:

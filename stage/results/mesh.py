@@ -26,14 +26,6 @@ class TriangleMesh(NamedTuple):
 def write_mesh_ply(mesh: TriangleMesh, path: str | Path, *, comments: tuple[str, ...] = ()) -> None:
     """Write a mesh as PLY whole or not at all: position, normal, `sigma`, `seen` and colour of the vertices, and the faces.
 
-    Args:
-        mesh: the mesh.
-        path: the file.
-        comments: comments for the header, one line each.
-
-    Raises:
-        StorageError: the file cannot be written.
-
     Source:
         Turk, "The PLY Polygon File Format", 1994.
     """

@@ -18,16 +18,7 @@ def result_metadata(camera: Camera, provenance: Mapping[str, str]) -> dict[str, 
 
 
 def camera_and_provenance(metadata: Mapping[str, Any], path: str | Path, *, file_name: str) -> tuple[Camera, dict[str, str]]:
-    """Return the camera and the provenance from the attributes of a result file.
-
-    Args:
-        metadata: the attributes of the file.
-        path: the file, for the message.
-        file_name: the name of such files, for the message: maps.exr or depth.exr.
-
-    Raises:
-        ResultError: the camera is missing or invalid.
-    """
+    """Return the camera and the provenance from the attributes of a result file."""
     if CAMERA not in metadata:
         raise ResultError(f"{path}: carries no {CAMERA} attribute, so it is not a {file_name} of relit")
     try:
@@ -38,16 +29,7 @@ def camera_and_provenance(metadata: Mapping[str, Any], path: str | Path, *, file
 
 
 def result_file(given: Path, name: str, *, command: str) -> Path:
-    """Return a result file that is given as itself or by its folder.
-
-    Args:
-        given: the file, or its folder.
-        name: of the file in a folder: maps.exr or depth.exr.
-        command: the command that makes such files, for the message.
-
-    Raises:
-        ResultError: it is not there.
-    """
+    """Return a result file that is given as itself or by its folder."""
     file = given / name if given.is_dir() else given
     if not file.is_file():
         raise ResultError(f"{file}: is not there: run `{command}` first")

@@ -38,11 +38,7 @@ class Hsh(NamedTuple):
 
 
 def write(path: str | Path, hsh: Hsh) -> None:
-    """Write an `.rti` file whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
-    """
+    """Write an `.rti` file whole or not at all."""
     channels, rows, cols, terms = hsh.stored.shape
     header = f"#HSH1.2\r\n{FILE_TYPE}\r\n{cols} {rows} {channels}\r\n{terms} {SEPARATE} {ELEMENT_SIZE}\r\n"
     scale, bias = TOP * hsh.quantization.step, -hsh.quantization.zero * hsh.quantization.step
@@ -54,12 +50,7 @@ def write(path: str | Path, hsh: Hsh) -> None:
 
 
 def read(path: str | Path) -> Hsh:
-    """Read an `.rti` file with separate coefficients of three channels, one byte each.
-
-    Raises:
-        ImageError: the file is of another type, its header is damaged, or it has too few or too many bytes.
-        StorageError: the file cannot be read.
-    """
+    """Read an `.rti` file with separate coefficients of three channels, one byte each."""
     with storage("read", path):
         data = Path(path).read_bytes()
     lines: list[bytes] = []

@@ -38,11 +38,7 @@ class Ptm(NamedTuple):
 
 
 def write(path: str | Path, ptm: Ptm) -> None:
-    """Write a `.ptm` file whole or not at all: RGB for three channels, LRGB for a luminance and colours.
-
-    Raises:
-        StorageError: the file cannot be written; nothing is left behind.
-    """
+    """Write a `.ptm` file whole or not at all: RGB for three channels, LRGB for a luminance and colours."""
     channels, rows, cols, _ = ptm.stored.shape
     name = RGB if channels == 3 else LRGB
     scales = " ".join(np.format_float_positional(step, unique=True, trim="0") for step in ptm.quantization.step)
@@ -59,12 +55,7 @@ def write(path: str | Path, ptm: Ptm) -> None:
 
 
 def read(path: str | Path) -> Ptm:
-    """Read an uncompressed `.ptm` file, RGB or LRGB.
-
-    Raises:
-        ImageError: the file is of another type, its header is damaged, or it has too few or too many bytes.
-        StorageError: the file cannot be read.
-    """
+    """Read an uncompressed `.ptm` file, RGB or LRGB."""
     with storage("read", path):
         data = Path(path).read_bytes()
     *lines, body = data.split(b"\n", HEADER_LINES) if data.count(b"\n") >= HEADER_LINES else [b""]

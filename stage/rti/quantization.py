@@ -35,7 +35,6 @@ def quantize(coefficients: np.ndarray, quantization: Quantization) -> np.ndarray
 
     Args:
         coefficients: [terms, …].
-        quantization: the step and the zero of each term.
 
     Returns:
         [terms, …] uint8; a coefficient outside the range takes the nearest end of the range.

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
-from stage.records import faults_of, read_record
+from stage.records import faults_of_each, read_record
 from stage.transforms import Transform
 
 SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
@@ -129,24 +129,13 @@ def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
 
     Args:
         path: the file, or the folder with it.
-
-    Returns:
-        The file, and its content.
-
-    Raises:
-        StorageError: the file cannot be read.
-        ManifestError: the file is not JSON, or fields are wrong; a sentence for each names file and field.
     """
     file = path / SCAN_SET_FILE if path.is_dir() else path
     return file, read_record(file, ScanSet, SCAN_SET_SCHEMA, _faults)
 
 
 def write_scan_set(scans: ScanSet, path: Path) -> None:
-    """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a scan-set.json whole or not at all, one scan a line, with what differs from its default."""
     data = scans.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     entries = ",\n".join("    " + json.dumps(entry) for entry in data.pop("scans"))
     body = json.dumps({"schema": data.pop("schema"), "name": data.pop("name"), **data}, indent=2)
@@ -158,11 +147,7 @@ def _faults(data: dict[str, Any]) -> Iterator[str]:
     scans = data.get("scans")
     if not isinstance(scans, list):
         return
-    for index, scan in enumerate(scans):
-        try:
-            ScanEntry.model_validate(scan)
-        except ValidationError as error:
-            yield from faults_of(error, within=("scans", index))
+    yield from faults_of_each(data, "scans", ScanEntry)
     turntable = data.get("turntable")
     angles = turntable.get("angles_deg") if isinstance(turntable, dict) else None
     yield from _between_scans([scan.get("name") if isinstance(scan, dict) else None for scan in scans],

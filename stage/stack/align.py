@@ -36,16 +36,7 @@ class Alignment:
     """The alignment of the frames of a stack, one tracking interval at a time, so that two flows at most are in memory."""
 
     def __init__(self, capture: Capture, tracking: Tracking, frames: list[Frame]) -> None:
-        """Assign the frames of a stack to the intervals between tracking frames.
-
-        Args:
-            capture: an opened capture.
-            tracking: its tracking frames.
-            frames: the frames of its stack.
-
-        Raises:
-            ManifestError: a frame lies too far outside the tracking frames; the message names it.
-        """
+        """Assign the frames of a stack to the intervals between tracking frames."""
         self._tracking = tracking
         self._mask = capture.mask()
         self._intervals = intervals(capture, tracking, frames)
@@ -53,14 +44,7 @@ class Alignment:
         self._lost: list[int] = []
 
     def batches(self, correction: Correction) -> Iterator[tuple[tuple[int, ...], Warp]]:
-        """Yield the lights of one interval after another with the warp of their images, which several threads may call.
-
-        Args:
-            correction: the correction of the capture, which tracking frames need too.
-
-        Raises:
-            ImageError: a tracking frame is unreadable, or dark; the message names the file.
-        """
+        """Yield the lights of one interval after another with the warp of their images, which several threads may call."""
         from stage.motion import flow  # OpenCV takes 0.15 s to load, which only aligned captures need
 
         frames, middle = self._tracking.frames, self._tracking.reference

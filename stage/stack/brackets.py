@@ -110,9 +110,6 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights 
     """Return a stack whose frames of one light are merged; where every light has one frame, the stack as it is.
 
     Args:
-        stack: of the frames.
-        frames: of the stack, in its order.
-        lights: of the frames.
         component: what the images of a polarised pair become.
         leak: of the polarisers, `Manifest.polarizer_leak`.
     """
@@ -139,12 +136,7 @@ def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights 
 
 
 def one_frame_a_light(stack: Stack, lights: Lights) -> tuple[Stack, Lights]:
-    """Return the first frame of each bracket of a merged stack, with the frames outside brackets, and their lights.
-
-    Args:
-        stack: of merge_brackets.
-        lights: of its frames.
-    """
+    """Return the first frame of each bracket of a merged stack, with the frames outside brackets, and their lights."""
     if not isinstance(stack, BracketedStack):
         return stack, lights
     first = np.ones(stack.light_count, dtype=bool)

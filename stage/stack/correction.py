@@ -80,22 +80,14 @@ class Correction:
         return cls(capture, dark, flat, total / len(off), full_scale)
 
     def apply(self, frame: Frame) -> Radiance:
-        """Read one frame and correct it.
-
-        Raises:
-            ImageError: the file is unreadable, or a recorded value is NaN, infinite or negative beyond noise; the message names the file.
-        """
+        """Read one frame and correct it."""
         coded = self.coded(frame)
         if isinstance(coded, Radiance):
             return coded
         return Radiance(np.take(coded.values, coded.codes), coded.saturated)
 
     def coded(self, frame: Frame) -> Radiance | CodedRadiance:
-        """Read one frame and correct it, and leave integers and half values as they are where `has_codes`.
-
-        Raises:
-            ImageError: as `apply`.
-        """
+        """Read one frame and correct it, and leave integers and half values as they are where `has_codes`."""
         manifest = self.capture.manifest
         recorded = self.capture.recorded(frame.image, keep_half=True)
         saturated: np.ndarray | None = None
@@ -143,7 +135,6 @@ class Correction:
 
         Args:
             recorded: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16.
-            frame: which gives the exposure.
         """
         pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:

@@ -19,12 +19,7 @@ class Fingerprints:
     """The content hashes of the files of one folder, which are kept in a JSON file between runs."""
 
     def __init__(self, folder: Path, memory: Path) -> None:
-        """Load the hashes that an earlier run has kept.
-
-        Args:
-            folder: the folder of the files.
-            memory: the JSON file of the hashes, which need not exist.
-        """
+        """Load the hashes that an earlier run has kept."""
         self._folder = folder
         self._memory = memory
         self._known: dict[str, list[int | str]] = {}
@@ -35,11 +30,7 @@ class Fingerprints:
             pass  # damaged hashes are computed again
 
     def of(self, names: Iterable[str]) -> dict[str, str]:
-        """Return the content hash of each file by its name.
-
-        Raises:
-            StorageError: a file cannot be read.
-        """
+        """Return the content hash of each file by its name."""
         wanted = list(dict.fromkeys(names))
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="relit-fingerprints") as pool:
             return dict(zip(wanted, pool.map(self._of, wanted), strict=True))
@@ -59,11 +50,7 @@ class Fingerprints:
 
 
 def digest(path: str | Path) -> str:
-    """Return the content hash of one file: BLAKE2b with 16 bytes, in hexadecimal digits.
-
-    Raises:
-        StorageError: the file cannot be read.
-    """
+    """Return the content hash of one file: BLAKE2b with 16 bytes, in hexadecimal digits."""
     content = hashlib.blake2b(digest_size=16)
     with inputs.opened(path) as source, storage("read", path):
         while block := source.file.read(BLOCK):

@@ -75,7 +75,6 @@ class Ingest:
 
         Raises:
             ManifestError: no light lit any frame of the capture.
-            StorageError: an image cannot be read.
         """
         frames = capture.sources()
         if not frames:
@@ -93,8 +92,6 @@ class Ingest:
 
         Raises:
             ManifestError: a frame lies too far outside the tracking frames.
-            ImageError: an image is unreadable or holds impossible values, or a tracking frame is dark; the message names the file.
-            StorageError: the cache cannot be written (no space, read-only folder); nothing is left behind.
         """
         found = stacks.find(self.folder, self.key)
         if found is not None:
@@ -113,11 +110,7 @@ class Ingest:
 
 def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None,
                progress: FrameProgress | None = None) -> Stack:
-    """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do.
-
-    Raises:
-        ManifestError, ImageError, StorageError: for the reasons that these two name.
-    """
+    """Return the stack of the light frames of a capture, as `Ingest.of` and `Ingest.stack` do."""
     return Ingest.of(capture, cache=cache, tracking=tracking).stack(progress)
 
 

@@ -38,10 +38,6 @@ class ExposureSeries(NamedTuple):
 def exposure_series(capture: Capture, frames: Sequence[Frame]) -> ExposureSeries | None:
     """Return the frames of patterns by their exposures; None where no pattern was taken at more than one.
 
-    Args:
-        capture: for messages.
-        frames: of patterns.
-
     Raises:
         ManifestError: some patterns were not taken at an exposure that others were, or the images do not say where they saturate.
     """
@@ -65,11 +61,7 @@ def exposure_series(capture: Capture, frames: Sequence[Frame]) -> ExposureSeries
 
 
 def frames_shown(capture: Capture) -> tuple[list[Frame], ExposureSeries | None]:
-    """Return one frame of each pattern of a capture, and the series that they are joined from, where there is one.
-
-    Raises:
-        ManifestError: as `exposure_series`.
-    """
+    """Return one frame of each pattern of a capture, and the series that they are joined from, where there is one."""
     taken = [frame for frame in capture.manifest.frames if frame.pattern is not None]
     series = exposure_series(capture, taken)
     return (taken if series is None else list(series.shown)), series
@@ -87,12 +79,9 @@ class JoinedExposures:
         """Read all frames once, to learn at which exposures no frame of a pixel is clipped.
 
         Args:
-            capture: of the frames.
-            series: the frames.
             progress: called after every pattern with the count of patterns that have been read.
 
         Raises:
-            ImageError: a frame is unreadable.
             ManifestError: a frame does not say where it saturates.
         """
         self._correction = Correction.of(capture, full_scale=True)
@@ -125,9 +114,6 @@ class JoinedExposures:
 
         Args:
             frame: one of `ExposureSeries.shown`.
-
-        Raises:
-            ImageError: a frame is unreadable.
         """
         total = np.zeros((*self._total.shape, 3), dtype=np.float32)
         saturated = np.zeros_like(self._lost)

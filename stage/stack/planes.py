@@ -56,7 +56,6 @@ class Planes:
         """Return some frames of a range of rows, each pixel times its exposure.
 
         Args:
-            rows: the range.
             frames: indices of the frames; None stands for all.
 
         Returns:
@@ -75,16 +74,10 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
     """Decode and correct frames on a thread pool, and yield planes that exist until the block ends.
 
     Args:
-        capture: an opened capture.
-        frames: frames of the capture.
         colour: True keeps three channels, False weighs them with GREY_WEIGHTS.
         cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
         progress: called after every frame with the count of frames that have been read.
         joined: how each frame is joined of several exposures; None: they are read as they are.
-
-    Raises:
-        ImageError: a frame is unreadable or holds impossible values; the message names the file.
-        StorageError: the scratch file cannot be written.
     """
     read_frame = Correction.of(capture).apply if joined is None else joined.read
     marked = joined is not None or capture.manifest.saturation is not None
@@ -111,16 +104,7 @@ def frame_planes(capture: Capture, frames: Sequence[Frame], *, colour: bool, cac
 
 @contextmanager
 def scratch_arrays(size: int, capture: Capture, cache: Path | None) -> Iterator[Callable[[tuple[int, ...], type[np.generic]], np.ndarray]]:
-    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files.
-
-    Args:
-        size: bytes of all arrays together.
-        capture: whose folder has the scratch file, where `cache` does not.
-        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture.
-
-    Raises:
-        StorageError: when the function is called: the file cannot be made.
-    """
+    """Yield a function that makes arrays: in memory up to MEMORY_BYTES in all, otherwise in unnamed temporary files."""
     if size <= MEMORY_BYTES:
         yield lambda shape, dtype: np.empty(shape, dtype)
         return

@@ -25,7 +25,6 @@ class ReplacedStack(Stack):
         """Return a stack with these readings in place of its own.
 
         Args:
-            stack: of the other readings.
             pixel: [n] row-major positions in the image.
             light: [n] positions in the stack.
             radiance: [3, n].

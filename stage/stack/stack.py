@@ -63,11 +63,7 @@ class Stack:
         return (CHANNELS, padded(self.light_count, LIGHT_PAD), padded(self.pixel_count, PIXEL_PAD))
 
     def bands(self, bytes_per_pixel: int = 0) -> Iterator[tuple[int, int]]:
-        """Yield pixel ranges [start, stop) that cover the padded pixel axis, each a multiple of 64 pixels.
-
-        Args:
-            bytes_per_pixel: the bytes that the caller allocates for each pixel beside the stack.
-        """
+        """Yield pixel ranges [start, stop) that cover the padded pixel axis, each a multiple of 64 pixels."""
         channels, lights, pixels = self.shape
         per_pixel = 2 * channels * lights + bytes_per_pixel
         step = max(PIXEL_PAD, BAND_BYTES // per_pixel // PIXEL_PAD * PIXEL_PAD)
@@ -86,11 +82,8 @@ class Stack:
         return self._map(values_path(self.folder, self.key), self.shape)[:, :, start:stop]
 
     def saturated(self, start: int, stop: int) -> np.ndarray:
-        """Return the saturation bits of a pixel range.
-
-        Returns:
-            [lights padded / 8, stop - start] uint8; bit l % 8 of byte l // 8 is set where light l has no usable reading.
-        """
+        """Return the saturation bits of a pixel range: [lights padded / 8, stop - start] uint8; bit l % 8 of byte l // 8 is set where light
+        l has no usable reading."""
         path = saturated_path(self.folder, self.key)
         shape = (self.shape[1] // 8, self.shape[2])
         if not path.exists():
@@ -118,9 +111,6 @@ class Stack:
     def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of single pixels, and which readings are usable.
 
-        Args:
-            pixels: [n] row-major indices.
-
         Returns:
             [lights, n, 3] float64 scene-linear and [lights, n] bool, without padding.
         """
@@ -131,9 +121,6 @@ class Stack:
 
     def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
         """Return the saturation bits of single pixels.
-
-        Args:
-            pixels: [n] row-major indices.
 
         Returns:
             [lights padded / 8, n] uint8, a copy.
@@ -196,7 +183,6 @@ def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> N
     """Write the index of a stack, which completes it.
 
     Args:
-        stack: whose values and saturation bits are in its folder.
         values: the checksums of its planes, in the order of channels and padded lights.
         saturated: the checksum of the saturation bits, or None where there are none.
     """

@@ -29,7 +29,6 @@ def of_plane(plane: np.ndarray, padding: int) -> int:
     """Return the checksum of a plane that is followed by zeros.
 
     Args:
-        plane: contiguous values.
         padding: the bytes of zeros behind it.
     """
     return zlib.crc32(bytes(padding), zlib.crc32(plane.data))
@@ -39,9 +38,7 @@ def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksu
     """Return whether a cache file holds an array of this shape and type whose planes have these checksums.
 
     Args:
-        path: a .npy file.
         shape: of the array; the last axis and, for half values, the light axis are padded.
-        kind: the type of the values.
         checksums: of the planes along the last axis in C order, or of the whole array where there is one.
     """
     expected = list(checksums)

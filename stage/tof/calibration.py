@@ -96,7 +96,6 @@ class TofCalibration(Strict):
         """Return measured ranges in metres, corrected for scale, offset and drift.
 
         Args:
-            range_m: measured ranges of any shape.
             temperature_c: the temperature of the camera, for a calibration with drift.
 
         Raises:
@@ -112,32 +111,22 @@ class TofCalibration(Strict):
 
 
 def read_calibration(path: str | Path) -> TofCalibration:
-    """Read a relit.tof/1 file.
-
-    Raises:
-        ManifestError: a field is wrong; the message names file and field.
-    """
+    """Read a relit.tof/1 file."""
     return read_record(path, TofCalibration, SCHEMA)
 
 
 def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
-    """Write a relit.tof/1 file whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a relit.tof/1 file whole or not at all."""
     data = {"schema": SCHEMA, **calibration.model_dump(mode="json", exclude_defaults=True, exclude={"schema_"})}
     write_text(path, json.dumps(data, indent=2) + "\n")
 
 
-def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float, *, highest: int = HARMONICS) -> Harmonics:
+def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float) -> Harmonics:
     """Fit the wiggling at one frequency to phases that were measured at known ranges.
 
     Args:
         phase_rad: [n] measured phases, radians.
         range_m: [n] true ranges along the ray, metres.
-        modulation_hz: the modulation frequency.
-        highest: the highest harmonic.
 
     Raises:
         CalibrationError: there are too few readings, or they cover too little of a period.
@@ -145,9 +134,9 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
     Source:
         Lindner, Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
     """
-    unknowns = 2 * highest + 1
+    unknowns = 2 * HARMONICS + 1
     if phase_rad.shape != range_m.shape or phase_rad.ndim != 1 or len(phase_rad) < 2 * unknowns:
-        raise CalibrationError(f"the sweep has {phase_rad.size} phases and {range_m.size} ranges: harmonics up to {highest} need "
+        raise CalibrationError(f"the sweep has {phase_rad.size} phases and {range_m.size} ranges: harmonics up to {HARMONICS} need "
                                f"{2 * unknowns} of each")
     covered = len(np.unique(np.floor(np.mod(phase_rad, 2 * np.pi) / (2 * np.pi) * 32))) / 32
     if covered < SWEEP_PART:
@@ -156,24 +145,17 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
     error = phase_rad - 4 * np.pi * modulation_hz / SPEED_OF_LIGHT * range_m
     centre = np.angle(np.exp(1j * error).mean())  # so that an offset near half a period does not wrap
     error = centre + np.angle(np.exp(1j * (error - centre)))
-    angle = phase_rad[:, None] * np.arange(highest + 1)
+    angle = phase_rad[:, None] * np.arange(HARMONICS + 1)
     matrix = np.concatenate([np.cos(angle), np.sin(angle[:, 1:])], axis=1)
     found = np.linalg.lstsq(matrix, error, rcond=1e-6)[0]
-    return Harmonics(modulation_hz=modulation_hz, cos=tuple(found[: highest + 1].tolist()), sin=(0.0, *found[highest + 1 :].tolist()))
+    return Harmonics(modulation_hz=modulation_hz, cos=tuple(found[: HARMONICS + 1].tolist()), sin=(0.0, *found[HARMONICS + 1 :].tolist()))
 
 
 def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
-    """Fit scale and offset of a `TofCalibration` to known ranges by least squares.
-
-    Args:
-        measured_m: [n] measured ranges, metres.
-        true_m: [n] true ranges, metres.
+    """Fit scale and offset of a `TofCalibration` to known ranges, [n] each, by least squares.
 
     Returns:
         scale and offset_m.
-
-    Raises:
-        CalibrationError: there are fewer than two different ranges.
     """
     if measured_m.shape != true_m.shape or measured_m.ndim != 1 or np.unique(true_m).size < 2 or np.ptp(measured_m) == 0:
         raise CalibrationError(f"{measured_m.size} measured and {true_m.size} true ranges give no line: "
@@ -183,17 +165,10 @@ def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
 
 
 def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Temperature, float]:
-    """Fit the drift with temperature to range errors, relative to the mean temperature.
-
-    Args:
-        error_m: [n] range errors, metres.
-        temperature_c: [n] temperatures.
+    """Fit the drift with temperature to range errors, [n] each, relative to the mean temperature.
 
     Returns:
         The drift, and the error at its reference temperature in metres.
-
-    Raises:
-        CalibrationError: there are fewer than two different temperatures.
     """
     if error_m.shape != temperature_c.shape or np.unique(temperature_c).size < 2:
         raise CalibrationError("drift needs errors at two different temperatures or more: give one error a temperature")
@@ -239,9 +214,5 @@ class Sweep(Strict):
 
 
 def read_sweep(path: str | Path) -> Sweep:
-    """Read a relit.tof-sweep/1 file.
-
-    Raises:
-        ManifestError: a field is wrong; the message names file and field.
-    """
+    """Read a relit.tof-sweep/1 file."""
     return read_record(path, Sweep, SWEEP_SCHEMA)

@@ -63,12 +63,7 @@ def is_pulsed(capture: Capture) -> bool:
 
 
 def read_correlations(capture: Capture) -> CorrelationImages:
-    """Read the correlation images of a capture.
-
-    Raises:
-        ManifestError: there is none.
-        ImageError: a file is unreadable or has another size than the camera; the message names the file.
-    """
+    """Read the correlation images of a capture."""
     frames = _frames(capture, ContinuousWave)
     if not frames:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: none is cw")
@@ -84,8 +79,6 @@ def read_histograms(capture: Capture) -> Histograms:
 
     Raises:
         ManifestError: there is none, frames have different bins, or first_photon_only is given without pulses.
-        ImageError: a file is unreadable, has another size than the camera, or holds impossible counts; the message names the
-            file.
     """
     frames = _frames(capture, Pulsed)
     if not frames:
@@ -105,25 +98,15 @@ def read_histograms(capture: Capture) -> Histograms:
 
 
 def check_frames(capture: Capture) -> None:
-    """Check that the time-of-flight frames of a capture go together: one kind, one place of the source, and the same bins.
-
-    Raises:
-        ManifestError: they do not; the message names the frames.
-    """
+    """Check that the time-of-flight frames of a capture go together: one kind, one place of the source, and the same bins."""
     if is_pulsed(capture):
         _check_bins(capture, _frames(capture, Pulsed))
     read_source(capture)
 
 
 def read_frame(capture: Capture, frame: Frame) -> np.ndarray:
-    """Read the recorded values of one time-of-flight frame.
-
-    Returns:
-        [rows, cols] float32 of a correlation image, which may be negative or not finite; [rows · cols, bins] float32 counts of histograms.
-
-    Raises:
-        ImageError: the file is unreadable or has another size than the camera, or holds impossible counts; the message names the file.
-    """
+    """Read the recorded values of one time-of-flight frame: [rows, cols] float32 of a correlation image, which may be negative or not
+    finite; [rows · cols, bins] float32 counts of histograms."""
     return _histogram(capture, frame) if isinstance(frame.tof, Pulsed) else _plane(capture, frame)
 
 
@@ -190,11 +173,7 @@ def _histogram(capture: Capture, frame: Frame) -> np.ndarray:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Read a .npy file of real numbers.
-
-    Raises:
-        ImageError: the file is no whole .npy file, or not of real numbers; the message names the file.
-    """
+    """Read a .npy file of real numbers."""
     with inputs.opened(path) as source:
         array_shape(path, source.file, source.max_pixels)
         with storage("read", path):

@@ -41,7 +41,6 @@ def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, 
     """Interpolate the poses of a track at given times: positions linearly, rotations by slerp.
 
     Args:
-        track: the poses in order of time.
         times_s: [n] seconds, on the clock of the track.
 
     Returns:
@@ -118,10 +117,6 @@ def read_scan(path: str | Path) -> Shots:
 
     Args:
         path: the folder of the scan, or the scan.json in it.
-
-    Raises:
-        ManifestError: scan.json is missing or wrong; the message names the field.
-        ImageError: an array is unreadable or has the wrong shape; the message names the file.
     """
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given
@@ -162,7 +157,6 @@ def world_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[
     """Return the world points of ranges, from the pose of the platform at the time of each shot.
 
     Args:
-        shots: the shots of the scan.
         index: [m] the shot of each range; a shot may have several ranges.
         range_m: [m] metres.
 

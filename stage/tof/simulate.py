@@ -105,11 +105,8 @@ class HistogramCamera:
 
 
 def correlation_images(scene: TofScene, camera: CorrelationCamera, random: np.random.Generator | None = None) -> np.ndarray:
-    """Return correlation images, with noise when `random` is given.
-
-    Returns:
-        [images, rows, cols] float64 electrons, in the order of `camera.settings()`.
-    """
+    """Return correlation images, with noise when `random` is given: [images, rows, cols] float64 electrons, in the order of
+    `camera.settings()`."""
     images = []
     for hz, delta in camera.settings():
         mean = camera.ambient_electrons * scene.albedo
@@ -146,14 +143,7 @@ def histograms(scene: TofScene, camera: HistogramCamera, random: np.random.Gener
 
 def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera: Camera, sensor: CorrelationCamera,
                        source_m: Vector | None = None) -> Path:
-    """Write images of `correlation_images` as a capture, with the place of the light source in the camera frame (None: at the camera).
-
-    Returns:
-        The path of its capture.json.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
+    """Write images of `correlation_images` as a capture, with the place of the light source in the camera frame (None: at the camera)."""
     frames = []
     for index, (image, (hz, delta)) in enumerate(zip(images, sensor.settings(), strict=True)):
         frames.append(Frame(image=f"{index:03d}.npy", tof=ContinuousWave(type="cw", modulation_hz=hz, reference_phase_rad=delta,
@@ -164,14 +154,7 @@ def write_correlations(folder: str | Path, name: str, images: np.ndarray, camera
 
 def write_histograms(folder: str | Path, name: str, counts: np.ndarray, camera: Camera, sensor: HistogramCamera,
                      source_m: Vector | None = None) -> Path:
-    """Write counts of `histograms` as a capture, with the place of the light source in the camera frame (None: at the camera).
-
-    Returns:
-        The path of its capture.json.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
+    """Write counts of `histograms` as a capture, with the place of the light source in the camera frame (None: at the camera)."""
     _save(Path(folder) / "histograms.npy", counts)
     tof = Pulsed(type="pulsed", bin_s=sensor.bin_s, start_s=sensor.start_s, pulses=sensor.pulses,
                  first_photon_only=sensor.pulses is not None, source_m=source_m)

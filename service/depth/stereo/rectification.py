@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.capture.camera import Camera
-from stage.capture.other_camera import OtherCamera
+from stage.capture.camera import Camera, OtherCamera
 from stage.errors import ManifestError
 from stage.motion.resample import bicubic, touched
 from stage.transforms import OPENCV_FROM_CAMERA

@@ -10,8 +10,7 @@ import pytest
 
 from kernels.status import Status
 from service.depth.stereo.rectification import rectify
-from stage.capture.camera import Camera
-from stage.capture.other_camera import OtherCamera
+from stage.capture.camera import Camera, OtherCamera
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.reference import projector as reference

@@ -81,7 +81,7 @@ def test_images_follow_the_contract(axis):
 
 @pytest.mark.parametrize("base_bit, widest", [(0, 2), (1, 4)])
 def test_xor_stripes_are_all_narrow(base_bit, widest):
-    patterns = xor_patterns(256, "column", base_bit=base_bit, inverses=False, references=False)
+    patterns = xor_patterns(256, "column", base_bit=base_bit, inverses=False)[:-2]
     for pattern in patterns:
         edges = np.flatnonzero(np.diff(draw(pattern, (256, 1))[0]))
         assert np.diff(edges).max() <= widest, pattern

@@ -276,7 +276,7 @@ def test_a_cache_folder_that_cannot_be_made(tmp_path):
 NO_SPACE = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
-from stage.capture import Capture
+from stage.capture.capture import Capture
 from stage.stack.ingest import open_stack
 from stage.errors import StorageError
 try:

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from service.depth.stereo.rectification import rectify
-from stage.capture.camera import Camera
-from stage.capture.other_camera import OtherCamera
+from stage.capture.camera import Camera, OtherCamera
 from stage.errors import ManifestError
 from tests.reference import projector as reference
 from tests.scenes.depth import entry_of
