@@ -139,7 +139,7 @@ def test_a_process_that_takes_too_long_or_is_not_wanted_is_ended(monkeypatch, tm
 def test_what_a_library_prints_is_no_answer(tmp_path):
     """The decoders of damaged files print on the standard output."""
     write_capture(tmp_path / "cap", make_scene(size=8, lights=5))
-    noise = f"import os, sys; sys.path[:0] = {sys.path!r}\nfrom stage import images\nbefore = images.read_header"
+    noise = f"import os, sys; sys.path[:0] = {sys.path!r}\nfrom stage.formats import images\nbefore = images.read_header"
     code = f"""{noise}
 def noisy(path):
     os.write(1, b"libtiff: {{}}\\n")

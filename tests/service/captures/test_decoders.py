@@ -165,7 +165,7 @@ def test_the_process_ends_with_the_worker(folder):
 import os, signal, sys
 sys.path[:0] = {sys.path!r}
 from service.captures.decoders import Decoders
-from stage import images
+from stage.formats import images
 found = Decoders({PIXELS})
 with images.decoded_by(found):
     images.read_recorded({str(folder / "a.png")!r})

@@ -235,9 +235,9 @@ def test_results_that_cannot_be_written(relit, tmp_path):
 @pytest.fixture
 def relit_as_nobody(relit):
     """Run `relit ARGS` without the superuser's leave to pass over permissions."""
-    import service.captures.inspect
-    import service.cli.light
-    import service.light.relight
+    import service.captures.info
+    import service.cli.commands.light
+    import service.relight.relight
     import service.solve.solve  # noqa: F401  (from folders that may not be nobody's to read)
 
     devices.names()

@@ -22,6 +22,7 @@ from service.server.database.engine import connect
 from service.server.database.intakes import insert as insert_intake
 from service.server.database.schema import upgrade
 from service.server.storage.part_files import PartFile, PartFileLocked
+from service.server.storage.upload_parts import FolderParts
 from tests.service.server.api.test_uploads import at_once, begun, made, part, soon, stored
 from tests.service.server.api.tus import Tus, checksum, encoded
 from tests.service.server_process import serving
@@ -237,10 +238,10 @@ def test_what_nobody_adds_to_expires(tmp_path):
     PartFile.open(folder, "up_orphan").close()
     os.utime(folder / "up_orphan.part", (limit + 1, limit + 1))  # the clock of files is a coarse one
     with PartFile.open(folder, ids["busy"]):
-        assert uploads.expire(database, folder, limit) == 1
+        assert FolderParts(folder, database).expire(limit) == 1
     assert {name for name, identifier in ids.items() if uploads.find(database, identifier, "p") is not None} == {"busy", "new", "done"}
     assert {path.stem for path in folder.iterdir()} == {ids["busy"], ids["new"], "up_orphan"}
-    assert uploads.expire(database, folder, time.time() + 60) == 2
+    assert FolderParts(folder, database).expire(time.time() + 60) == 2
     assert list(folder.iterdir()) == []
     assert uploads.find(database, ids["done"], "p") is not None
     database.close()
