@@ -5,14 +5,12 @@ and camera whose channels mix by the matrix X: the object's reflectance cancels.
 in doubt where the second-best is nearly as near (a mixture at an edge, or noise); up to two doubtful digits are tried both ways,
 and where that changes the stripe by one at most, as it does at every edge of a reflected code, the middle is the result. Readings that lie
 between levels make all digits of the pixel doubtful sooner: the mean misfit of its nearest levels is the scale of its errors. At a carry of
-a plain code several digits are mixed at once (carry.py): where a carry explains the readings better than the nearest levels do, its edge
+a plain code several digits are mixed at once: where a carry explains the readings better than the nearest levels do, its edge
 is the result; where about as well, and it lies elsewhere, the pixel is UNDECIDED.
 
 Sources: Er (reflected k-ary), The Computer Journal 1984; Horn and Kiryati, "Toward optimal structured light patterns", Image and
 Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging with adaptive color structured light", TPAMI 1998
 (crosstalk, equations 1 to 5).
-
-Mixtures of two stripes at a carry of a plain k-ary code, and how well the readings of a pixel fit levels at all.
 
 Where digit j of a plain code grows by one, all finer digits fall from k - 1 to 0. A pixel that sees both stripes reads all of them at one
 mixture t; levels in between look like other digits, and the number that they spell may lie far away. So every such carry is fitted to

@@ -1,1 +1,1 @@
-"""Depth from projected patterns, lasers and time of flight; direct and global light; and the patterns to project."""
+"""Depth from projected patterns, lasers, time of flight and several cameras; direct and global light; and the patterns to project."""

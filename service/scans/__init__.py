@@ -1,1 +1,1 @@
-"""Many scans of one object: reading them, and finding their poses."""
+"""Many scans of one object: reading them, finding their poses, and fusing them into one surface."""

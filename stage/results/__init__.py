@@ -1,1 +1,1 @@
-"""Result files: maps, depths, light bases and meshes, and what they record."""
+"""Result files (maps, depths, light bases, meshes) and what they record; mattes, and the breaks and normals of depths."""

@@ -1,1 +1,1 @@
-"""Normals from a reference object: posteriors over directions."""
+"""Posteriors over normals: from a reference object, or under extended sources."""

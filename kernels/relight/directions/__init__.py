@@ -1,1 +1,1 @@
-"""Directions on the sphere: lat-long maps, grids and triangulations."""
+"""Directions on the sphere: lat-long maps and grids."""

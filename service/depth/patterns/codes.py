@@ -8,8 +8,7 @@ To add a code:
 2. stage/patterns/planner.py: a function that gives the standard deviation of the code.
 3. kernels/structured/NEW.py: the kernel that decodes it.
 4. service/depth/patterns/decoders.py: `new_decoder`. A code that numbers stripes has no decoder of its own: it goes into
-`AxisCodes.stripes` and
-   `_decode_stripes`, so that it numbers the periods of phases too.
+   `AxisCodes.stripes` and `_decode_stripes`, so that it numbers the periods of phases too.
 5. service/requests/patterns.py: a `PatternCode`, which is what users type, and the options that belong to the code.
 6. Here: a row of `CODES`. Its place is its precedence: if a capture holds several codes, the decoder of the first is used.
 7. docs/structured_light.md and docs/capture.md; tests in tests/stage/patterns, tests/kernels/structured and tests/service/depth, with a

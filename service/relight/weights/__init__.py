@@ -1,1 +1,1 @@
-"""Weights of captured lights: triangulations, quadrature and environments."""
+"""Weights of captured lights: triangulation and kernel quadrature."""

@@ -43,6 +43,7 @@ def object_misfit(given: SolveInput, lights: Lights, field: NearField | None = N
     else:
         toward = readings.on_host(near.toward, len(pixels))
     solved = (fit.status.numpy()[: len(pixels)] == Status.OK).reshape(2, -1).all(axis=0)
+    # the fit has put its weights in place of the values
     weights = readings.on_host(readings.values, len(pixels))
 
     def pairs(array: np.ndarray) -> np.ndarray:

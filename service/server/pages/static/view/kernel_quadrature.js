@@ -1,6 +1,6 @@
 /**
  * Shares light out over the captured lights by kernel quadrature, as `relit relight --weights kernel` does
- * (kernels/relight/kernel_quadrature.py has the sources): the energies of least expected error that are not negative.
+ * (service/relight/weights/quadrature.py has the sources): the energies of least expected error that are not negative.
  */
 
 const ROUNDING = 1e-9;
