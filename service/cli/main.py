@@ -16,7 +16,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("commands.demo", "Solve, export and relight the shipped sample."),
     "bench": ("commands.demo", "Measure the speed of the kernels, and in the same run that of NumPy and of a plain copy."),
     "info": ("commands.captures", "Say what a capture holds, and what is wrong with it."),
-    "view": ("commands.captures", "What a browser needs to show a capture, its maps, its object under new light, and its depth as points."),
+    "view": ("commands.captures", "Write the files that a browser needs to show a capture, its maps, its object under new light, and its "
+             "depth as points."),
     "solve": ("commands.solve", "Normals, albedo and height of a light-stage capture."),
     "export": ("commands.export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
     "basis": ("commands.export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
@@ -108,7 +109,7 @@ def main() -> None:
         signal.signal(number, signal.default_int_handler)
     try:
         app = listing() if sys.argv[1:] in ([], ["--help"]) else program(next(iter(sys.argv[1:]), None))
-        code = app(standalone_mode=False)  # so that wrong options, too, are one sentence
+        code = app(prog_name="relit", standalone_mode=False)  # so that wrong options, too, are one sentence
         if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
             print("relit: interrupted; results that are there are whole, run again to finish", file=sys.stderr)
         sys.exit(code)

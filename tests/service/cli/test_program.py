@@ -33,7 +33,7 @@ def test_help_names_every_command(relit):
 
 def test_the_help_that_is_shown_without_loading_commands_is_theirs(relit):
     command = get_command(program())
-    assert relit("--help").out == command.get_help(Context(command, info_name=Path(sys.argv[0]).name)) + "\n"
+    assert relit("--help").out == command.get_help(Context(command, info_name="relit")) + "\n"
     loaded = subprocess.run([sys.executable, "-X", "importtime", "-m", "service.cli.main", "--help"], cwd=ROOT, check=True, text=True,
                             capture_output=True).stderr
     assert "typer" in loaded
