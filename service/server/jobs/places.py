@@ -113,7 +113,8 @@ def files_within(capture: Path, names: Iterable[str], field: str) -> tuple[Path,
 def without_places(text: str, job: str, context: WorkerContext) -> str:
     """Return a sentence for users of the service, without the folders of the server, whose places are not theirs to know.
 
-    A registered capture or environment is named by its identifier. Any other file is named below the data folder or the root.
+    A registered capture is named by its identifier, and the file of an environment by its name. Any other file is named below the data
+    folder or the root.
 
     Args:
         text: the sentence, of an error.
@@ -124,7 +125,7 @@ def without_places(text: str, job: str, context: WorkerContext) -> str:
     for row in intakes.read_by(context.database, job):
         names |= {f"{root}/": "" for root in context.roots_of(row["project"])}
         if row["folder"] is not None:
-            names[row["folder"]] = row["id"]
+            names[row["folder"]] = row["id"] if row["kind"] == CAPTURE else Path(row["folder"]).name
     for place in sorted(names, key=len, reverse=True):
         text = text.replace(place, names[place])
     return text
