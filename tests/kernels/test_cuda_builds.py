@@ -97,8 +97,9 @@ KERNELS = discovered()
 
 
 def test_kernels_are_discovered():
-    assert {"photometric.lambert._lambert_kernel", "photometric.search_kernel.search_kernel", "structured.stripe._stripe_kernel",
-            "surface.multigrid._smooth_from_zero", "tof.flying._flying_kernel"} <= KERNELS.keys()
+    assert {"photometric.lambertian.lambert._lambert_kernel", "photometric.search.search_kernel.search_kernel",
+            "structured.stripe._stripe_kernel",
+            "surface.multigrid._smooth_from_zero", "tof.continuous.flying._flying_kernel"} <= KERNELS.keys()
     for module in modules():
         source = inspect.getsource(module)
         place = module.__name__.removeprefix("kernels.")

@@ -16,8 +16,11 @@ WIDTH = 1280
 DECODERS = {"binary": decode_binary, "gray": decode_gray, "xor": decode_xor}
 
 
-def patterns_of(code, **options):
-    return xor_patterns(WIDTH, "column", **options) if code == "xor" else binary_patterns(WIDTH, "column", code=code, **options)
+def patterns_of(code, *, references=True, **options):
+    if code == "xor":
+        patterns = xor_patterns(WIDTH, "column", **options)
+        return patterns if references else patterns[:-2]  # white and black come last
+    return binary_patterns(WIDTH, "column", code=code, references=references, **options)
 
 
 def decode(stack, patterns, device, *, saturated=None, noise=NOISE, extent=WIDTH):
