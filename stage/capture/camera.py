@@ -225,7 +225,7 @@ class OtherCamera(Strict):
 
 
 class StereoImages(Strict):
-    """What the other cameras saw at the moment of a frame, under projected texture without a code."""
+    """Images of the other cameras at the moment of a frame, under projected texture without a code."""
 
     images: Annotated[tuple[Text, ...], Field(min_length=1), FirstFault]
     """The image of each of `other_cameras`, in their order; files of the folder that no other frame has."""
