@@ -43,7 +43,7 @@ gpu-bench: $(VENV)/installed
 
 # docs/manifest.md, every field of capture.json, from the models in stage/
 manifest-page: $(VENV)/installed-dev
-	$(BIN)/python -m stage.capture.manifest_page
+	$(BIN)/python -m docs.tools.manifest_page
 
 # the tables of docs/figures.md; FIGURES="--data DIR --glossy DIR --large DIR" measures what needs data or space
 figures: $(VENV)/installed-dev
@@ -83,7 +83,7 @@ vendor:
 
 # the colour spaces that pages convert between, as the colour library has them
 colour-table: $(VENV)/installed
-	$(BIN)/python -m service.viewing.colour_table > service/server/pages/static/view/colour_table.js.new
+	$(BIN)/python -m docs.tools.colour_table > service/server/pages/static/view/colour_table.js.new
 	mv service/server/pages/static/view/colour_table.js.new service/server/pages/static/view/colour_table.js
 
 clean:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from service.requests.register import FuseRequest
-from service.scans.fuse import fuse
+from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from tests.scenes.clouds import all_around, entry
 from tests.scenes.statue import PARTS, SIGMA, distance, nearest_part, turntable, write_scans, write_set

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.file_mutations import write_between
 from service.requests.register import FuseRequest
-from service.scans.fuse import fuse
+from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import exponential
 from stage.capture.camera import Camera

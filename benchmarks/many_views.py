@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.file_mutations import write_between
 from service.requests.register import FuseRequest, RegisterRequest
-from service.scans.fuse import fuse
+from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.register import register_scans

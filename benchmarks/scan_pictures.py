@@ -19,7 +19,7 @@ import OpenImageIO as oiio
 from benchmarks.many_views import off_surface, write_scans
 from service.relight.sheet import BACKGROUND, INK, write_sheet
 from service.requests.register import FuseRequest, RegisterRequest
-from service.scans.fuse import fuse
+from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import applied, inverse
 from service.scans.register import register_scans

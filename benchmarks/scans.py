@@ -22,7 +22,6 @@ from service.scans.points.rigid import about, applied, inverse, moved, step_betw
 from service.scans.points.scan import Scan
 from service.scans.read import read_scan
 from service.scans.registration.registration import Registration, RegistrationOptions, register
-from service.scans.registration.turntable import turned_pose
 from stage.results.depth_maps import DepthMaps
 from stage.sets.scan_set import ScanEntry, ScanSet, Turntable
 from tests.scenes.turntable import MM, View, figure, pose, see
@@ -109,7 +108,7 @@ def table(rows: int, open3d: str | None) -> str:
                                                for view in views]
             found, seconds = timed(scans, starts)
             lines.append(line(case, "relit, starts 8 mm and 1° off", views, found.poses, seconds))
-            starts = [turned_pose(turntable, 20.0 * k + rng.normal(scale=0.5)) for k in range(18)]
+            starts = [turntable.pose_at(20.0 * k + rng.normal(scale=0.5)) for k in range(18)]
             found, seconds = timed(scans, starts, turntable)
             lines.append(line(case, "relit, axis known, angles 0.5° off", views, found.poses, seconds))
     return "\n".join(lines)

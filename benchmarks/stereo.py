@@ -14,8 +14,7 @@ from benchmarks.timing import run_seconds
 from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.pattern_frames import NoiseModel
-from service.depth.stereo.rectification import rectify
-from service.depth.stereo.rectified_frames import RectifiedFrames, smoothed
+from service.depth.stereo.rectification import RectifiedFrames, rectify, smoothed
 from service.depth.stereo.stereo_pair import Disparity, match
 from stage.capture.camera import Camera, OtherCamera
 from tests.scenes import stereo as scenes

@@ -22,9 +22,8 @@ from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
 from stage.colour.colour import rgb_matrix
 from stage.errors import ManifestError
+from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, quantize, write_hsh, write_ptm
 from stage.results.light_basis import numbers, write_facts
-from stage.rti import hsh, ptm
-from stage.rti.quantization import Quantization, dequantize, quantization_of_range, quantize
 
 DISPLAY_SPACE = "lin_rec709_scene"
 """The linear space of an sRGB display."""
@@ -105,9 +104,9 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
     rows, cols = source.capture.camera.height, source.capture.camera.width
     grid = stored.reshape(channels, rows, cols, terms)
     if kind == BasisKind.HSH:
-        hsh.write(request.out, hsh.Hsh(grid, quantization))
+        write_hsh(request.out, Hsh(grid, quantization))
     else:
-        ptm.write(request.out, ptm.Ptm(grid, quantization, colours.reshape(rows, cols, 3) if channels == 1 else None))
+        write_ptm(request.out, Ptm(grid, quantization, colours.reshape(rows, cols, 3) if channels == 1 else None))
     readings = 3 * source.pixels * len(model.front)
     error = {"relative_rms": np.sqrt(loss[1] / loss[2]), "levels_rms": WHITE * np.sqrt(loss[1] / readings),
              "fit_relative_rms": np.sqrt(loss[0] / loss[2])}

@@ -31,11 +31,6 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
     """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names; or the shots of a scan,
     or the tiles of a board.
 
-    Args:
-        folder: folder of the capture or of the sequence.
-        max_pixels: most pixels of an image.
-        progress: told of every capture.
-
     Returns:
         A description: number of captures and frames, resolution, colour space, name; of a scan its number of shots and name; of a
         board its number of tiles and name.
@@ -86,15 +81,8 @@ def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:
 def recheck_capture(folder: Path, *, max_pixels: int, number: int | None = None) -> None:
     """Check again what may have changed since a capture was admitted: where its files lie, and their sizes.
 
-    Opening the capture then checks everything else. A file that is changed between the two checks is not noticed.
-
-    Args:
-        folder: of the capture or of a sequence.
-        max_pixels: most pixels of an image.
-        number: of the only step of a sequence whose images are read, from 1; None: all are.
-
-    Raises:
-        ManifestError, ImageError, StorageError: for the reasons that `admit_capture` names.
+    Opening the capture then checks everything else. A file that is changed between the two checks is not noticed. Of a sequence all steps
+    are checked, or the only one whose images are read, of a number from 1.
     """
     _check_manifest_files(folder)
     steps = time_steps(folder)
@@ -104,14 +92,7 @@ def recheck_capture(folder: Path, *, max_pixels: int, number: int | None = None)
 
 
 def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
-    """Check the header of an environment map.
-
-    Args:
-        folder: a folder that holds one image.
-        max_pixels: most pixels of the image.
-
-    Returns:
-        A description: file and resolution.
+    """Check the header of an environment map, the only image of a folder, and return its file and resolution.
 
     Raises:
         ImageError: there is not exactly one image, it is not a lat-long map, or it has too many pixels.
@@ -127,14 +108,7 @@ def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
 
 
 def environment_file(folder: Path) -> Path:
-    """Return the image of an environment.
-
-    Args:
-        folder: a folder that holds one file, or that file, as for a registered environment.
-
-    Raises:
-        ImageError: the folder holds no file, or several.
-    """
+    """Return the only file of a folder, or the file that was given, as for a registered environment."""
     if folder.is_file():
         return folder
     with storage("read", folder):

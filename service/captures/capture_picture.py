@@ -54,15 +54,9 @@ def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[s
     """Write the picture of a capture.
 
     Args:
-        path: the PNG.
-        capture: an opened capture.
         peak: the largest reading.
         suspects: lights that disagree with the others, by their images; they are red.
         done: called with the count of frames that have been read.
-
-    Raises:
-        StageError: the mask, or a dark, flat or ambient frame cannot be read.
-        StorageError: the picture cannot be written.
     """
     unit = 1.0 if peak <= 2.0 ** STOPS[1] else 2.0 ** (np.ceil(np.log2(peak)) - STOPS[1])
     views = _read(capture, unit, done)

@@ -49,9 +49,7 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
 
     Args:
         folder: of the capture or the environment, or the file of a registered environment.
-        environment: whether it is an environment.
         root: the folder below which a registered one lies, so that no link is followed out of its folder; None: it was uploaded.
-        max_pixels: most pixels of an image.
         progress: of the check; an exception that it raises ends the process.
 
     Returns:

@@ -51,11 +51,7 @@ class _Process:
         self.socket.settimeout(WALL_S)
 
     def ask(self, what: str, source: inputs.Source) -> tuple[dict[str, Any], list[int]]:
-        """Return the answer, and descriptors that came with it.
-
-        Raises:
-            OSError: the process ended, or takes too long.
-        """
+        """Return the answer, and descriptors that came with it; an OSError says that the process ended, or takes too long."""
         socket.send_fds(self.socket, [json.dumps({"what": what, "path": str(source.path)}).encode()], [source.file.fileno()])
         data, descriptors, _, _ = socket.recv_fds(self.socket, MESSAGE_BYTES, 1)
         if not data:
@@ -76,7 +72,6 @@ class Decoders:
     """Decodes images in other processes, several at one time. Implements `stage.formats.images.Decoder`."""
 
     def __init__(self, max_pixels: int) -> None:
-        """Args: max_pixels: most pixels of an image."""
         self._max_pixels = max_pixels
         self._places = threading.BoundedSemaphore(min(os.cpu_count() or 1, MOST_PROCESSES))
         self._headers = threading.BoundedSemaphore(HEADER_PROCESSES)

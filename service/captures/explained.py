@@ -47,12 +47,7 @@ def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.
     """Return what explains the images much better than the manifest, else the lights that disagree with the others.
 
     Args:
-        capture: whose frames are lit by distant lights.
-        positions: of pixels_to_look_at.
         recorded: [n, 3] float32 of each frame at these pixels, by the name of its image: fractions of full scale, or floating-point values.
-
-    Raises:
-        StageError: a dark, flat or ambient frame cannot be used.
     """
     lit = capture.lit_by(DistantLight)
     correction = Correction.of(capture).at(positions)

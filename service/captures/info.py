@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from service.captures.explained import Findings, findings, pixels_to_look_at
-from service.captures.front_lights import front_lights
 from service.reporting.progress import Progress, Timings
 from service.requests.captures import InfoRequest
 from stage.capture.capture import Capture
@@ -30,6 +29,10 @@ from stage.tof.raw_frames import check_frames, read_frame
 
 FAR_UNKNOWN = "camera.surface_z_m is missing: relit solve estimates how far the surface is"
 """The remark about near lights whose distance to the surface nobody has measured."""
+READINGS = 3
+"""The least count of lights that a normal must face to be measured."""
+NORMALS = 2000
+"""The directions on the visible hemisphere at which lights are counted: shares are then good to a tenth of a per cent."""
 
 
 class Inspection(NamedTuple):
@@ -54,15 +57,7 @@ class _FrameLevel(NamedTuple):
 
 
 def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspection:
-    """Decode and check every frame of a capture.
-
-    Args:
-        request: the capture, and how its pixels are read.
-        progress: told of every frame.
-
-    Raises:
-        StageError: the capture cannot be opened.
-    """
+    """Decode and check every frame of a capture."""
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
@@ -127,8 +122,7 @@ def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, f
 def standing_faults(capture: Capture, *, readable: bool = True) -> list[str]:
     """Return what is wrong with a capture beside its frames: lights that determine no normal, the mask, the dark and flat frames.
 
-    Args:
-        readable: whether all frames are; else dark and flat frames are not looked at, because they are read with the ambient frames.
+    If not all frames are readable, dark and flat frames are not looked at, because they are read with the ambient frames.
     """
     faults = []
     try:
@@ -222,3 +216,46 @@ def _level(capture: Capture, frame: Frame, positions: np.ndarray | None) -> _Fra
     lowest, peak = float(pixels.min(where=finite, initial=np.inf)), float(pixels.max(where=finite, initial=-np.inf))
     picked = pixels.reshape(-1, pixels.shape[-1])[positions] if positions is not None and frame.tof is None else None
     return _FrameLevel(lowest, peak, saturated, None, picked, int(finite.size - finite.sum()))
+
+
+class FrontLights(NamedTuple):
+    """The directions that lights reach which all stand in front of the object: no slopes, sides and back.
+
+    A surface shows the highlight of a light when its normal lies half way between the light and the view. Lights within an angle of the
+    view axis show highlights on normals within half of it.
+    """
+
+    widest_deg: float
+    """The largest angle of a light from the view axis."""
+    highlight_deg: float
+    """The largest angle from the view axis of a normal that shows the highlight of a light."""
+    elsewhere: float
+    """The share of all directions, of those around the object, that are farther from the view axis than every light."""
+    dark: float
+    """The share of the normals that a camera can see which face fewer than three lights."""
+
+    def sentence(self) -> str:
+        """Return what the capture cannot show, for a person who looks at it."""
+        text = (f"all lights are within {self.widest_deg:.0f} degrees of the view axis: surfaces turned more than {self.highlight_deg:.0f} "
+                "degrees from the camera show no highlight, so that roughness and specular say little there; in relit frames the nearest "
+                f"lights stand in for light from elsewhere, {100 * self.elsewhere:.0f} % of all directions")
+        if self.dark >= 0.005:
+            text += f"; {100 * self.dark:.0f} % of the directions that a visible surface may have face fewer than {READINGS} lights"
+        return text
+
+
+def front_lights(directions: np.ndarray) -> FrontLights | None:
+    """Return what lights of these directions reach that all stand in front of the object, or None where one stands beside or behind it."""
+    lowest = float(directions[:, 2].min()) if len(directions) else 0.0
+    if lowest <= 0:
+        return None
+    widest = float(np.degrees(np.arccos(min(lowest, 1.0))))
+    facing = (_hemisphere(NORMALS) @ directions.T > 0).sum(axis=1)
+    return FrontLights(widest, widest / 2, (1 + lowest) / 2, float((facing < READINGS).mean()))
+
+
+def _hemisphere(count: int) -> np.ndarray:
+    """Return evenly spread unit directions with z above 0, [count, 3], on a spiral of the golden angle."""
+    number = np.arange(count) + 0.5
+    z, angle = number / count, np.pi * (1 + np.sqrt(5)) * number
+    return np.column_stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z])

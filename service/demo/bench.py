@@ -24,10 +24,6 @@ LIGHTS, SIDE, FRAMES = 64, 512, 24
 def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
     """Measure the speed of the kernels on this machine.
 
-    Args:
-        request: the device, and the runs of each kernel, of which the median is taken.
-        progress: told how far the work is.
-
     Returns:
         Lines of a Markdown table: what, milliseconds, pixels per second, against what, its milliseconds, ratio (above 1: faster).
     """

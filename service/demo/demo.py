@@ -41,11 +41,7 @@ class DemoResult(NamedTuple):
 
 
 def sample_folder() -> Path:
-    """Return the folder of the shipped sample, inside the installed package or in the checkout.
-
-    Raises:
-        RequestError: the sample is in neither.
-    """
+    """Return the folder of the shipped sample, inside the installed package or in the checkout."""
     package = Path(service.__file__).parent
     for folder in (package / "samples" / SAMPLE, package.parent / "samples" / SAMPLE):
         if (folder / "capture.json").exists():
@@ -54,12 +50,7 @@ def sample_folder() -> Path:
 
 
 def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
-    """Solve, export and relight the sample, and write a preview.
-
-    Args:
-        request: the device, and the folder for the results; its `.relit` holds the stack cache, so that nothing is written into the sample.
-        progress: told how far the work is.
-    """
+    """Solve, export and relight the sample, and write a preview; the cache lies with the results, so that the sample stays as it is."""
     sample, out, device = sample_folder(), request.out, devices.resolve(request.device)
     cache = out / CACHE_FOLDER
     solved = solve(SolveRequest(capture=sample, out=out, device=device, cache=cache), progress)
@@ -83,17 +74,7 @@ EXPOSURE_TARGET = 0.8
 
 
 def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: Sequence[Path]) -> None:
-    """Write the preview of a solve.
-
-    Args:
-        path: the PNG.
-        maps: solved maps.
-        captured: [rows, cols, 3] scene-linear, one captured image.
-        frames: relit EXR frames; two rows of them, evenly chosen, are shown.
-
-    Raises:
-        StorageError: the image cannot be written.
-    """
+    """Write the preview of a solve: its maps, a captured image [rows, cols, 3] scene-linear, and two rows of frames, evenly chosen."""
     mask = maps.mask
     top = [("captured, one light", display(captured * _exposure(captured[None], mask), maps.color_space))]
     if maps.normal is not None:

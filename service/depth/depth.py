@@ -168,11 +168,7 @@ def _ranging(capture: Capture, wanted: Ranging | None) -> Ranging:
 
 
 def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) -> None:
-    """Refuse a solution without any depth, or with depths that cannot be in metres; warn where every depth is unsure.
-
-    Raises:
-        ManifestError: says what most often is the cause.
-    """
+    """Refuse a solution without any depth, or with depths that cannot be in metres; warn where every depth is unsure."""
     estimated = solution.estimated
     if not solution.solved.any():
         text = _reasons(solution)

@@ -39,18 +39,7 @@ def is_result_sequence(path: Path) -> bool:
 
 
 def export_sequence(request: ExportRequest, timings: Timings) -> tuple[SequenceSizes, tuple[str, ...]]:
-    """Write the asset, one step after another, and return its sizes and what its user should know.
-
-    Args:
-        request: its `maps` is the folder or the file of is_result_sequence.
-        timings: told of each step.
-
-    Raises:
-        RequestError: an option that such an asset has no place for.
-        ResultError: a step has no result, another camera than the first, or results of another kind.
-        AssetError: another suffix than .usdc and .usdz, or a step without a surface; names the step.
-        StorageError: the asset cannot be written; nothing is left half-written.
-    """
+    """Write the asset, one step after another, and return its sizes and what its user should know."""
     for name, given in (("--levels", request.levels != 0), ("--textures", request.textures is not TextureFormat.PNG16)):
         if given:
             raise RequestError(f"{name}: the asset of a sequence has colours at its vertices, in one level of detail: leave the option out")

@@ -65,7 +65,6 @@ class KeptScans:
         """Create the scans, of which none is read yet.
 
         Args:
-            pieces: where prepared scans and pairs are kept, with the run that they belong to.
             memory_bytes: that scans read again may take, beside those that threads are at work on.
             threads: scans and pairs at one time.
         """
@@ -172,15 +171,7 @@ class Looked(NamedTuple):
 
 
 def with_found_targets(scan: Scan, entry: ScanEntry, options: RegisterOptions, file: Path, where: str) -> Looked:
-    """Return the targets of a scan with the markers and board corners that its image shows.
-
-    Args:
-        options: which markers and which board to look for.
-
-    Raises:
-        ManifestError: the image is not one of the scan's camera, or a target is found whose name is listed too.
-        ImageError, StorageError: the image cannot be read.
-    """
+    """Return the targets of a scan with the markers and board corners that its image shows."""
     if options.markers is None and options.board is None:
         return Looked(scan.targets, 0, None)
     if scan.camera is None:

@@ -23,9 +23,7 @@ DONE, CLAIM = ".done", ".claim"
 def stamps(places: Sequence[Path], *, timed: bool) -> tuple[tuple[int, int], ...]:
     """Return the size and the time of the last change of the files of scans, by which a run that is begun again knows them.
 
-    Args:
-        places: files, and folders of depth results; what is not there is left out.
-        timed: whether times count: workers on several machines have copies of other times.
+    Times do not count if workers on several machines have copies of other times.
     """
     files = [path for place in places for path in (place, place / DEPTH_FILE) if path.is_file()]
     return tuple((path.stat().st_size, path.stat().st_mtime_ns if timed else 0) for path in files)
@@ -65,7 +63,6 @@ class SharedPieces:
         """Create the part of a worker.
 
         Args:
-            store: where pieces are kept, by all workers.
             leads: whether this worker has the job; it alone says what a phase follows from.
             invite: called with the number of pieces before each phase, to ask other workers.
         """

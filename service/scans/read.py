@@ -32,11 +32,7 @@ class _Sigma(NamedTuple):
 
 
 def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
-    """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory.
-
-    Raises:
-        StageError: a scan cannot be used; the message names it.
-    """
+    """Yield the scans of a set in its order, read one by one, so that only what the caller keeps stays in memory."""
     for number in range(len(scans.scans)):
         yield read_scan(file, scans, number)
 
@@ -47,10 +43,6 @@ def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool
     Args:
         number: of the scan, from 0.
         estimate_normals: whether normals are fitted to the points where the scan has none; without them the scan has none.
-
-    Raises:
-        ManifestError: the scan holds no depth or points, has a unit or maps that do not fit, or no σ can be estimated.
-        ResultError, ImageError, StorageError: a file is missing or damaged.
     """
     entry = scans.scans[number]
     where = f"{file}: scans[{number}] ({entry.name})"
@@ -173,11 +165,7 @@ def _kept(ply: PlyPoints, viewpoint: np.ndarray | None) -> PlyPoints:
 
 
 def _sigma(measured: np.ndarray | None, entry: ScanEntry, points: np.ndarray, planes: LocalPlanes | None, where: str) -> _Sigma:
-    """Return σ along the line of sight of each point.
-
-    Raises:
-        ManifestError: there is none in the files, and too few points lie together to estimate it.
-    """
+    """Return σ along the line of sight of each point."""
     least = FLOAT_STEP * float(np.abs(points).max())
     if measured is not None:
         return _Sigma(np.maximum(measured, least).astype(np.float32), "measured")

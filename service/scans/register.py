@@ -22,7 +22,6 @@ from service.scans.registration.fixed_poses import check_fixed
 from service.scans.registration.pairs import Evidence, Pair, PairState
 from service.scans.registration.registration import RegistrationOptions, register_by
 from service.scans.registration.target_pairs import target_places
-from service.scans.registration.turntable import turned_pose
 from service.scans.registration_words import (
     fixed_facts,
     fixed_warnings,
@@ -110,11 +109,7 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
 
 
 def help_register(request: RegisterRequest, progress: Progress, sharing: SharedPieces) -> None:
-    """Do pieces of a registration that another worker leads, and write no result.
-
-    Raises:
-        DivergedError: this worker finds something else than the worker that leads.
-    """
+    """Do pieces of a registration that another worker leads, and write no result."""
     file, listed = read_scan_set(request.scan_set)
     with _pieces(request, file, listed, sharing) as pieces:
         _placed(request, file, listed, pieces, Timings(progress))
@@ -145,7 +140,7 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
             scans.append(scan)
             timings.advance(len(scans))
         timings.stage("register", 100)
-        fixed = check_fixed(scans, [turned_pose(table, angle) for angle in table.angles_deg], threads=threads,
+        fixed = check_fixed(scans, [table.pose_at(angle) for angle in table.angles_deg], threads=threads,
                             advance=timings.advance_percent, cell_m=request.cell_m, least_overlap=request.least_overlap)
         known = [facts_of(scan, file, listed, number, request) for number, scan in enumerate(scans)]
         missed = _missed(request, known)
@@ -166,11 +161,7 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
 
 
 def _missed(request: RegisterRequest, scans: Sequence[ScanFacts]) -> list[str]:
-    """Return which scans show none of the marks that were looked for.
-
-    Raises:
-        RequestError: none does.
-    """
+    """Return which scans show none of the marks that were looked for; refuse if none does."""
     if (request.markers is not None or request.board is not None) and not any(scan.found for scan in scans):
         named = [] if request.markers is None else [f"--markers {request.markers}"]
         named += [] if request.board is None else [f"--board {request.board[0]}x{request.board[1]}"]
@@ -183,11 +174,7 @@ def _threads(request: RegisterRequest) -> int:
 
 
 def _checked(request: RegisterRequest, file: Path, listed: ScanSet) -> int | None:
-    """Return the number of the reference.
-
-    Raises:
-        RequestError, ScanError: an option does not fit the set.
-    """
+    """Return the number of the reference, and refuse options that do not fit the set."""
     if request.turntable is not TableUse.START and listed.turntable is None:
         raise RequestError(f"--turntable {request.turntable}: {file} has no turntable")
     if request.turntable is TableUse.FIXED and listed.turntable is not None and listed.turntable.angles_deg is None:
@@ -207,7 +194,7 @@ def _starts(request: RegisterRequest, listed: ScanSet, scans: Sequence[ScanFacts
     if request.poses is GivenPoses.IGNORED:
         return [None] * len(scans)
     table = listed.turntable
-    turned = [None] * len(scans) if table is None or table.angles_deg is None else [turned_pose(table, angle) for angle in table.angles_deg]
+    turned = [None] * len(scans) if table is None or table.angles_deg is None else [table.pose_at(angle) for angle in table.angles_deg]
     if request.turntable is TableUse.ANGLES:
         return list(turned)
     return [scan.pose if scan.pose is not None else start for scan, start in zip(scans, turned, strict=True)]

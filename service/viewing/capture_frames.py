@@ -69,12 +69,7 @@ class CaptureImages(NamedTuple):
 
 
 def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> CaptureImages:
-    """Decode every frame of a capture once.
-
-    Args:
-        mask: [rows, cols] bool.
-        timings: told of every frame.
-    """
+    """Decode every frame of a capture once."""
     frames = capture.manifest.frames
     sources = {frame.image for frame in capture.sources()}
     measured = [not sources or frame.image in sources for frame in frames]
@@ -110,13 +105,7 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
 
 def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[list[int] | None],
                     suspects: dict[str, str]) -> list[dict[str, Any]]:
-    """Return what view.json says of every frame.
-
-    Args:
-        found: its images.
-        thumbnails: where the picture of each frame lies in the atlas.
-        suspects: a sentence for each image whose light disagrees with the others.
-    """
+    """Return what view.json says of every frame: its place in the atlas of thumbnails, and a sentence where its light is suspect."""
     centre = _centre_lights(capture)
     white = found.white
     described = []
@@ -211,16 +200,7 @@ QUALITIES = (88, 75, 60, 40, 20, 5)
 
 
 def write_thumbnails(path: Path, found: CaptureImages, space: str) -> list[list[int] | None]:
-    """Write the sheet, and return where the picture of each frame lies in it: x, y, width and height, or None where there is none.
-
-    Args:
-        path: the JPEG.
-        found: the frames.
-        space: scene-linear colour space of the frames.
-
-    Raises:
-        StorageError: the sheet cannot be written.
-    """
+    """Write the sheet, and return where the picture of each frame lies in it: x, y, width and height, or None where there is none."""
     shown = [image for image in found.images if image is not None]
     rows, cols = found.inside.shape
     height, width = (max(1, round(CELL * side / max(rows, cols))) for side in (rows, cols))

@@ -32,12 +32,8 @@ class HeldOutLights:
         """Choose the lights, and an exposure for each.
 
         Args:
-            lights: of the images.
-            transfer: their table of directions.
+            transfer: the table of directions of the lights.
             covered: [pixels padded] bool, pixels of the object.
-
-        Raises:
-            ArrayError: a light gives nothing in a channel.
         """
         sky = np.einsum("dcl,d->cl", transfer.weights, transfer.solid_angle / transfer.solid_angle.sum())
         keys = key_weights(lights)
@@ -53,13 +49,7 @@ class HeldOutLights:
         self._squares, self._whole = np.zeros(len(self.weights)), np.zeros(len(self.weights))
 
     def compare(self, images: np.ndarray, shown: np.ndarray, inside: np.ndarray) -> None:
-        """Count some pixels.
-
-        Args:
-            images: [tiles, 3, lights, pixels] the captured images.
-            shown: the same as the basis gives them.
-            inside: [tiles, pixels] bool, which pixels count.
-        """
+        """Count some pixels of the captured images [tiles, 3, lights, pixels], shown as the basis gives them; `inside` says which."""
         truth, found = (self._encoded(values, inside) for values in (images, shown))
         for picture, (true, other) in enumerate(zip(truth, found, strict=True)):
             self._squares[picture] += ((true[0] - other[0]) ** 2).sum(dtype=np.float64)
@@ -83,11 +73,7 @@ class HeldOutLights:
 
 
 def key_weights(lights: DistantLights) -> np.ndarray:
-    """Return the weights [KEY_LIGHTS, 3, lights] of the captured images under each key light of irradiance 1.
-
-    Raises:
-        ArrayError: a captured light gives nothing in a channel.
-    """
+    """Return the weights [KEY_LIGHTS, 3, lights] of the captured images under each key light of irradiance 1."""
     return weights_of(key_directions(lights.direction)[:, None], np.ones((KEY_LIGHTS, 1)), lights)
 
 

@@ -20,14 +20,10 @@ HISTOGRAM_PERCENTILES = (0.1, 99.9)
 
 
 def statistics_of(values: np.ndarray, valid: np.ndarray) -> dict[str, Any]:
-    """Return `range` and `histogram` of the valid pixels of a layer; all are 0 where there is none.
+    """Return `range` and `histogram` of the valid pixels of a layer [channels, rows, cols]; all are 0 where there is none.
 
     The range is [1st, 99th percentile] over all channels. The histogram has `low`, `high` and `counts` [channels][64]; values beyond count
     in the first and last bin.
-
-    Args:
-        values: [channels, rows, cols].
-        valid: [rows, cols] bool.
     """
     chosen = values[:, valid].astype(np.float32, copy=False)
     of = (HISTOGRAM_PERCENTILES[0], *RANGE_PERCENTILES, HISTOGRAM_PERCENTILES[1])
@@ -37,12 +33,7 @@ def statistics_of(values: np.ndarray, valid: np.ndarray) -> dict[str, Any]:
 
 
 def code_counts(codes: np.ndarray, counted: np.ndarray) -> dict[str, Any]:
-    """Return the codes that occur as `range`, and as `histogram` how many of the counted pixels have each code 0 … 63.
-
-    Args:
-        codes: [rows, cols] uint8.
-        counted: [rows, cols] bool.
-    """
+    """Return the codes that occur as `range`, and as `histogram` how many of the counted pixels have each code 0 … 63."""
     counts = np.bincount(np.minimum(codes[counted], BINS - 1), minlength=BINS)
     return {"range": np.flatnonzero(np.bincount(codes.reshape(-1))).tolist(),
             "histogram": {"low": 0, "high": BINS, "counts": [counts.tolist()]}}
@@ -73,12 +64,7 @@ REGIMES = {1: "Lambertian", 2: "glossy", 3: "mirror", 4: "mixture of diffuse and
 
 
 def write_layers(found: ResultLayers, file: BlockFile, timings: Timings) -> list[dict[str, Any]]:
-    """Write the tiles of every layer, and return what view.json says of them.
-
-    Raises:
-        ResultError: a layer holds values that are not finite.
-        OSError: the file cannot be written.
-    """
+    """Write the tiles of every layer, and return what view.json says of them."""
     names = found.names()
     timings.stage("layers", len(names))
     classes = _class_levels(found)

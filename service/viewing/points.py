@@ -20,16 +20,7 @@ DEPTH_TOLERANCE = 1e-5
 
 
 def write_points(found: ResultLayers, file: BlockFile) -> dict[str, Any]:
-    """Write the points of a depth, first those of the mask and then the unsure ones, and return what view.json says of them.
-
-    Args:
-        found: depth maps; the layers are not forgotten.
-        file: for the blocks.
-
-    Raises:
-        ResultError: the points.ply beside the depth is damaged.
-        OSError: the file cannot be written.
-    """
+    """Write the points of a depth, first those of the mask and then the unsure ones, and return what view.json says of them."""
     step = step_within(int(found.estimated.sum()), MOST_POINTS)
     pixels, unsure = (_every(mask, step) for mask in (found.mask, found.estimated & ~found.mask))
     chosen = np.concatenate([pixels, unsure])

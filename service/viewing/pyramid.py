@@ -50,15 +50,7 @@ def halve_classes(classes: np.ndarray) -> np.ndarray:
 
 
 def halve_values(values: np.ndarray, classes: np.ndarray) -> np.ndarray:
-    """Return the mean of the pixels of the best class among each four; 0 where none is estimated.
-
-    Args:
-        values: [channels, rows, cols].
-        classes: [rows, cols] of NONE, UNSURE, SURE.
-
-    Returns:
-        [channels, ⌈rows / 2⌉, ⌈cols / 2⌉] float32.
-    """
+    """Return the mean of the pixels of the best class among each four, [channels, ⌈rows / 2⌉, ⌈cols / 2⌉] float32; 0 without estimate."""
     corners = _quarters(classes)
     best = np.maximum.reduce(corners)
     counted = [(corner == best) & (best > NONE) for corner in corners]

@@ -23,14 +23,7 @@ class RowBand(NamedTuple):
 
 
 def row_bands(stack: Stack, shape: tuple[int, int], step: int, bytes_per_pixel: int) -> Iterator[RowBand]:
-    """Yield bands of rows that begin at a multiple of a step.
-
-    Args:
-        stack: of the images.
-        shape: rows and columns of an image.
-        step: that the first row of every band is a multiple of.
-        bytes_per_pixel: what the caller allocates for each pixel beside the stack.
-    """
+    """Yield bands of rows that begin at a multiple of a step; the caller allocates some bytes for each pixel beside the stack."""
     rows, cols = shape
     _, most = next(stack.bands(bytes_per_pixel))
     height = max(1, most // (cols * step)) * step
@@ -48,15 +41,9 @@ def step_within(pixels: int, most: int) -> int:
 
 
 def block_sums(values: np.ndarray, step: int, weight: np.ndarray | None = None) -> np.ndarray:
-    """Return the sum of each block of step × step pixels; blocks at the right and lower edge may have fewer pixels.
+    """Return the sum of each block of step × step pixels, [⌈rows / step⌉, ⌈cols / step⌉, channels] float32.
 
-    Args:
-        values: [rows, cols, channels].
-        step: of a block.
-        weight: [rows, cols] factors of the pixels; None: 1.
-
-    Returns:
-        [⌈rows / step⌉, ⌈cols / step⌉, channels] float32.
+    Blocks at the right and lower edge may have fewer pixels; pixels may have weights [rows, cols].
     """
     rows, cols, channels = values.shape
     down = np.empty((-(-rows // step), cols, channels), dtype=np.float32)

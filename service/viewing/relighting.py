@@ -56,12 +56,7 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     Args:
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
-        file: for the blocks.
         most_terms: most coefficient images; None: DEFAULT_TERMS.
-
-    Raises:
-        ArrayError: a light gives nothing in a channel.
-        OSError: the file cannot be written.
     """
     covered = np.zeros(stack.shape[2], dtype=bool)
     covered[: stack.pixel_count] = (matte.factor > 0).reshape(-1)
@@ -156,13 +151,6 @@ def write_quadrature(lights: DistantLights, file: BlockFile) -> dict[str, Any]:
     Light from between the captured lights is shared by kernel quadrature: its moments are sums over directions, and a small system with
     them gives the energies of the lights, none below 0 (service.relight.weights.quadrature). Light from beyond them is shared by a table
     over the grid of directions, since its parts add up (service.relight.weights.triangulation).
-
-    Args:
-        lights: of the captured images.
-        file: for the blocks.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     kept = first_of_equals(lights.direction)
     towards = np.ascontiguousarray(lights.direction[kept], dtype=np.float64)

@@ -68,12 +68,7 @@ class ResultLayers:
     """A result file of a capture, open for its layers."""
 
     def __init__(self, path: Path, capture: Capture) -> None:
-        """Read the header of a maps.exr or depth.exr; its layers are read when the first is asked for.
-
-        Raises:
-            ResultError: a layer is incomplete, the mask is missing, or the file is of another camera than the capture.
-            ImageError: the file is not a readable EXR.
-        """
+        """Read the header of a maps.exr or depth.exr; its layers are read when the first is asked for."""
         self.path = path
         header = exr.read_header(path)
         told = [name for name, (channel, _) in depth_maps.LAYERS.items()
@@ -106,11 +101,7 @@ class ResultLayers:
 
     @cached_property
     def status(self) -> np.ndarray | None:
-        """The status of each pixel, [rows, cols] uint8; None: the file has none.
-
-        Raises:
-            ResultError: a code is not known.
-        """
+        """The status of each pixel, [rows, cols] uint8; None: the file has none."""
         if "status" not in self._names:
             return None
         codes = self.plane("status")
@@ -148,11 +139,7 @@ class ResultLayers:
         return self._channels[self._names[name][0]]
 
     def take(self, name: str) -> np.ndarray:
-        """Return a layer, [channels, rows, cols] in its stored type, and forget it.
-
-        Raises:
-            ResultError: the layer holds values that are not finite.
-        """
+        """Return a layer, [channels, rows, cols] in its stored type, and forget it."""
         _ = self.estimated, self.on_object  # which are made of layers that may be the next to be forgotten
         values = np.stack([self._channels.pop(channel) for channel in self._names[name]])
         if bad := int((~np.isfinite(values)).sum()):

@@ -56,18 +56,8 @@ def write_samples(stack: Stack, shape: tuple[int, int], found: ResultLayers, lig
     """Write the samples of a solve, and return what view.json says of them.
 
     Args:
-        stack: the captured images.
-        shape: rows and columns of an image.
-        found: the maps.
         lights: that the maps were solved with; None: they are of a kind that the model does not have, and there is no model.
-        file: for the samples.
         doubts: gets a sentence where nothing tells whether the maps were solved from these images.
-        device: where the model is lit.
-        timings: told of every stage.
-
-    Raises:
-        ResultError: the maps were solved from other images.
-        OSError: the file cannot be written.
     """
     if (doubt := other_inputs(found.provenance, stack.key, found.path)) is not None:
         doubts.append(doubt)

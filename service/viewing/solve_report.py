@@ -48,12 +48,7 @@ class SolveReport(NamedTuple):
 
 
 def read_report(maps: Path) -> SolveReport:
-    """Read the report.json beside a maps.exr or depth.exr; where there is none, nothing is known.
-
-    Raises:
-        ResultError: the file is not a report of Relit.
-        StorageError: it cannot be read.
-    """
+    """Read the report.json beside a maps.exr or depth.exr; where there is none, nothing is known."""
     path = maps.parent / REPORT_FILE
     if not path.is_file():
         return SolveReport([], {}, None)

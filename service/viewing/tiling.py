@@ -44,13 +44,7 @@ class TileRow(NamedTuple):
 
 
 def tiling_of(factor: np.ndarray, *, lights: int, terms: int) -> Tiling:
-    """Return the smallest tiles that a page can use.
-
-    Args:
-        factor: [rows, cols] of the reduced image, above 0 on the object.
-        lights: number of captured lights.
-        terms: most terms of a basis.
-    """
+    """Return the smallest tiles that a page can use, of a reduced image that is above 0 on the object, for so many lights and terms."""
     side = LEAST_SIDE
     while True:
         holds = block_sums((factor > 0).astype(np.float32)[..., None], side)[..., 0] > 0
@@ -68,9 +62,6 @@ def tile_rows(stack: Stack, factor: np.ndarray, tiling: Tiling, step: int, timin
     Args:
         factor: [rows, cols] of the whole image, which the images are multiplied with.
         tiling: of the image that is reduced by the step.
-        step: whole factor by which the images are reduced.
-        timings: told of the rows as one stage of the work.
-        stage: the name of that stage.
     """
     lights, side, cols = stack.light_count, tiling.side, factor.shape[1]
     across = tiling.index.shape[1]

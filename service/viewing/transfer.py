@@ -29,11 +29,7 @@ class Transfer(NamedTuple):
 
 
 def transfer_of(lights: DistantLights) -> Transfer:
-    """Return the table of captured lights.
-
-    Raises:
-        ArrayError: a light gives nothing in a channel.
-    """
+    """Return the table of captured lights."""
     solid_angle = np.linalg.norm(grid_directions(PARTS, unit=False), axis=-1)
     energy = solid_angle / solid_angle.sum(axis=1, keepdims=True)
     share = share_beyond(lights.direction, grid_directions(1)[:, 0])
@@ -42,18 +38,11 @@ def transfer_of(lights: DistantLights) -> Transfer:
 
 
 def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -> np.ndarray:
-    """Return the weights of the captured images for white light of several kinds.
+    """Return the weights [kinds, 3, lights] float32 of the captured images for white light of several kinds.
 
     Args:
         samples: [kinds, n, 3] unit vectors to each.
         energy: [kinds, n] irradiance of each sample.
-        lights: the captured ones.
-
-    Returns:
-        [kinds, 3, lights] float32.
-
-    Raises:
-        ArrayError: a light gives nothing in a channel.
     """
     found = np.zeros((len(samples), 3, len(lights.direction)), dtype=np.float32)
     for begin in range(0, len(samples), COLS):
@@ -66,14 +55,11 @@ def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -
 
 
 def grid_directions(parts: int, *, unit: bool = True) -> np.ndarray:
-    """Return the directions of the grid, row by row.
+    """Return the directions of the grid, row by row, [ROWS · COLS, parts², 3] float64.
 
     Args:
         parts: samples down and across a pixel; 1: its middle.
         unit: make them unit vectors; else their length is sin πv, in proportion to the solid angle of a sample.
-
-    Returns:
-        [ROWS · COLS, parts², 3] float64.
 
     Convention:
         +y at the top, +z in the middle of the grid, +x a quarter from the left edge.

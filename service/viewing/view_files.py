@@ -54,8 +54,7 @@ class Readings(NamedTuple):
     def model_lights(self, factors: np.ndarray | None) -> DistantLights | PlacedLights | None:
         """Return the lights where they are, with the intensities that the maps were solved with; None as for `lights`.
 
-        Args:
-            factors: [lights] of the solve, one for each light whatever its exposures; None: all are 1.
+        The solve has one factor for each light whatever its exposures; without factors all are 1.
         """
         if self.lights is None:
             return None
@@ -69,11 +68,7 @@ class Readings(NamedTuple):
 
 
 def open_readings(capture: Capture, request: ViewRequest, timings: Timings) -> Readings:
-    """Open the stack of a capture that has light frames.
-
-    Raises:
-        StageError: an image cannot be used, near lights have no scale, or the cache cannot be written; names file and field.
-    """
+    """Open the stack of a capture that has light frames."""
     single = all(isinstance(frame.light, DistantLight | PointLight) for frame in capture.sources())
     lights = lights_from_centre(capture) if single else None
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
@@ -107,9 +102,6 @@ class ViewResult(NamedTuple):
 
 def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     """Write what a browser needs to show a capture and its maps.
-
-    Args:
-        request: the capture, the maps if there are any, and the folder of the results.
 
     Raises:
         RequestError: a file of the view would replace one of the capture.
@@ -189,21 +181,13 @@ def _relight(readings: Readings, request: ViewRequest, file: BlockFile, device: 
 
 
 def _check_outputs(request: ViewRequest, capture: Capture) -> None:
-    """Refuse to write over an input, or into a folder that cannot be written to.
-
-    Raises:
-        RequestError, StorageError: as check_outputs.
-    """
+    """Refuse to write over an input, or into a folder that cannot be written to."""
     outputs = [(f"--out {request.out}", request.out / name) for name in (VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE)]
     check_outputs(outputs, [capture.file(name) for _, name in capture.files()])
 
 
 def result_file(maps: Path) -> Path:
-    """Return the maps.exr or depth.exr of a folder, or the file that was given.
-
-    Raises:
-        ResultError: neither is there.
-    """
+    """Return the maps.exr or depth.exr of a folder, or the file that was given."""
     if not maps.is_dir():
         if maps.is_file():
             return maps

@@ -1,10 +1,12 @@
-"""The headers of .npy files, which are checked before what they claim is asked of the memory."""
+"""Headers of .npy files, which are checked before what they claim is asked of the memory, and arrays as the bytes of an .npz file."""
 
+import io
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -38,3 +40,16 @@ def array_shape(path: str | Path, stream: BinaryIO, max_pixels: int | None = Non
     if math.prod(shape) * dtype.itemsize != present:
         raise ImageError(f"{path}: is not a whole .npy array: it has {present} bytes of {math.prod(shape) * dtype.itemsize}")
     return shape
+
+
+def packed(arrays: Mapping[str, Any]) -> bytes:
+    """Return arrays and numbers by their names as bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def unpacked(content: bytes) -> dict[str, np.ndarray]:
+    """Return the arrays of `packed`."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as found:
+        return {name: found[name] for name in found.files}

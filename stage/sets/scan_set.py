@@ -5,12 +5,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
 from stage.records import faults_of_each, read_record
-from stage.transforms import Transform
+from stage.transforms import Transform, rotation_about
 
 SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
@@ -100,6 +101,25 @@ class Turntable(Strict):
     None: the angles are not known."""
     angle_sigma_deg: NotNegative = 0.0
     """Standard deviation of each angle, degrees."""
+
+    def pose_at(self, angle_deg: float) -> np.ndarray:
+        """Return world_from_scan [4, 4] of a scan that was taken when the table had turned by an angle: it undoes the turn."""
+        point = np.array(self.axis_point_m)
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_about(self.axis, -angle_deg)
+        pose[:3, 3] = point - pose[:3, :3] @ point
+        return pose
+
+    def angle_of(self, pose: np.ndarray) -> float:
+        """Return the angle in degrees whose `pose_at` has the rotation nearest to that of a pose."""
+        rotation, axis = pose[:3, :3], np.array(self.axis)
+        vector = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+        return -float(np.degrees(np.arctan2(axis @ vector, np.trace(rotation) - axis @ rotation @ axis)))
+
+    def freedom(self) -> np.ndarray:
+        """Return the motion about the axis by one radian, of small ones: [6, 1] rotation vector, and translation at the world's origin."""
+        axis = np.array(self.axis)
+        return np.concatenate([axis, np.cross(self.axis_point_m, axis)])[:, None]
 
 
 class ScanSet(Strict):

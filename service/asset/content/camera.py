@@ -19,11 +19,7 @@ class View(NamedTuple):
 
 
 def view_of(camera: Camera, extent: np.ndarray) -> View:
-    """Return where the camera stands, and a clipping range twice as deep as the surface.
-
-    Args:
-        extent: [2, 3] bounding box of the surface, camera frame.
-    """
+    """Return where the camera stands, and a clipping range twice as deep as the surface's bounding box [2, 3], camera frame."""
     farthest, nearest = float(extent[0, 2]), float(extent[1, 2])
     if camera.projection == "perspective":
         return View(0.0, -nearest / 2, -farthest * 2)

@@ -39,13 +39,7 @@ class CardImages(NamedTuple):
 
 
 def find_frames(pattern: Path, camera: Camera) -> dict[int, Path]:
-    """Return the frames of a file name with a run of # for the number, or the one file, after a look at their headers.
-
-    Raises:
-        AssetError: several runs of #, no frame, or one that is missing between the first and the last.
-        ImageError: a frame is no EXR file, has no R, G and B, or has another size than the camera's image.
-        StorageError: a file cannot be opened.
-    """
+    """Return the frames of a file name with a run of # for the number, or the one file, after a look at their headers."""
     runs = re.findall("#+", pattern.name)
     if len(runs) != 1 or "#" in str(pattern.parent):
         if runs or not pattern.is_file():
@@ -76,13 +70,7 @@ def write_card(frames: Mapping[int, Path], folder: Path, *, as_png: bool) -> Car
     """Write the images of a card.
 
     Args:
-        frames: of find_frames.
-        folder: exists.
         as_png: colours as PNG of 16 bits with the sRGB curve, clipped at 1, and not as half EXR.
-
-    Raises:
-        ImageError: a frame is damaged, has values that are not finite, a coverage outside 0…1, or a colour space that is not known.
-        OSError, StorageError: a file cannot be written.
     """
     colours: dict[int, str] = {}
     opacities: dict[int, str] = {}

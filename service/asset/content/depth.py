@@ -59,11 +59,7 @@ def measured_points(maps: DepthMaps, cloud: PointCloud | None) -> MeasuredPoints
     """Return the points of a depth.
 
     Args:
-        maps: a depth.
         cloud: what points.ply holds; None: a point is made for each pixel of the depth, without a colour.
-
-    Raises:
-        AssetError: there is no point, or the cloud is not one of this depth.
     """
     if cloud is None:
         rows, cols = np.nonzero(valid_heights(SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth)))
@@ -78,9 +74,7 @@ def measured_points(maps: DepthMaps, cloud: PointCloud | None) -> MeasuredPoints
 def colour_image(measured: MeasuredPoints, mask: np.ndarray) -> np.ndarray | None:
     """Return the colours of the points as an image, [rows, cols, 3] float32 scene-linear Rec.709; None if they have none.
 
-    Args:
-        measured: at least one point.
-        mask: [rows, cols] bool; its pixels without a point of their own take the colour of the pixels around them.
+    Pixels of the mask without a point of their own take the colour of the pixels around them.
     """
     if measured.colours is None:
         return None
@@ -132,11 +126,7 @@ LEAST_SHARE = 0.5
 def depth_mesh(maps: DepthMaps) -> SurfaceMesh:
     """Return faces between neighbouring pixels, without those across a break of the depth (stage.results.depth_breaks).
 
-    Args:
-        maps: a depth; pixels whose depth is not finite, or not in front of a perspective camera, get no vertex.
-
-    Raises:
-        AssetError: there is no face.
+    Pixels whose depth is not finite, or not in front of a perspective camera, get no vertex.
     """
     surface = SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth)
     valid = valid_heights(surface)

@@ -55,12 +55,8 @@ def split_fans(quads: np.ndarray, triangles: np.ndarray, vertex_count: int) -> t
 
 
 def drawn_apart(places: np.ndarray, quads: np.ndarray, triangles: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return the places of vertices, with those that split_fans made of one drawn into their own fans, so that no two are at one place.
-
-    Args:
-        places: [V, 2 or 3], the first two coordinates in pixels.
-        source: of split_fans.
-    """
+    """Return the places of vertices, the first two coordinates in pixels, with those that split_fans made of one drawn into their own
+    fans, so that no two are at one place."""
     split = np.bincount(source, minlength=len(source))[source] > 1
     if not split.any():
         return places

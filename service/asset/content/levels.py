@@ -61,9 +61,7 @@ def with_smooth_normals(mesh: SurfaceMesh) -> SurfaceMesh:
 def level_meshes(mesh: SurfaceMesh, camera: Camera, count: int) -> list[SurfaceMesh]:
     """Return levels of detail of a mesh, each with a quarter of the faces of the one before, and those along the border.
 
-    Args:
-        mesh: the full mesh, with the normals that the normal map is relative to.
-        count: number of levels; fewer are returned where the border of the mesh leaves nothing to simplify.
+    There are fewer than `count` where the border of the mesh leaves nothing to simplify.
     """
     u, v = mesh.st[:, 0].astype(np.float64) * camera.width, (1 - mesh.st[:, 1].astype(np.float64)) * camera.height
     places = np.stack([u, -v, relief(mesh.points[:, 2].astype(np.float64), camera)], axis=-1)

@@ -37,11 +37,7 @@ class Links(NamedTuple):
 
 
 def relief(height: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return heights in pixels, growing towards the viewer.
-
-    Args:
-        height: camera-frame z of any shape, negative in front of a perspective camera.
-    """
+    """Return heights, camera-frame z, negative in front of a perspective camera, in pixels that grow towards the viewer."""
     if camera.focal_px is None:
         return height / (camera.pixel_size_m or 1.0)
     return -float(np.mean(camera.focal_px)) * np.log(-height)
@@ -55,12 +51,7 @@ def height_of(relief_px: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def surface_links(maps: SurfaceMaps, valid: np.ndarray) -> Links:
-    """Return which neighbouring pixels lie on one surface.
-
-    Args:
-        maps: with `height`. Without `normal`, a step breaks the surface where it is steeper than 80 degrees.
-        valid: [rows, cols] bool, where there is a height that counts.
-    """
+    """Return which neighbouring pixels lie on one surface; without normals a step is a break where it is steeper than 80 degrees."""
     assert maps.height is not None
     height = np.where(valid, maps.height, -1).astype(np.float32)
     links = []
@@ -81,13 +72,10 @@ def surface_links(maps: SurfaceMaps, valid: np.ndarray) -> Links:
 
 
 def slopes(normal: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return how relief grows from a pixel to the one on its right and to the one below, as its normal says.
+    """Return how relief grows from a pixel to the one on its right and to the one below, as its normal says, in pixels a pixel.
 
     Args:
         normal: [rows, cols, 3] unit, camera frame; slopes are 0 where it is 0 or not finite.
-
-    Returns:
-        Two arrays [rows, cols], in pixels a pixel.
     """
     across, up, facing = (np.nan_to_num(normal[..., axis], posinf=0, neginf=0) for axis in range(3))
     if camera.focal_px is not None:

@@ -60,9 +60,6 @@ def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links:
         vertex_budget: above it only every k-th pixel in both directions is used, with the smallest k that fits.
         links: which neighbours lie on one surface; None: those of surface_links.
 
-    Raises:
-        AssetError: there is no height layer, or no three neighbouring pixels to span a face.
-
     Convention:
         st = ((c + 0.5) / W, 1 - (r + 0.5) / H) for the pixel (row r, column c), so that a vertex lies on the centre
         of its own texel.
@@ -97,11 +94,7 @@ def camera_points(camera: Camera, u: np.ndarray, v: np.ndarray, height: np.ndarr
 
 
 def valid_heights(maps: SurfaceMaps) -> np.ndarray:
-    """Return where the maps have a height in front of the camera: [rows, cols] bool.
-
-    Raises:
-        AssetError: there is no height layer.
-    """
+    """Return where the maps have a height in front of the camera: [rows, cols] bool."""
     if maps.height is None:
         raise AssetError("the maps have no height layer, so there is no surface to export: solve with a height")
     valid = maps.mask & np.isfinite(maps.height)
@@ -112,14 +105,7 @@ def valid_heights(maps: SurfaceMaps) -> np.ndarray:
 
 def face_to_vertex(quad_values: np.ndarray, triangle_values: np.ndarray, quads: np.ndarray, triangles: np.ndarray,
                    vertex_count: int) -> np.ndarray:
-    """Sum a vector for each face onto the face's corners, and normalise the sums.
-
-    Args:
-        quad_values: [Q, 3]. triangle_values: [T, 3].
-
-    Returns:
-        [V, 3] float64 unit vectors.
-    """
+    """Sum a vector for each face, [Q, 3] and [T, 3], onto the face's corners, and return the normalised sums [V, 3] float64."""
     corners = np.concatenate([quads.ravel(), triangles.ravel()])
     values = np.concatenate([np.repeat(quad_values, 4, axis=0), np.repeat(triangle_values, 3, axis=0)])
     total = np.stack([np.bincount(corners, values[:, axis], minlength=vertex_count) for axis in range(3)], axis=-1)

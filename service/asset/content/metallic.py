@@ -125,13 +125,10 @@ def specular_of_ior(ior: float) -> float:
 
 
 def dielectric_ior(specular: np.ndarray) -> float:
-    """Return one index of refraction of the pixels that are dielectrics: of the median of their F0, or that of glass.
+    """Return one index of refraction of the pixels that are dielectrics: of the median of their F0 [n, 3], or that of glass.
 
-    Args:
-        specular: [n, 3] F0. Pixels with a channel above the F0 of IOR_LIMITS are taken as metal, or as a blend with it.
-
-    Returns:
-        GLASS_IOR where its F0 lies in the spread of the pixels, and where there are no dielectrics.
+    Pixels with a channel above the F0 of IOR_LIMITS are taken as metal, or as a blend with it. GLASS_IOR is returned where its F0 lies in
+    the spread of the pixels, and where there are no dielectrics.
     """
     strongest = specular.max(axis=-1)
     f0 = specular.mean(axis=-1, dtype=np.float32)[strongest <= specular_of_ior(IOR_LIMITS[1])]

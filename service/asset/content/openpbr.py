@@ -36,9 +36,7 @@ _COLOR_SPACES = {DISPLAY_SPACE: "srgb_texture", "lin_rec709_scene": "lin_rec709"
 def openpbr_document(textures: Mapping[str, Texture], *, ior: float) -> mx.Document:
     """Return the material as a document whose files are relative to the folder of the textures.
 
-    Args:
-        textures: by name. Without `roughness` the surface is Lambertian: nothing is reflected, whatever `ior`.
-        ior: index of refraction of the dielectric share.
+    Without the texture `roughness` the surface is Lambertian: nothing is reflected, whatever the index of refraction.
 
     Convention:
         Texture coordinates are the geometric property `st`, as in USD. Images that are no colours declare no colour space.
@@ -79,11 +77,7 @@ def openpbr_document(textures: Mapping[str, Texture], *, ior: float) -> mx.Docum
 
 
 def write_openpbr(document: mx.Document, folder: Path) -> Path:
-    """Write a document into the folder of the textures, and return its path.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a document into the folder of the textures, and return its path."""
     path = folder / DOCUMENT
     path.write_text(mx.writeToXmlString(document), encoding="utf-8")
     return path

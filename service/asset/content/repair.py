@@ -29,16 +29,10 @@ class Repaired(NamedTuple):
 
 
 def repair_heights(maps: SurfaceMaps) -> Repaired:
-    """Replace heights that stand off all of their neighbours, by what these and the normals say.
+    """Replace heights that stand off all of their neighbours, by what these and the normals say; without normals, none.
 
     A spike is a patch of at most a few linked pixels within a part of the object. Its pixels become, ring by ring, the mean of what the
     neighbours that are known say: their relief and the mean slope of both normals.
-
-    Args:
-        maps: with `height`; without `normal` they are returned as they are.
-
-    Raises:
-        AssetError: there is no height layer, or spikes are a large part of the surface.
     """
     valid = valid_heights(maps)
     if maps.normal is None or not valid.any():

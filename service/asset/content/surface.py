@@ -31,11 +31,7 @@ class AssetReport(NamedTuple):
 
 
 def surface_of(maps: SurfaceMaps) -> Surface:
-    """Return solved maps as a mesh with its look.
-
-    Raises:
-        AssetError: there is no height layer, or no face.
-    """
+    """Return solved maps as a mesh with its look."""
     look = metallic_look(maps) if maps.diffuse_albedo is not None else None
     provenance = {**maps.provenance, "relit:color_space": maps.color_space, **(look.provenance if look is not None else {})}
     return Surface(height_mesh(maps), look, provenance, unit_in_metres(maps.camera))

@@ -23,14 +23,7 @@ class TangentFrame(NamedTuple):
     covered: np.ndarray  # [rows, cols] bool, True where the frame exists
 
     def express(self, normal: np.ndarray) -> np.ndarray:
-        """Return camera-frame normals in tangent space.
-
-        Args:
-            normal: [rows, cols, 3] unit, camera frame.
-
-        Returns:
-            [rows, cols, 3] float32: components along T, B = N × T, and N.
-        """
+        """Return camera-frame normals [rows, cols, 3] in tangent space: their components along T, B = N × T, and N, float32."""
         found = np.empty(normal.shape, dtype=np.float32)
         found[..., 0], found[..., 2] = dot(self.tangent, normal), dot(self.normal, normal)
         t, m = np.moveaxis(self.tangent, -1, 0), np.moveaxis(normal, -1, 0)
@@ -47,11 +40,7 @@ class TangentFrames:
     """
 
     def __init__(self, mesh: SurfaceMesh, shape: tuple[int, int]) -> None:
-        """Put the vertices in order.
-
-        Args:
-            shape: rows, cols of the texture; that of the height map.
-        """
+        """Put the vertices in order for a texture of a shape (rows, cols), which is that of the height map."""
         self._step, self._shape = mesh.step, shape
         self._normals, self._tangents = _grid(mesh.normals, mesh, shape), _grid(vertex_tangents(mesh), mesh, shape)
 

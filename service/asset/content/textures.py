@@ -84,21 +84,13 @@ class BakedImages(NamedTuple):
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None = None,
                    storage: TextureFormat = TextureFormat.PNG16, tangent: TangentNormals | None = None) -> dict[str, Texture]:
-    """Write the images that the materials of solved maps use.
+    """Write the images that the materials of solved maps use, and return them by name, in the order of NAMES.
 
     Args:
         mesh: of these maps; the normal map is relative to its frame.
-        folder: exists.
         look: of these maps, for `base_color` and `metallic`; an object without metal has no `metallic`.
         storage: 8 bits are kept for colours alone: normals and roughness would show their steps in highlights, and have 16.
         tangent: the normals in the tangent space of the mesh; None: those of the maps, whose pixels carry the vertices of the mesh.
-
-    Returns:
-        By name, in the order of NAMES.
-
-    Raises:
-        AssetError: the colour space of the maps has no known conversion to Rec.709.
-        OSError, StorageError: a file cannot be written.
     """
     sources: dict[str, np.ndarray | None] = {"roughness": maps.roughness, "normal": maps.normal if tangent is None else tangent.values}
     if look is not None:
@@ -149,11 +141,7 @@ def space_warnings(textures: Mapping[str, Texture]) -> Iterator[str]:
 
 def encode(values: np.ndarray, known: np.ndarray, color_space: str | None,
            dtype: type[np.unsignedinteger[Any]]) -> tuple[np.ndarray, int]:
-    """Return the codes of an image, 0 where nothing is known, and the count of clipped pixels.
-
-    Args:
-        color_space: of `values`, which are converted to DISPLAY_SPACE; None: they are data.
-    """
+    """Return the codes of an image, 0 where nothing is known, and the count of clipped pixels; without a colour space it is data."""
     codes, clipped = np.zeros(values.shape, dtype=dtype), 0
     for start in range(0, len(values), BAND_ROWS):
         rows = slice(start, start + BAND_ROWS)
@@ -174,11 +162,7 @@ def _write_exr(path: Path, values: np.ndarray, known: np.ndarray, color_space: s
 
 
 def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteger]) -> tuple[np.ndarray, int]:
-    """Round values of 0…1 to the codes of an integer type.
-
-    Returns:
-        codes, as values; and the number of known pixels with a channel more than VISIBLE outside 0…1.
-    """
+    """Return values of 0…1 rounded to the codes of an integer type, and how many known pixels have a channel more than VISIBLE outside."""
     top = float(np.iinfo(dtype).max)
     outside = (values < -VISIBLE) | (values > 1 + VISIBLE)
     clipped = outside if outside.ndim == 2 else outside.any(axis=-1)
@@ -187,11 +171,7 @@ def quantise(values: np.ndarray, known: np.ndarray, dtype: type[np.unsignedinteg
 
 
 def to_display(values: np.ndarray, color_space: str) -> np.ndarray:
-    """Return colours [rows, cols, 3] of the maps in the display space; not clipped.
-
-    Raises:
-        AssetError: the colour space has no known conversion.
-    """
+    """Return colours [rows, cols, 3] of the maps in the display space; not clipped."""
     try:
         return convert(np.ascontiguousarray(values), color_space, DISPLAY_SPACE)
     except ValueError as error:
@@ -235,13 +215,9 @@ def bleed(values: np.ndarray, known: np.ndarray, *, reach: int, in_place: bool =
     """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border.
 
     Args:
-        values: [rows, cols] or [rows, cols, channels], integers or floats.
-        known: [rows, cols] bool; known texels are returned as they are.
+        values: [rows, cols] or [rows, cols, channels], integers or floats; zero throughout when nothing is known.
         reach: number of rings; texels beyond get the mean of the known ones, for the coarse mip levels.
         in_place: whether `values` are changed.
-
-    Returns:
-        `values` or a new array like it, of the same type; zero throughout when nothing is known.
     """
     filled = values[..., None] if values.ndim == 2 else values
     if not in_place:

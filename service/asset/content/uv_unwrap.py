@@ -24,11 +24,7 @@ class UnwrappedMesh(NamedTuple):
 
 
 def unwrapper() -> Any:
-    """Return xatlas.
-
-    Raises:
-        AssetError: it is not installed.
-    """
+    """Return xatlas, which may be not installed."""
     try:
         import xatlas
     except ImportError as error:
@@ -37,13 +33,7 @@ def unwrapper() -> Any:
 
 
 def textured_mesh(points: np.ndarray, faces: np.ndarray, *, most_faces: int, texture_px: int) -> UnwrappedMesh:
-    """Return a mesh with fewer faces and texture coordinates in charts that do not overlap.
-
-    Args:
-        points: [V, 3] metres.
-        faces: [F, 3] vertex numbers.
-        most_faces: as many are left, or fewer.
-        texture_px: side of the texture, for the distance between charts.
+    """Return a mesh of points [V, 3] and faces [F, 3] with fewer faces and texture coordinates in charts that do not overlap.
 
     Source:
         Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997, as fast-simplification does it; Young,

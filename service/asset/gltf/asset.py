@@ -9,9 +9,8 @@ from service.asset.content.depth import UNCERTAINTY, colour_image, colour_warnin
 from service.asset.content.metallic import GLASS_IOR, loss_warnings
 from service.asset.content.surface import AssetReport, surface_of
 from service.asset.gltf.container import Glb, writing_glb
-from service.asset.gltf.geometry import add_attribute, add_points, add_surface
 from service.asset.gltf.materials import NORMAL, add_material, add_unlit_material, check_textures, write_textures
-from service.asset.gltf.scene import add_scene, camera_warnings
+from service.asset.gltf.scene import add_attribute, add_points, add_scene, add_surface, camera_warnings
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps
@@ -23,8 +22,6 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
     """Write solved maps as a .glb file, whole or not at all.
 
     Args:
-        maps: with `height`.
-        path: the file; missing folders are made.
         name: free text; the root node, the mesh and the material are named after it.
         version: of the asset, kept with the file's name in the extras of `asset`.
         textures: the bits of normals, roughness and metallic; colours have 8.
@@ -48,19 +45,13 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
 
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
                 version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
-    """Write a depth as a .glb file, whole or not at all.
+    """Write a depth as a .glb file, whole or not at all, and return sentences on what the asset lacks.
 
     Args:
-        maps: a depth.
         cloud: what points.ply holds, or None.
-        path: the file; missing folders are made.
         name: free text; the root node and the material are named after it.
         geometry: what the asset is made of; glTF has no variants for both.
         version: of the asset, kept with the file's name in the extras of `asset`.
-        textures: a .glb has no place for EXR.
-
-    Returns:
-        Sentences on what the asset lacks.
 
     Raises:
         AssetError: EXR textures; no point, or no face for a mesh; a cloud that is not one of this depth; more than 4 GiB.

@@ -68,12 +68,7 @@ class Glb:
         return len(self.document.images) - 1
 
     def write(self, path: Path) -> None:
-        """Write the file.
-
-        Raises:
-            AssetError: more than the 4 GiB that a .glb can hold.
-            OSError: it cannot be written.
-        """
+        """Write the file, which can hold 4 GiB."""
         self.document.buffers = [Buffer(byteLength=self._size)]
         text = self.document.gltf_to_json(separators=(",", ":"), indent=None).encode()
         text += b" " * (-len(text) % ALIGNMENT)
@@ -97,12 +92,7 @@ class Glb:
 
 @contextmanager
 def writing_glb(target: Path) -> Iterator[tuple[Glb, Path]]:
-    """Yield an empty document and a folder for its images; the file replaces `target`, whole or not at all, when the block ends.
-
-    Raises:
-        AssetError: more than the 4 GiB that a .glb can hold.
-        StorageError: the disk refuses; what was there before is left as it was.
-    """
+    """Yield an empty document and a folder for its images; the file replaces `target`, whole or not at all, when the block ends."""
     with replacing(target) as temporary, tempfile.TemporaryDirectory(prefix=f".{target.stem}.", dir=target.parent) as folder:
         glb = Glb()
         yield glb, Path(folder)
@@ -119,12 +109,7 @@ class GlbContents(NamedTuple):
 
 
 def read_glb(path: Path) -> GlbContents:
-    """Read the document of a .glb file.
-
-    Raises:
-        AssetError: it is not a .glb file of version 2, or it is cut off.
-        OSError: it cannot be read.
-    """
+    """Read the document of a .glb file."""
     start = _HEADER.size + _CHUNK_HEADER.size
     with open(path, "rb") as stream:
         head = stream.read(start)

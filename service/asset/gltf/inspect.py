@@ -18,12 +18,7 @@ from stage.errors import storage
 
 
 def inspect_glb(path: Path) -> Inspection:
-    """Read what a .glb file holds.
-
-    Raises:
-        AssetError: it is not a .glb file, or a damaged one.
-        StorageError: it cannot be read.
-    """
+    """Read what a .glb file holds."""
     with storage("read", path):
         contents = read_glb(path)
         try:

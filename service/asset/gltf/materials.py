@@ -25,31 +25,21 @@ BASE_COLOR, METALLIC_ROUGHNESS, NORMAL = "base_color", "metallic_roughness", "no
 
 
 def check_textures(target: Path, storage: TextureFormat) -> None:
-    """Check that a .glb can hold textures that are stored so.
-
-    Raises:
-        AssetError: it cannot hold EXR images.
-    """
+    """Check that a .glb can hold textures that are stored so: it has no place for EXR."""
     if storage is TextureFormat.EXR:
         raise AssetError(f"{target} cannot hold EXR textures: a .glb takes PNG; store the textures as png16, or export a .usda or .usdc")
 
 
 def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: MetallicLook | None,
                    storage: TextureFormat = TextureFormat.PNG16) -> dict[str, Texture]:
-    """Write the images that a glTF material of solved maps uses.
+    """Write the images that a glTF material of solved maps uses, and return them by name.
+
+    METALLIC_ROUGHNESS is there only where a highlight was fitted.
 
     Args:
         mesh: of these maps; the normal map is relative to its frame.
-        folder: exists.
         look: of these maps, where they have reflectance.
         storage: PNG16 or PNG8, the bits of the images that are no colours.
-
-    Returns:
-        By name; METALLIC_ROUGHNESS only where a highlight was fitted.
-
-    Raises:
-        AssetError: the colour space of the maps has no known conversion to Rec.709.
-        OSError: a file cannot be written.
     """
     reach = max(BLEED_TEXELS, mesh.step)
     data: type[np.unsignedinteger[Any]] = np.uint8 if storage is TextureFormat.PNG8 else np.uint16
@@ -90,11 +80,6 @@ NEUTRAL_GREY = 0.18
 def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, name: str, ior: float = GLASS_IOR) -> int:
     """Add a material that uses these textures, and return its number.
 
-    Args:
-        textures: by name, written into `folder`.
-        name: of the material.
-        ior: index of refraction of the dielectric share.
-
     Convention:
         A surface without specular reflection has `specularFactor` 0 (KHR_materials_specular): F0 and F90 are 0, and what is left is
         Lambert's law. The index of refraction of dielectrics is written where it is not 1.5, the default (KHR_materials_ior).
@@ -129,11 +114,7 @@ def add_material(glb: Glb, textures: Mapping[str, Texture], folder: Path, *, nam
 
 
 def add_unlit_material(glb: Glb, *, name: str, coloured: bool) -> int:
-    """Add a material that shows the colours of points as they were measured, and return its number (KHR_materials_unlit).
-
-    Args:
-        coloured: the points have colours; without, they are grey.
-    """
+    """Add a material that shows the colours of points as they were measured, or grey, and return its number (KHR_materials_unlit)."""
     shade = 1.0 if coloured else NEUTRAL_GREY
     glb.document.materials.append(gltf.Material(
         name=name, extensions={"KHR_materials_unlit": {}},

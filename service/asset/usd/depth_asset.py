@@ -1,10 +1,15 @@
-"""Writes a measured depth as a USD asset: a mesh between neighbouring pixels of one surface, and points; with what the scene looks like."""
+"""Writes a measured depth as a USD asset: a mesh between neighbouring pixels of one surface, and points; with what the scene looks like.
+
+The points of a scan in the world are a layer of their own.
+
+Source: OpenUSD, UsdGeomPoints: widths are diameters of the points, in scene units; displayColor is scene-linear.
+"""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pxr import Sdf, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from service.asset.content.depth import (
     GREY,
@@ -13,6 +18,7 @@ from service.asset.content.depth import (
     colour_image,
     colour_warnings,
     depth_mesh,
+    linear_colours,
     measured_points,
     mesh_warnings,
     photographed,
@@ -20,8 +26,8 @@ from service.asset.content.depth import (
 from service.asset.content.mesh import SurfaceMesh
 from service.asset.content.textures import write_textures
 from service.asset.usd.camera import define_cameras
-from service.asset.usd.files import check_textures
-from service.asset.usd.layers import AssetLayers, Description
+from service.asset.usd.files import check_textures, write_layer
+from service.asset.usd.layers import AssetLayers, Description, define_root, describe_root, prim_name, set_extents_hint
 from service.asset.usd.materials import define_display_color_material, define_looks
 from service.asset.usd.scene import define_mesh, define_points, set_primvar
 from service.asset.usd.surroundings import writing_asset
@@ -29,6 +35,10 @@ from service.errors import AssetError
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps
+
+POINT_SUFFIXES = (".usda", ".usdc")
+WIDTH_PART = 0.5
+"""Width of a point, as a part of the spacing that the points would have if they lay evenly on the sides of their box."""
 
 
 class _Parts(NamedTuple):
@@ -45,14 +55,11 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
     """Write a depth as a USD asset with a mesh, which is cut at breaks of the depth, and the measured points as variants of `geo`.
 
     Args:
-        maps: a depth.
         cloud: what points.ply holds, or None.
-        path: .usda, .usdc or .usdz.
         name: free text; the root prim is named after it.
         geometry: the variant that is selected. Beside a mesh with a vertex for every k-th row and column, the points are those of the same
             pixels; without any face there is no mesh beside points.
         version: of the asset, for assetInfo.
-        textures: how the texture is stored.
 
     Returns:
         Sentences on what the asset lacks.
@@ -123,3 +130,36 @@ def _set_uncertainty(prim: UsdGeom.Gprim, maps: DepthMaps, rows: np.ndarray, col
         values = getattr(maps, name)
         if values is not None:
             set_primvar(prim, name, Sdf.ValueTypeNames.FloatArray, values[rows, cols])
+
+
+def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: dict[str, str] | None = None) -> None:
+    """Write a point cloud in metres as a USD layer, .usda or .usdc, whole or not at all.
+
+    The intensity of points, where they have one, becomes the primvar of that name.
+
+    Raises:
+        AssetError: another suffix, or no point.
+        StorageError: the disk refuses.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in POINT_SUFFIXES:
+        raise AssetError(f"{target} cannot be written as USD points: its suffix must be .usda or .usdc")
+    if len(cloud.points) == 0:
+        raise AssetError(f"{target} cannot be written as USD points: there is no point")
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    width = WIDTH_PART * float(np.linalg.norm(high - low)) / max(len(cloud.points) ** 0.5, 1.0)
+
+    def define(usd_stage: Usd.Stage) -> None:
+        root = define_root(usd_stage, Sdf.Path.absoluteRootPath.AppendChild(prim_name(name)), provenance=provenance, documentation=(
+            f"{name}: measured points in the world. Where they come from is in customLayerData."))
+        describe_root(root, name=name, identifier=target.name, version=FIRST_VERSION, provenance=provenance or {})
+        prim = define_points(usd_stage, root.GetPath().AppendChild("Points"), cloud.points, np.array([width]), normals=cloud.normals)
+        set_primvar(prim, "displayColor", Sdf.ValueTypeNames.Color3fArray, linear_colours(cloud.colours))
+        if cloud.intensity is not None:
+            set_primvar(prim, "intensity", Sdf.ValueTypeNames.FloatArray, cloud.intensity)
+        looks = UsdGeom.Scope.Define(usd_stage, root.GetPath().AppendChild("Looks")).GetPath()
+        material = define_display_color_material(usd_stage, looks.AppendChild("PointMaterial"))
+        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
+        set_extents_hint(root.GetPrim())
+
+    write_layer(target, define)

@@ -30,11 +30,7 @@ _PADDING_FIELD = 0x1986
 
 
 def check_suffix(target: Path) -> str:
-    """Return the suffix of an asset in lower case.
-
-    Raises:
-        AssetError: no USD file has this suffix.
-    """
+    """Return the suffix of an asset in lower case; it must be that of a USD file."""
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise AssetError(f"{target} cannot be written as a USD asset: its suffix must be .usda, .usdc or .usdz")
@@ -42,11 +38,7 @@ def check_suffix(target: Path) -> str:
 
 
 def check_textures(target: Path, textures: TextureFormat) -> str:
-    """Return the suffix of an asset in lower case.
-
-    Raises:
-        AssetError: no USD file has this suffix, or one that does cannot hold such textures.
-    """
+    """Return the suffix of an asset in lower case, if such a file can hold these textures."""
     suffix = check_suffix(target)
     if suffix == ".usdz" and textures is TextureFormat.EXR:
         raise AssetError(f"{target} cannot hold EXR textures, which ARKit and three.js do not read in a .usdz: export a .usda or .usdc, or "
@@ -55,16 +47,7 @@ def check_textures(target: Path, textures: TextureFormat) -> str:
 
 
 def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
-    """Write a USD file that refers to no other file.
-
-    Args:
-        target: .usda, .usdc or .usdz.
-        define: fills the empty stage.
-
-    Raises:
-        AssetError: another suffix, or what `define` raises.
-        StorageError: the disk refuses; what was there before is left as it was.
-    """
+    """Write a USD file that refers to no other file, whole or not at all; `define` fills the empty stage."""
     suffix = check_suffix(target)
     with temporary_folder_beside(target) as temporary:
         layer = temporary / f"{target.stem}{'.usdc' if suffix == '.usdz' else suffix}"
@@ -146,15 +129,7 @@ def temporary_folder_beside(target: Path) -> Iterator[Path]:
 
 
 def _pack(package: Path, layer: Path, files: Sequence[Path]) -> None:
-    """Write a package of a layer and the files that it refers to.
-
-    Args:
-        package: its folder holds the layer and, at any depth, the files; their paths relative to it are kept.
-
-    Raises:
-        AssetError: more than the 4 GiB that a package can hold.
-        OSError: it cannot be written.
-    """
+    """Write a package of a layer and the files that it refers to, in the folder of both, relative to which their paths are kept."""
     try:
         with open(package, "wb") as stream, zipfile.ZipFile(stream, "w", allowZip64=False) as archive:
             for file in (layer, *files):

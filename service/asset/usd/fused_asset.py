@@ -23,14 +23,7 @@ from stage.results.mesh import TriangleMesh
 
 
 def write_fused(unwrapped: UnwrappedMesh, baked: BakedImages, path: Path, *, name: str, provenance: dict[str, str]) -> None:
-    """Write a fused surface as a USD asset.
-
-    Args:
-        unwrapped: in the world frame, metres.
-        baked: the images over its texture.
-        path: .usda, .usdc or .usdz.
-        name: free text; the root prim is named after it.
-        provenance: kept with the asset.
+    """Write a fused surface in the world frame, with the images over its texture, as a USD asset.
 
     Raises:
         AssetError: another suffix.
@@ -72,11 +65,7 @@ class Tile(NamedTuple):
 
 
 def write_tile(mesh: TriangleMesh, path: Path) -> Tile:
-    """Write a mesh with the colours of its vertices as a layer, whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write a mesh with the colours of its vertices as a layer, whole or not at all."""
     def define(usd_stage: Usd.Stage) -> None:
         root = define_root(usd_stage, Sdf.Path(f"/{TILE}"))
         counts = np.full(len(mesh.faces), 3, dtype=np.int32)
@@ -91,17 +80,7 @@ def write_tile(mesh: TriangleMesh, path: Path) -> Tile:
 
 
 def write_site(tiles: Sequence[Tile], path: Path, *, name: str, provenance: dict[str, str]) -> None:
-    """Write the layer that has tiles as payloads, with the extent of each, so that a viewer knows it before it loads the tile.
-
-    Args:
-        tiles: below the folder of the file.
-        path: of the file.
-        name: free text; the root prim is named after it.
-        provenance: kept with the asset.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write the layer that has tiles as payloads, with the extent of each, so that a viewer knows it before it loads the tile."""
     def define(usd_stage: Usd.Stage) -> None:
         usd_stage.SetLoadRules(Usd.StageLoadRules.LoadNone())  # the layer is written in another folder first, where the tiles are not
         usd_stage.GetRootLayer().customLayerData = dict(provenance)

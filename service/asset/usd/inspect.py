@@ -30,12 +30,7 @@ BINARY = b"PXR-USDC"
 
 
 def inspect_asset(path: Path) -> Inspection:
-    """Open an asset, look at each of its variants, and run every validator on them.
-
-    Raises:
-        AssetError: it is no USD file, or one that cannot be opened.
-        StorageError: it cannot be read.
-    """
+    """Open an asset, look at each of its variants, and run every validator on them."""
     if path.suffix.lower() not in SUFFIXES:
         raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)} and .glb")
     warnings = _check_package(path) if path.suffix.lower() == ".usdz" else []

@@ -84,12 +84,7 @@ class AssetLayers:
     """
 
     def __init__(self, folder: Path, target: Path, description: Description) -> None:
-        """Create empty layers.
-
-        Args:
-            folder: temporary; the layers are created in it.
-            target: the asset that they become.
-        """
+        """Create empty layers in a temporary folder, which become the target."""
         self._description = description
         self.packed = check_suffix(target) == ".usdz"
         self._interface_file = folder / f"{target.stem}{'.usdc' if self.packed else target.suffix.lower()}"
@@ -224,8 +219,7 @@ class AssetLayers:
     def _create(self, file: Path, *, posed: bool = False) -> Usd.Stage:
         """Return a new stage with axes, unit, default prim and provenance; the root prim of the interface says what the asset is.
 
-        Args:
-            posed: whether the root prim has the pose of the camera frame, which that of the interface has in any case.
+        The root prim of the interface has the pose of the camera frame in any case, others if they are posed.
         """
         description = self._description
         usd_stage: Usd.Stage = Usd.Stage.CreateNew(str(file))
@@ -262,13 +256,9 @@ def set_extents_hint(root: Usd.Prim) -> None:
 
 
 def describe_root(root: UsdGeom.Xform, *, name: str, identifier: str, version: str, provenance: Mapping[str, str]) -> None:
-    """Write kind, assetInfo with the provenance, and the name for people on the root prim of an asset.
+    """Write kind, assetInfo with the provenance, and the name for people on the root prim of an asset; the identifier is its file's name.
 
-    Args:
-        name: free text.
-        identifier: the name of the asset's file.
-        version: of the asset.
-        provenance: kept in assetInfo too, because customLayerData is not seen through a reference.
+    The provenance is kept in assetInfo too, because customLayerData is not seen through a reference.
     """
     model = Usd.ModelAPI(root.GetPrim())
     model.SetKind(Kind.Tokens.component)

@@ -3,8 +3,14 @@
 Blender and three.js multiply `specularColor` with the F0 of the index of refraction, so that metals of the specular workflow are black
 there.
 
+The metallic look is a MaterialX document too: each of its nodes becomes a shader of its definition's name, as the usdMtlx plug-in of
+OpenUSD does it. The plug-in is not in OpenUSD's wheels, which cannot open a .mtlx, so that nothing refers to one. They also lack
+MaterialX's definitions, and validators there call every such shader unknown. The shaders are therefore abstract prims (`class`), which
+traversals leave out, and which UsdShade and Hydra find by the connection of the material. In a build with the plug-in, the same shaders
+as `def` have no finding.
+
 Source: OpenUSD, "UsdPreviewSurface Specification" (surface, UsdUVTexture, UsdPrimvarReader); "Color User Guide" (colorSpace of an
-attribute, UsdColorSpaceAPI).
+attribute, UsdColorSpaceAPI); usdMtlx (names of definitions, types, render context `mtlx`, MaterialXConfigAPI).
 """
 
 from collections.abc import Mapping
@@ -14,10 +20,9 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from service.asset.content.metallic import IOR_LIMITS, MetallicLook
-from service.asset.content.openpbr import openpbr_document, write_openpbr
+from service.asset.content.openpbr import GRAPH, SURFACE, openpbr_document, write_openpbr
 from service.asset.content.textures import DISPLAY_SPACE, Texture
 from service.asset.usd.layers import AssetLayers
-from service.asset.usd.openpbr import define_materialx_surface
 
 METALLIC, SPECULAR = "metallic", "specular"
 """The variants of `look`."""
@@ -41,6 +46,12 @@ _INPUT_TYPES = {
 }
 """Input of the surface → its type; output of the texture, its type."""
 
+RENDER_CONTEXT = "mtlx"
+
+_MATERIALX_TYPES = {"float": _TYPES.Float, "string": _TYPES.String, "filename": _TYPES.Asset,
+          "color3": _TYPES.Color3f, "vector2": _TYPES.Float2, "vector3": _TYPES.Float3,
+          "surfaceshader": _TYPES.Token}
+
 
 def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: float, openpbr: Any = None) -> None:
     """Define a material for each look, and make them the variants of `look`.
@@ -48,7 +59,6 @@ def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: f
     Args:
         textures: by name, written into the folder that `layers` names. Without `roughness` the surface is the fitted Lambertian: `ior` is
             1, so that nothing is reflected at normal incidence, and roughness is 1.
-        ior: index of refraction of the dielectric share, in the metallic workflow.
         openpbr: MaterialX.Document of the metallic look, which its material has for the render context `mtlx`; None: it has none.
 
     Convention:
@@ -62,7 +72,7 @@ def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: f
     if "metallic" not in textures:
         surface.CreateInput("metallic", _TYPES.Float).Set(0.0)
     if openpbr is not None:
-        define_materialx_surface(layers, metallic, openpbr)
+        _define_materialx_surface(layers, metallic, openpbr)
     layers.add_look(METALLIC, metallic)
 
     specular = _define_material(layers, SPECULAR, "Specular", textures)
@@ -75,11 +85,7 @@ def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: f
 def define_openpbr_looks(layers: AssetLayers, folder: Path, textures: Mapping[str, Texture], look: MetallicLook | None) -> list[Path]:
     """Define the looks, the metallic one with an OpenPBR surface too, and return the files that the asset has for them.
 
-    Args:
-        layers: of the asset.
-        folder: of the textures; a MaterialX document is written into it, unless the asset is a package, which may hold none.
-        textures: by name.
-        look: of the surface; None: its reflectance is not known.
+    The document of MaterialX is written beside the textures, unless the asset is a package, which may hold none.
     """
     ior = look.ior if look is not None else IOR_LIMITS[0]
     document = openpbr_document(textures, ior=ior) if look is not None else None
@@ -160,3 +166,51 @@ def define_shader(usd_stage: Usd.Stage, path: Sdf.Path, identifier: str) -> UsdS
     shader = UsdShade.Shader.Define(usd_stage, path)
     shader.CreateIdAttr(identifier)
     return shader
+
+
+def _define_materialx_surface(layers: AssetLayers, material: UsdShade.Material, document: Any) -> None:
+    """Give a material a MaterialX surface, for renderers that read its render context; others see the material as it is."""
+    graph, surface = document.getNodeGraph(GRAPH), document.getNode(SURFACE)
+    nodes = UsdShade.NodeGraph.Define(layers.materials, material.GetPath().AppendChild(graph.getName()))
+    shaders = {node.getName(): _materialx_node(layers, nodes.GetPath(), node) for node in graph.getNodes()}
+    for node in graph.getNodes():
+        for given in node.getInputs():
+            if source := given.getNodeName():
+                _input(shaders[node.getName()], given).ConnectToSource(shaders[source].GetOutput("out"))
+    for output in graph.getOutputs():
+        outlet = nodes.CreateOutput(output.getName(), _MATERIALX_TYPES[output.getType()])
+        outlet.ConnectToSource(shaders[output.getNodeName()].GetOutput("out"))
+    shader = _materialx_node(layers, material.GetPath(), surface)
+    for given in surface.getInputs():
+        if given.getOutputString():
+            _input(shader, given).ConnectToSource(nodes.GetOutput(given.getOutputString()))
+    material.CreateSurfaceOutput(RENDER_CONTEXT).ConnectToSource(shader.GetOutput("out"))
+    for abstract in (nodes, shader):
+        abstract.GetPrim().SetSpecifier(Sdf.SpecifierClass)
+    prim = material.GetPrim()
+    prim.AddAppliedSchema("MaterialXConfigAPI")  # by name, since the schema comes with the plug-in
+    version = ".".join(map(str, document.getVersionIntegers()))
+    prim.CreateAttribute("config:mtlx:version", _TYPES.String, custom=False).Set(version)
+
+
+def _materialx_node(layers: AssetLayers, parent: Sdf.Path, node: Any) -> UsdShade.Shader:
+    """Define a node with the values of its inputs and its output `out`; connections are made when all nodes are there."""
+    shader = UsdShade.Shader.Define(layers.materials, parent.AppendChild(node.getName()))
+    shader.CreateIdAttr(node.getNodeDef().getName())
+    for given in node.getInputs():
+        if not given.getValueString():
+            continue
+        if given.getType() == "filename":
+            file = _input(shader, given)
+            file.Set(Sdf.AssetPath(f"{layers.texture_folder}/{given.getValueString()}"))
+            if given.getColorSpace():
+                file.GetAttr().SetColorSpace(given.getColorSpace())
+        else:
+            value = given.getValue()
+            _input(shader, given).Set(Gf.Vec3f(*value) if given.getType() == "color3" else value)
+    shader.CreateOutput("out", _MATERIALX_TYPES[node.getType()])
+    return shader
+
+
+def _input(shader: UsdShade.Shader, given: Any) -> UsdShade.Input:
+    return shader.CreateInput(given.getName(), _MATERIALX_TYPES[given.getType()])

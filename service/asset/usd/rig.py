@@ -36,17 +36,7 @@ LIGHT_SPACE = "lin_rec709_scene"
 
 
 def write_dome_texture(environment: Path, texture: Path, *, clipped: dict[str, int] | None = None) -> None:
-    """Write an environment map as the texture of a dome light.
-
-    Args:
-        environment: lat-long .exr or .hdr.
-        clipped: as in stage.colour.environment_maps.read_environment.
-        texture: the .exr; half where half holds every value, else float32.
-
-    Raises:
-        ImageError: impossible values, or a colour space that is not known.
-        StorageError: a file cannot be read or written.
-    """
+    """Write a lat-long environment map, .exr or .hdr, as the texture of a dome light, and count what is clipped."""
     write_radiance(read_environment(environment, LIGHT_SPACE, clipped=clipped), texture)
 
 
@@ -70,8 +60,7 @@ def define_dome(usd_stage: Usd.Stage, path: Sdf.Path, texture: str | None) -> Us
 def light_colour(rgb: tuple[float, float, float], space: str) -> tuple[float, tuple[float, float, float]]:
     """Return the intensity and colour of a light from its red, green and blue in a scene-linear colour space.
 
-    Returns:
-        The largest channel in LIGHT_SPACE, and the channels over it; a channel outside of its gamut is 0.
+    These are the largest channel in LIGHT_SPACE, and the channels over it; a channel outside of its gamut is 0.
     """
     channels = np.maximum(convert(np.array([[rgb]], np.float32), space, LIGHT_SPACE)[0, 0].astype(np.float64), 0)
     intensity = float(channels.max())
@@ -108,11 +97,7 @@ class _Emission(NamedTuple):
 
 
 def rig_lights(capture: Capture) -> list[RigLight]:
-    """Return the different lights of a capture, in the order of their first frames.
-
-    Raises:
-        AssetError: no frame is lit by a light that can be placed.
-    """
+    """Return the different lights of a capture, in the order of their first frames."""
     found: dict[Placed, RigLight] = {}
     gradients = bool(capture.lit_by(GradientLight))
     full: list[tuple[int, str]] = []
@@ -135,18 +120,10 @@ def rig_lights(capture: Capture) -> list[RigLight]:
 
 
 def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> list[Path]:
-    """Define the variant `rig` of `light` from the lights of a capture.
+    """Define the variant `rig` of `light` from the lights of a capture, and return the textures of dome lights, beside the layer.
 
     Args:
         extent: [2, 3] bounding box of the surface, camera frame, scene units.
-
-    Returns:
-        The textures of dome lights, beside the layer.
-
-    Raises:
-        AssetError: no light, near lights without a scale, or an extended light that surrounds the object; names the frame.
-        ImageError: an environment of the capture cannot be read.
-        StorageError: a file cannot be read or written.
     """
     lights = rig_lights(capture)
     textures: list[Path] = []

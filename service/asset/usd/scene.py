@@ -22,12 +22,7 @@ def define_mesh(usd_stage: Usd.Stage, path: Sdf.Path, mesh: SurfaceMesh) -> UsdG
 
 def define_polygons(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, normals: np.ndarray, counts: np.ndarray,
                     indices: np.ndarray) -> UsdGeom.Mesh:
-    """Define polygons with normals.
-
-    Args:
-        points: [V, 3] float32. normals: [V, 3] float32.
-        counts: [F] corners of each face. indices: vertex numbers of all corners.
-    """
+    """Define polygons with normals, of which `counts` has the corners of each face and `indices` the vertex numbers of all."""
     usd_mesh = UsdGeom.Mesh.Define(usd_stage, path)
     usd_mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     usd_mesh.CreateDoubleSidedAttr(True)
@@ -41,14 +36,7 @@ def define_polygons(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, no
 
 
 def set_primvar(prim: UsdGeom.Gprim, name: str, kind: Sdf.ValueTypeName, values: np.ndarray) -> None:
-    """Set a primvar of vertices or points, or of the whole prim where one value is given.
-
-    Args:
-        prim: a mesh or points.
-        name: without "primvars:".
-        kind: FloatArray or Color3fArray.
-        values: [n] or [n, 3]; n is the count of vertices or points, or 1.
-    """
+    """Set a primvar of vertices or points, FloatArray or Color3fArray, or of the whole prim where one value is given."""
     interpolation = UsdGeom.Tokens.constant if len(values) == 1 else UsdGeom.Tokens.vertex
     primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation)
     first, index = distinct(values)
@@ -71,15 +59,7 @@ def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widths: np.ndarray, *,
                   normals: np.ndarray | None) -> UsdGeom.Points:
-    """Define points at `path`.
-
-    Args:
-        usd_stage: the stage.
-        path: of the prim.
-        points: [n, 3] in scene units.
-        widths: [n], or [1] for points of one width.
-        normals: [n, 3] unit vectors, or None.
-    """
+    """Define points with widths [n], or [1] for points of one width."""
     prim = UsdGeom.Points.Define(usd_stage, path)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, dtype=np.float32)))
     each_width = Vt.FloatArray.FromNumpy(np.broadcast_to(widths, len(points)).astype(np.float32))

@@ -59,7 +59,6 @@ def write_sequence_asset(moments: Iterator[Moment], target: Path, description: D
 
     Args:
         moments: in the order of time, one step or more, all with faces or none; each is held only while it is written.
-        target: .usdc or .usdz.
         description: goes into the root prim and the layer; it has a camera.
         frames_per_second: time codes a second.
 

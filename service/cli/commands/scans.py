@@ -31,7 +31,7 @@ def _register(request: RegisterRequest) -> None:
 
 
 def _fuse(request: FuseRequest) -> None:
-    from service.scans.fuse import fuse
+    from service.scans.fusion.fuse import fuse
 
     result = with_bar(fuse, request)
     facts = result.facts

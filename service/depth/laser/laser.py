@@ -52,17 +52,8 @@ class _Spot(NamedTuple):
 
 
 def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
-    """Measure every laser frame.
-
-    Args:
-        capture: with laser frames; `off` or `black` frames of it are its ambient light.
-        mask: [rows, cols] bool.
-        request: its span of depths; depths outside are OUT_OF_RANGE.
-
-    Raises:
-        StageError: a laser stands where it cannot, a frame is unreadable, or no frame shows a spot or stripe.
-    """
-    check_laser(capture)
+    """Measure every laser frame; `off` or `black` frames are the ambient light, and depths outside the request's span are OUT_OF_RANGE."""
+    _check_laser(capture)
     near_m, far_m = request.near_m or 0.0, request.far_m or np.inf
     frames = [frame for frame in capture.manifest.frames if frame.laser is not None]
     correction = Correction.of(capture)
@@ -230,12 +221,8 @@ def _words(seen: Counter[str]) -> str:
     return ", ".join(f"{count} {name}" for name, count in seen.items()) or "none was seen"
 
 
-def check_laser(capture: Capture) -> None:
-    """Refuse lasers that stand where the camera sees no depth.
-
-    Raises:
-        ManifestError: names the frame, or the camera when it is orthographic.
-    """
+def _check_laser(capture: Capture) -> None:
+    """Refuse lasers that stand where the camera sees no depth."""
     check_perspective(capture)
     for index, frame in enumerate(capture.manifest.frames):
         where = f"{capture.folder / FILE_NAME}: frames[{index}].laser"

@@ -52,16 +52,13 @@ class Meeting(NamedTuple):
 
 
 def find_spot(signal: np.ndarray) -> Spot:
-    """Return the sub-pixel centroid of the brightest spot.
+    """Return the sub-pixel centroid of the brightest spot; LOW_MODULATION when none stands out of the noise.
 
     Args:
         signal: [rows, cols] float32, the frame less its background; what is not to be looked at is NaN.
 
     Source:
         The mean shift of Comaniciu and Meer, TPAMI 2002, equation 20, divided by its slope.
-
-    Returns:
-        The spot; LOW_MODULATION when none stands out of the noise.
     """
     none = Spot(0.0, 0.0, 0.0, 0.0, int(Status.LOW_MODULATION))
     valid = np.isfinite(signal)
@@ -139,13 +136,10 @@ def _uneven(window: np.ndarray, centre: np.ndarray, width: float) -> float:
 
 
 def nearest_points(origins_a: np.ndarray, directions_a: np.ndarray, origins_b: np.ndarray, directions_b: np.ndarray) -> Meeting:
-    """Return the points with the least sum of squared distances to two rays each.
+    """Return the points with the least sum of squared distances to two rays each; NaN where the rays are parallel.
 
     Args:
         origins_a: [n, 3] or [3], metres. directions_a: [n, 3], of any length. The same of b.
-
-    Returns:
-        The midpoints; NaN where the rays are parallel.
 
     Source:
         Sunday, "Practical Geometry Algorithms", 2021, distance between lines: the 2×2 normal equations in closed form.

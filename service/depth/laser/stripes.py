@@ -35,51 +35,69 @@ WINDOW_PX = 5
 """Side of the window over which the texture of the albedo is compared with its noise, pixels."""
 
 
-class SweepEnergy:
-    """The energy of each pixel over the frames of a sweep."""
+class Signal(NamedTuple):
+    """One frame less its background."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        """Begin with no frame."""
-        self.square = np.zeros(shape, np.float32)
-        self.fourth = np.zeros(shape, np.float32)
-        self.noise2 = 0.0
-        self.frames = 0
+    values: np.ndarray  # [rows, cols] float32, 0 outside the mask
+    channel: int
+    noise: float
+    """Standard deviation where there is no stripe."""
 
-    def add(self, signal: np.ndarray, noise: float) -> None:
-        """Add a frame.
 
-        Args:
-            signal: [rows, cols] float32, less its background.
-            noise: its standard deviation where there is no stripe.
-        """
-        square = np.where(signal > SIGNIFICANT * noise, signal, 0).astype(np.float32) ** 2
-        self.square += square
-        self.fourth += square * square
-        self.noise2 += noise * noise
-        self.frames += 1
+class Sweep:
+    """The albedo of surfaces, from the energy of each pixel over the frames of planes that cross the same lines."""
 
-    def albedo(self) -> np.ndarray | None:
-        """Return the relative albedo, [rows, cols] float32, 0 where the sweep does not tell it; None if it tells it nowhere.
+    def __init__(self) -> None:
+        self._channel = 0
+        self._square: np.ndarray | None = None  # Σ I², [rows, cols]
+        self._fourth: np.ndarray | None = None  # Σ I⁴
+        self._noise2 = 0.0
+        self._frames = 0
+        self._albedo: np.ndarray | None = None
 
-        Texture that does not stand out of its noise is smoothed (Lee, "Digital image enhancement and noise filtering by use of local
-        statistics", PAMI 1980): there a division by it would only add noise.
-        """
-        if self.frames < LEAST_FRAMES:
-            return None
-        noise2 = self.noise2 / self.frames
-        lit = self.square > LEAST_SIGNAL**2 * noise2
-        shared = np.where(lit, self.square**2 / np.where(lit, self.fourth, 1), 0).astype(np.float32)
-        around = _mean(shared, lit)
-        known = lit & (around >= LEAST_FRAMES)
-        if not known.any():
-            return None
-        known &= shared >= LEAST_PART * np.median(shared[known])
-        root = np.sqrt(self.square)
-        middle = _mean(root, known)
-        variance = np.maximum(_mean(root * root, known) - middle * middle, 0)
-        texture = np.maximum(1 - noise2 / np.maximum(variance, 1e-12 * noise2 + 1e-30), 0)
-        found = middle + texture * (root - middle)
-        return np.where(known & (found > 0), found, 0).astype(np.float32)
+    def add(self, signal: Signal) -> None:
+        """Add a frame; those of another channel than the first take no part."""
+        if self._square is None or self._fourth is None:
+            self._channel = signal.channel
+            self._square, self._fourth = np.zeros(signal.values.shape, np.float32), np.zeros(signal.values.shape, np.float32)
+        if signal.channel != self._channel:
+            return
+        square = np.where(signal.values > SIGNIFICANT * signal.noise, signal.values, 0).astype(np.float32) ** 2
+        self._square += square
+        self._fourth += square * square
+        self._noise2 += signal.noise * signal.noise
+        self._frames += 1
+
+    def albedo_for(self, signal: Signal) -> np.ndarray | None:
+        """Return the albedo in the channel of a frame, or None."""
+        return self._albedo if signal.channel == self._channel else None
+
+    def close(self) -> None:
+        """Compute the albedo, and let the frames go."""
+        if self._square is not None and self._fourth is not None and self._frames >= LEAST_FRAMES:
+            self._albedo = _relative_albedo(self._square, self._fourth, self._noise2 / self._frames)
+        self._square = self._fourth = None
+
+
+def _relative_albedo(energy: np.ndarray, fourth: np.ndarray, noise2: float) -> np.ndarray | None:
+    """Return the relative albedo, [rows, cols] float32, 0 where the sweep does not tell it; None if it tells it nowhere.
+
+    Texture that does not stand out of its noise is smoothed (Lee, "Digital image enhancement and noise filtering by use of local
+    statistics", PAMI 1980): there a division by it would only add noise.
+    """
+    lit = energy > LEAST_SIGNAL**2 * noise2
+    shared = np.where(lit, energy**2 / np.where(lit, fourth, 1), 0).astype(np.float32)
+    around = _mean(shared, lit)
+    known = lit & (around >= LEAST_FRAMES)
+    if not known.any():
+        return None
+    known &= shared >= LEAST_PART * np.median(shared[known])
+    root = np.sqrt(energy)
+    middle = _mean(root, known)
+    variance = np.maximum(_mean(root * root, known) - middle * middle, 0)
+    texture = np.maximum(1 - noise2 / np.maximum(variance, 1e-12 * noise2 + 1e-30), 0)
+    found = middle + texture * (root - middle)
+    return np.where(known & (found > 0), found, 0).astype(np.float32)
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -113,15 +131,6 @@ SAME_CURVE_PX = 4.0
 """Largest step of the centre per line between two lines that see one surface."""
 
 
-class Signal(NamedTuple):
-    """One frame less its background."""
-
-    values: np.ndarray  # [rows, cols] float32, 0 outside the mask
-    channel: int
-    noise: float
-    """Standard deviation where there is no stripe."""
-
-
 def stripe_signal(radiance: np.ndarray, mask: np.ndarray) -> Signal:
     """Return the brightest channel of a frame, with its median as zero.
 
@@ -142,31 +151,6 @@ def along_of(laser: LaserPlane) -> str:
     return "row" if abs(laser.normal[0]) >= abs(laser.normal[1]) else "column"
 
 
-class Sweep:
-    """The albedo of surfaces, from the frames of planes that cross the same lines."""
-
-    def __init__(self) -> None:
-        self.energy: SweepEnergy | None = None
-        self.channel = 0
-        self.albedo: np.ndarray | None = None
-
-    def add(self, signal: Signal) -> None:
-        """Add a frame; those of another channel than the first take no part."""
-        if self.energy is None:
-            self.energy, self.channel = SweepEnergy(signal.values.shape), signal.channel
-        if signal.channel == self.channel:
-            self.energy.add(signal.values, signal.noise)
-
-    def close(self) -> None:
-        """Compute the albedo, and let the frames go."""
-        if self.energy is not None:
-            self.albedo, self.energy = self.energy.albedo(), None
-
-    def albedo_for(self, signal: Signal) -> np.ndarray | None:
-        """Return the albedo in the channel of a frame, or None."""
-        return self.albedo if signal.channel == self.channel else None
-
-
 class Stripes(NamedTuple):
     """The stripes of one frame."""
 
@@ -181,12 +165,10 @@ class Stripes(NamedTuple):
 
 def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: Sweep, camera: Camera, *, device: str, near_m: float,
                    far_m: float) -> Stripes:
-    """Measure the stripe of one frame on each line.
+    """Measure the stripe of one frame on each line; depths outside the span are OUT_OF_RANGE.
 
     Args:
-        mask: [rows, cols] bool.
         sweep: of the frames whose stripes cross the same lines.
-        near_m, far_m: span of depths; others are OUT_OF_RANGE.
     """
     along = along_of(laser)
     place, sigma, brightness, amplitude, status = _peaks(signal, mask, along, sweep, device)

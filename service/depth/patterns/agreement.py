@@ -51,9 +51,7 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
     """Return the probability of each pixel's depth to be right, and add to σ what texture within the pixels does.
 
     Args:
-        solution: of projected patterns.
         residual_px: [rows, cols] of both axes; None with one axis.
-        camera, projector: their geometry.
 
     Returns:
         [rows, cols] float32, 0…1; 0 where there is no depth.
@@ -80,11 +78,8 @@ def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera
 
 
 def doubt_coordinates(solution: DecodedSolution) -> np.ndarray:
-    """Return the probability of each pixel's projector coordinates to be right, from its decoder and its neighbours alone.
-
-    Returns:
-        [rows, cols] float32, 0…1; 0 where there is no coordinate.
-    """
+    """Return the probability of each pixel's projector coordinates to be right, from its decoder and its neighbours alone, [rows, cols]
+    float32, 0…1; 0 where there is no coordinate."""
     right = np.zeros(solution.status.shape, np.float32)
     right[solution.solved] = 1
     for status, likely in CONFIDENT.items():
@@ -124,8 +119,7 @@ def conclude(solution: DepthSolution | DecodedSolution, right: np.ndarray, mask:
     Args:
         solution: its warnings, confidence and status are changed.
         right: of `doubt_pixels` or `doubt_coordinates`.
-        mask: [rows, cols] bool.
-        request: near and far, the residual, and the least confidence; where it names one, it alone decides what counts as solved.
+        request: where it names a least confidence, that alone decides what counts as solved.
         warnings: what a sample has shown of the frames; where frames are declared wrongly, no depth is believed.
     """
     lit = mask & ~np.isin(solution.status, UNLIT)

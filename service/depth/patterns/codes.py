@@ -159,7 +159,6 @@ def choose_decoder(collected: Collected, axis: Axis, projector: PatternProjector
     """Choose the most precise way to decode an axis from the codes of a capture: phases, else stripes, else digits, else a ramp.
 
     Args:
-        projector: its resolution, response and crosstalk.
         refine: interpolate a Gray code with inverses between the edges of its stripes.
 
     Returns:

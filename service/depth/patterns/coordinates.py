@@ -48,12 +48,7 @@ class Coordinates:
 
     @classmethod
     def empty(cls, shape: tuple[int, ...], *, columns: bool, rows: bool) -> "Coordinates":
-        """Return coordinates that are not decoded yet.
-
-        Args:
-            shape: rows and columns of the image.
-            columns, rows: which axes have a code.
-        """
+        """Return coordinates that are not decoded yet, for an image of this shape and the axes that have a code."""
         axes = [AxisMaps(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8)) if wanted else None
                 for wanted in (columns, rows)]
         return cls(axes[0], axes[1], np.zeros(shape, np.float32))
@@ -64,13 +59,7 @@ class Coordinates:
         return tuple(axis for axis in (self.columns, self.rows) if axis is not None)
 
     def put(self, band: slice, mask: np.ndarray, decoded: Sequence[Decoded | None]) -> None:
-        """Keep the columns and rows of a band of image rows.
-
-        Args:
-            band: its rows.
-            mask: [rows of the band, cols] bool; nothing is kept outside.
-            decoded: columns and rows.
-        """
+        """Keep the columns and rows of a band of image rows, inside the mask of the band alone."""
         shape = mask.shape
         for axis, found in zip((self.columns, self.rows), decoded, strict=True):
             if axis is None or found is None:

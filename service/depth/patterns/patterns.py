@@ -67,16 +67,9 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                    timings: Timings) -> DepthSolution | DecodedSolution:
     """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
 
-    Args:
-        mask: [rows, cols] bool.
-        request: its noise, residual and span of depths; depths outside are OUT_OF_RANGE.
-
     Returns:
-        Depth; or the decoded coordinates alone, where the capture is not calibrated or where no decoded pixel has a depth.
-
-    Raises:
-        StageError: a calibration that cannot be, an incomplete code, an unreadable frame.
-        RequestError: options about depth for a capture that is not calibrated.
+        Depth, OUT_OF_RANGE outside the request's span; or the decoded coordinates alone, where the capture is not calibrated or where no
+        decoded pixel has a depth.
     """
     missing = missing_calibration(capture)
     projector = check_projector(capture) if missing is None else None
@@ -125,11 +118,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
 
 
 def _refuse_depth_options(request: DepthRequest, missing: str) -> None:
-    """Refuse options that say something about depths where there will be none.
-
-    Raises:
-        RequestError: names the option.
-    """
+    """Refuse options that say something about depths where there will be none."""
     for option in ("near_m", "far_m", "max_sigma", "normals"):
         if getattr(request, option) not in (None, False):
             raise RequestError(f"--{option.replace('_', '-')}: is about depths, and the patterns are decoded without depth: {missing}")
@@ -144,11 +133,7 @@ def _refused(solution: DepthSolution, mask: np.ndarray) -> str:
 
 
 def pattern_projector(capture: Capture, frames: Sequence[Frame]) -> PatternProjector:
-    """Return what decoding needs of the projector; where the manifest has none, stripes that are counted by bits or digits tell its size.
-
-    Raises:
-        ManifestError: the projector is missing, and the codes do not tell how many pixels it has.
-    """
+    """Return what decoding needs of the projector; where the manifest has none, stripes counted by bits or digits tell its size."""
     projector = capture.manifest.projector
     if projector is not None:
         return PatternProjector(projector.resolution, projector.response, projector.crosstalk)
@@ -184,11 +169,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:
-    """Return the codes of a capture and how each axis is decoded.
-
-    Raises:
-        ManifestError: a code is incomplete; names the file.
-    """
+    """Return the codes of a capture and how each axis is decoded."""
     try:
         if len(frames) == sum(frame.pattern is not None for frame in capture.manifest.frames):
             collect([frame.pattern for frame in capture.manifest.frames])  # so that what is wrong is said with the manifest's numbers
@@ -245,11 +226,7 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,
                   device: str) -> Iterator[tuple[slice, list[Decoded | None]]]:
-    """Decode the planes band by band.
-
-    Yields:
-        A range of rows, and each axis decoded in it; None where an axis has no decoder.
-    """
+    """Yield ranges of rows and each axis decoded in them, None where an axis has no decoder."""
     _, height, _, width = planes.values.shape
     made = next((decoder.made for decoder in decoders if decoder is not None and decoder.made is not None), None)
     halo = max((decoder.halo for decoder in decoders if decoder is not None), default=0)
@@ -290,10 +267,7 @@ def full_scale(planes: Planes, capture: Capture, frames: list[Frame]) -> float:
 
 def scene_colour(capture: Capture, frames: list[Frame], collected: Collected, joined: JoinedExposures | None = None) -> np.ndarray | None:
     """Return what the scene looks like, [rows, cols, 3] linear: the white frame, else a bit and its inverse, which add up to even light,
-    else the mean of a wave over its shifts.
-
-    None if the capture has none of them.
-    """
+    else the mean of a wave over its shifts; None if the capture has none of them."""
     parts = {collected.white: 1.0} if collected.white is not None else {}
     for code in collected.codes:
         if not parts and isinstance(code, BinaryCode) and code.inverses is not None:

@@ -68,11 +68,7 @@ def stored(levels: np.ndarray, bits: int, gamma: float) -> np.ndarray:
 
 
 def patterns_of(request: PatternsRequest) -> tuple[Pattern, ...]:
-    """Return the manifest entries of one request; white and black once, at the end.
-
-    Raises:
-        ValueError: the code refuses an option.
-    """
+    """Return the manifest entries of one request; white and black once, at the end. Raise ValueError if the code refuses an option."""
     every = [pattern for axis in AXES[request.axis]
              for pattern in CODES[request.code].patterns(request, axis, request.projector[0 if axis == "column" else 1])]
     return (*(pattern for pattern in every if not isinstance(pattern, UniformPattern)), *uniform_patterns())

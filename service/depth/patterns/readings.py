@@ -38,11 +38,7 @@ class EvenLight(NamedTuple):
 def even_light(collected: Collected, response: Sequence[float] | None = None) -> EvenLight | None:
     """Return how white and black follow from the phases of a capture: from the longest period, which blur dims least.
 
-    Args:
-        response: the projector's light at even levels from 0 to 1; None: linear.
-
-    Returns:
-        None if no period has three shifts.
+    None if no period has three shifts. The response is the projector's light at even levels from 0 to 1; without one it is linear.
     """
     found: list[tuple[float, EvenLight]] = []
     for code in collected.codes:
@@ -90,8 +86,6 @@ class Readings(NamedTuple):
         Args:
             values: [frames, channels, pixels] float32; channels 1 or 3.
             saturated: [frames, pixels] bool; None when no reading saturates.
-            columns: pixels of an image row.
-            made: how white and black are made; None to leave them out.
             exposure: [pixels] by which the values were multiplied; None: all by the same.
         """
         grey = values[:, 0] if values.shape[1] == 1 else np.tensordot(values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))

@@ -15,11 +15,7 @@ GRID = 9
 
 
 def check_perspective(capture: Capture) -> None:
-    """Check that the camera is perspective, because triangulation needs lines of sight from one centre.
-
-    Raises:
-        ManifestError: the camera is orthographic.
-    """
+    """Check that the camera is perspective, because triangulation needs lines of sight from one centre."""
     if capture.camera.projection != "perspective":
         raise ManifestError(f"{capture.folder / FILE_NAME}: camera.projection: is orthographic: triangulation needs a perspective camera")
 
@@ -37,12 +33,7 @@ def missing_calibration(capture: Capture) -> str | None:
 
 
 def check_projector(capture: Capture) -> Projector:
-    """Check that a calibrated camera and projector can measure depth, and return the projector.
-
-    Raises:
-        ManifestError: the calibration is missing, the projector stands at the camera or implausibly far away, or it lights nothing
-            that the camera sees.
-    """
+    """Check that a calibrated projector stands at a plausible place and lights what the camera sees, and return it."""
     where = f"{capture.folder / FILE_NAME}: projector"
     projector, missing = capture.manifest.projector, missing_calibration(capture)
     if missing is not None or not isinstance(projector, Projector):

@@ -122,12 +122,7 @@ WHITE_PERCENTILE = 99.0
 
 
 def point_cloud(solution: DepthSolution, camera: Camera, *, color_space: str, normals: bool) -> PointCloud:
-    """Return one point for each solved pixel, row by row; or the measured places between pixels, if the method has them.
-
-    Args:
-        color_space: of the capture's images.
-        normals: fit them too.
-    """
+    """Return one point for each solved pixel, row by row; or the measured places between pixels, if the method has them."""
     solved = solution.solved
     if solution.points is not None and solution.pixels is not None:
         kept = solved[tuple(solution.pixels.T)]

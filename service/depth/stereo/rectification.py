@@ -1,4 +1,4 @@
-"""Rectification: two cameras turned about their centres until a point lies on the same row of both images.
+"""Rectification: two cameras turned about their centres until a point lies on the same row of both images, and the frames of both so.
 
 Both images are resampled onto the plane z = 1 of one rotated frame, whose x axis runs from the reference camera to the other: whatever
 the place of the other camera, the reference camera is then the left one, and a point at depth Z of that frame has the disparity
@@ -9,14 +9,21 @@ Source: Fusiello, Trucco and Verri, "A compact algorithm for rectification of st
 Convention: axes of OpenCV within the rectified frame, x along the baseline, y down, z forward.
 """
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from math import ceil, floor
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from stage.capture.camera import Camera, OtherCamera
+from stage.capture.capture import Capture
+from stage.capture.manifest import Frame
+from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.errors import ManifestError
 from stage.motion.resample import bicubic, touched
+from stage.stack.planes import scratch_arrays
 from stage.transforms import OPENCV_FROM_CAMERA
 
 LEAST_BASELINE_M, MOST_BASELINE_M = 1e-4, 20.0
@@ -59,11 +66,7 @@ class Rectification(NamedTuple):
         return self.left.left - self.right.left
 
     def rows_of(self, image: np.ndarray, *, other: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Resample an image of one of the two cameras.
-
-        Args:
-            image: [rows, cols] float32.
-            other: whether it is the other camera's.
+        """Resample an image [rows, cols] float32 of one of the two cameras.
 
         Returns:
             The rectified image, [rows, cols] float32, and [rows, cols] bool, False where the camera saw nothing.
@@ -93,9 +96,6 @@ class Rectification(NamedTuple):
     def positions(self, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where pixels of the reference camera lie in its rectified image.
 
-        Args:
-            rows: of the reference camera.
-
         Returns:
             Column and row in the left image, whole at the centres of its pixels; and the depth of the rectified frame at depth 1 of the
             reference camera. Each [rows, cols] float64.
@@ -111,7 +111,6 @@ def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectificati
     """Return how the images of two cameras are rectified.
 
     Args:
-        reference: the camera of the capture, perspective.
         where: the file and the field of the other camera, for messages.
 
     Raises:
@@ -179,3 +178,49 @@ def _extent(camera: Camera, turn: np.ndarray, focal: float, where: str) -> tuple
         raise ManifestError(f"{where}.camera_from_other: the cameras look in directions that are too different to be rectified")
     at = focal * towards[:, :2] / towards[:, 2:]
     return float(at[:, 0].min()), float(at[:, 1].min()), float(at[:, 0].max()), float(at[:, 1].max())
+
+
+class RectifiedFrames(NamedTuple):
+    """Images of two cameras whose rows agree; both are smoothed by the binomial filter 1 2 1, because texture finer than the pixels is
+    aliased and misleads the comparison of two cameras."""
+
+    left: np.ndarray  # [frames, rows, cols] float32, linear, of the reference camera
+    right: np.ndarray  # [frames, rows, right cols] float32, of the other camera
+    left_seen: np.ndarray  # [rows, cols] bool, False where the camera saw nothing
+    right_seen: np.ndarray  # [rows, right cols] bool
+
+
+@contextmanager
+def rectified_frames(capture: Capture, frames: Sequence[Frame], other: int, rectification: Rectification, *, cache: Path | None = None,
+                     progress: Callable[[int], None] | None = None) -> Iterator[RectifiedFrames]:
+    """Read and rectify the frames of the reference camera and of one other, and yield images that exist until the block ends.
+
+    Args:
+        other: index of the other camera.
+        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
+        progress: called after every frame with the count of frames that have been read.
+    """
+    grids = rectification.left, rectification.right
+    size = 4 * len(frames) * sum(grid.width * grid.height for grid in grids)
+    with scratch_arrays(size, capture, cache) as allocate:
+        images = [allocate((len(frames), grid.height, grid.width), np.float32) for grid in grids]
+        seen = [np.ones((grid.height, grid.width), bool) for grid in grids]
+        for index, frame in enumerate(frames):
+            assert frame.stereo is not None  # the caller chose stereo frames
+            recorded = capture.recorded(frame.image), capture.recorded_whole(frame.stereo.images[other])
+            for side, pixels in enumerate(recorded):
+                linear = linearise(pixels, capture.manifest.color_space) @ np.array(GREY_WEIGHTS, np.float32)
+                values, held = rectification.rows_of(smoothed(linear / np.float32(frame.exposure_s or 1.0)), other=side == 1)
+                images[side][index] = values
+                seen[side] &= held
+            if progress is not None:
+                progress(index + 1)
+        yield RectifiedFrames(images[0], images[1], seen[0], seen[1])
+
+
+def smoothed(image: np.ndarray) -> np.ndarray:
+    """Return an image [rows, cols] float32, smoothed by the binomial filter 1 2 1 along rows and columns; borders are continued."""
+    for axis in (0, 1):
+        along = np.moveaxis(np.pad(image, [(int(axis == 0),) * 2, (int(axis == 1),) * 2], mode="edge"), axis, 0)
+        image = np.moveaxis((along[:-2] + along[2:]) * np.float32(0.25) + along[1:-1] * np.float32(0.5), 0, axis)
+    return image

@@ -45,8 +45,7 @@ def find_places(column: np.ndarray, row: np.ndarray, sigma_column: np.ndarray, s
     """Find the places of the projector in the image of a second camera.
 
     Args:
-        column, row: [n] of the first camera, projector pixels.
-        sigma_column, sigma_row: [n] their standard deviations.
+        column, row: [n] of the first camera, projector pixels, with their standard deviations.
         other: what the second camera has decoded.
     """
     count = len(column)

@@ -13,8 +13,7 @@ from kernels.structured.pattern_frames import NoiseModel
 from service.depth.patterns.patterns import full_scale
 from service.depth.patterns.triangulation_check import check_perspective
 from service.depth.results.solution import DepthSolution, statistics
-from service.depth.stereo.rectification import Rectification, rectify
-from service.depth.stereo.rectified_frames import rectified_frames
+from service.depth.stereo.rectification import Rectification, rectified_frames, rectify
 from service.depth.stereo.stereo_pair import LEAST_PLACES, MOST_LABELS, SURE_LEAD, Disparity, Places, match, range_of, unique_places
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -64,15 +63,7 @@ class PairDepth(NamedTuple):
 
 
 def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str, timings: Timings) -> DepthSolution:
-    """Match the frames under texture and triangulate them.
-
-    Args:
-        mask: [rows, cols] bool.
-        request: its noise and its span of depths; depths outside are OUT_OF_RANGE.
-
-    Raises:
-        StageError: a calibration that cannot be, swapped images, nothing that matches, an unreadable frame.
-    """
+    """Match the frames under texture and triangulate them; depths outside the request's span are OUT_OF_RANGE."""
     check_perspective(capture)
     frames = [frame for frame in capture.manifest.frames if frame.stereo is not None]
     found: list[PairDepth] = []
@@ -114,11 +105,7 @@ def solve_stereo(capture: Capture, mask: np.ndarray, request: DepthRequest, devi
 
 
 def _check_order(places: Places, geometry: Rectification, where: str, name: str) -> None:
-    """Refuse images that match behind the cameras.
-
-    Raises:
-        ManifestError: says that the images or the pose are the wrong way round.
-    """
+    """Refuse images that match behind the cameras."""
     behind = int((places.disparity + geometry.offset_px < 0).sum())
     if behind >= LEAST_PLACES and behind > BEHIND_SHARE * len(places.disparity):
         raise ManifestError(f"{where}: {behind} of {len(places.disparity)} places that match have a negative disparity, as if they lay "
@@ -127,11 +114,7 @@ def _check_order(places: Places, geometry: Rectification, where: str, name: str)
 
 
 def _span(places: Places, geometry: Rectification, request: DepthRequest, where: str, name: str) -> tuple[float, float]:
-    """Return the least and the largest disparity to consider, between columns of the rectified images.
-
-    Raises:
-        ManifestError: too few places match to find a range, and the request gives none.
-    """
+    """Return the least and the largest disparity to consider, between columns of the rectified images."""
     reach = geometry.focal_px * geometry.baseline_m
     _, _, ahead = geometry.positions(slice(0, geometry.reference.height))
     ends = [None if metres is None else reach / (metres * float(z)) - geometry.offset_px

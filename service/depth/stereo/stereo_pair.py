@@ -13,7 +13,7 @@ from kernels.stereo.probe import probe
 from kernels.stereo.refine import refine
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.stereo.neighbourhood import WINDOW_REACH, bend, contrast
-from service.depth.stereo.rectified_frames import RectifiedFrames
+from service.depth.stereo.rectification import RectifiedFrames
 from service.depth.stereo.row_offset import row_offsets
 
 VOLUME_BYTES = 192 << 20
@@ -137,14 +137,11 @@ def range_of(places: Places) -> tuple[float, float] | None:
 
 
 def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel, device: str) -> Iterator[tuple[int, Disparity]]:
-    """Match two rectified images band by band.
+    """Match two rectified images band by band; yield how many rows are done, and the disparity of the whole image, final in those rows.
 
     Args:
         least, most: the disparities that are considered.
         noise: of a reading before smoothing.
-
-    Yields:
-        The count of rows that are done, and the disparity of the whole image, of which those rows are final.
     """
     _, rows, cols = images.left.shape
     labels = Labels.covering(least, most, device)

@@ -31,17 +31,10 @@ from stage.errors import ManifestError
 
 def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request: DepthRequest, device: str,
                       timings: Timings) -> DepthSolution:
-    """Decode both captures and intersect the lines of sight of their cameras.
+    """Decode both captures and intersect the lines of sight of their cameras, at the pixels of the first.
 
     Args:
-        capture: of the first camera, at whose pixels the depth is.
         beside: folder of the capture of the second camera, under the same patterns of the same projector.
-        mask: [rows, cols] bool, of the first camera.
-        request: its noise and its span of depths.
-
-    Raises:
-        StageError: a pose is missing or the cameras stand at one place, or a code is incomplete.
-        RequestError: an axis is not coded.
     """
     other = Capture.open(beside, request.pixels._replace(crop=None))
     for each in (capture, other):
@@ -88,11 +81,7 @@ def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request:
 
 
 def _as_projector(capture: Capture, other: Capture) -> Projector:
-    """Return the second camera as the projector of the first, checked as one.
-
-    Raises:
-        ManifestError: a pose is missing, or the cameras stand at one place.
-    """
+    """Return the second camera as the projector of the first, checked as one."""
     camera = other.camera
     if camera.world_from_camera is None:
         raise ManifestError(f"{other.folder / FILE_NAME}: camera.world_from_camera: is missing: two cameras are triangulated by their "

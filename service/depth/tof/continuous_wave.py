@@ -48,7 +48,6 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
     Args:
         images: [M, pixel] float32.
         modulation_hz, reference_phase_rad: [M].
-        cols: of the image.
         scale: [M] factor of each image (unequal exposures); None: 1.
         usable: [pixel] bool; None: all.
 
@@ -151,14 +150,8 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     """Return the range of each pixel from correlation images, of every pixel from which one can be decoded, however unsurely.
 
     Args:
-        options: vote: whether neighbours are asked, for the light of dark pixels and for wraps.
-        calibration: noise and wiggling, where they are known.
         near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
         limit: saturation, in recorded values.
-        usable: [rows, cols] bool mask.
-
-    Raises:
-        ArrayError: the phases or frequencies cannot give the range that is asked for.
     """
     rows, cols = usable.shape
     weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
@@ -211,12 +204,7 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
 
 
 def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[str, ...]:
-    """Return a sentence if the frequencies disagree by more than noise over most of the scene.
-
-    Args:
-        further: [pixel] τ² of `widen`, radians².
-        calibrated: whether the wiggling of every frequency is.
-    """
+    """Return a sentence if the frequencies disagree by more than noise (`further`, τ² of `widen`) over most of the scene."""
     part = float((further > 0).mean()) if further.size else 0.0
     if part < MOST_OF_SCENE:
         return ()

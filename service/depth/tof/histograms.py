@@ -39,11 +39,7 @@ RAISED = 1.1
 
 
 def pattern_bins(counts: np.ndarray) -> np.ndarray:
-    """Return the bins that hold a pattern which all pixels share, [bin] bool; none where there is no such pattern.
-
-    Args:
-        counts: [pixel, bin] photons.
-    """
+    """Return the bins that hold a pattern which all pixels share, [bin] bool, in [pixel, bin] photons; none if there is no such pattern."""
     bins = counts.shape[1]
     none = np.zeros(bins, dtype=bool)
     bright = counts[counts.sum(axis=1) > 0]
@@ -93,13 +89,11 @@ LEAST_PART = 0.02
 def interlaced(position: np.ndarray, there: np.ndarray, width: float) -> np.ndarray:
     """Return where a pixel agrees with the second pixels on both sides and the ones between agree with each other alone, [rows, cols] bool.
 
+    These are the pixels of both kinds, along rows or columns; none at all where fewer than LEAST_PART of the pixels are.
+
     Args:
         position: [rows, cols] times in bins.
-        there: [rows, cols] bool, where there is one.
         width: of the pulse, in bins.
-
-    Returns:
-        The pixels of both kinds, along rows or columns; none at all where fewer than LEAST_PART of the pixels are.
     """
     unit = max(width, 1.0)
     found = np.zeros(position.shape, dtype=bool)
@@ -136,15 +130,9 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     """Return the range of each pixel from photon histograms.
 
     Args:
-        options: which return, and whether neighbours vote.
-        calibration: the pulse, where it is known.
         near_m, far_m: the span of half paths; None: that of the histogram.
         limit: counts at or above it are a full counter.
         usable: [rows, cols] bool mask: the others decide on nothing.
-
-    Raises:
-        ArrayError: the histograms hold nothing.
-        RequestError: the span lies outside the histogram.
     """
     bin_m = range_of_delay_m(frames.bin_s)
     start_m = range_of_delay_m(frames.start_s)

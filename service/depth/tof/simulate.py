@@ -22,15 +22,7 @@ from stage.tof.source import SourcePath
 
 
 def simulate_tof(request: SimulateCwRequest | SimulatePulsedRequest) -> Path:
-    """Write a simulated capture.
-
-    Returns:
-        The capture.json.
-
-    Raises:
-        ResultError, ImageError: the depth cannot be read.
-        StorageError: the capture cannot be written.
-    """
+    """Write a simulated capture, and return its capture.json."""
     maps = DepthMaps.read(request.depth / DEPTH_FILE if request.depth.is_dir() else request.depth)
     scene, camera = _scene(maps, request), maps.camera
     random = np.random.default_rng(request.seed) if request.noise else None

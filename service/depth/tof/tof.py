@@ -32,23 +32,17 @@ from stage.tof.source import SourcePath
 
 def solve_tof(capture: Capture, options: TofOptions, *, near_m: float | None = None, far_m: float | None = None,
               calibration: TofCalibration | None = None, device: str, timings: Timings) -> DepthSolution:
-    """Solve the time-of-flight frames of a capture.
+    """Solve the cw or pulsed frames of a capture.
 
     Args:
-        capture: with cw or pulsed frames.
-        options: filters, and the file of a calibration.
         near_m: nearest range; None: 0, pulsed: where the histogram begins.
         far_m: farthest range; None: as far as the frequencies tell apart, or the histogram reaches.
-        calibration: in place of that file.
+        calibration: in place of the file that the options name.
 
     Returns:
         Depth, range, standard deviations of the depth, amplitude (mean over the frequencies; pulsed: photons of the return), confidence
         (probability of the wrap, or that the return is one) and status of each pixel; 0 where nothing was estimated. Facts say what was
         assumed.
-
-    Raises:
-        ManifestError, ImageError, CalibrationError: the frames or the calibration cannot be used.
-        ArrayError: phases, frequencies or bins that give no range; nothing is launched.
     """
     timings.stage("read", 1)
     pulsed = is_pulsed(capture)

@@ -73,11 +73,9 @@ def thinned_scan(scan: Scan) -> Thinned:
 
 
 def rough_scan(scan: Scan, thinned: Thinned, cell_m: float) -> Thinned:
-    """Return the means of the points of a scan in cells.
+    """Return the means of the points of a scan in cells of a side, metres, or of larger ones if the noise demands them.
 
-    Args:
-        thinned: what `thinned_scan` made of it, which is taken in its place if it has far fewer points.
-        cell_m: the side of the cells, metres, if the noise does not demand larger ones.
+    What `thinned_scan` made of the scan is taken in its place if it has far fewer points.
     """
     cell = max(cell_m, NOISE_CELLS * float(np.median(scan.sigma)))
     if len(scan.points) > MOST_POINTS:
@@ -123,14 +121,7 @@ def _planes(around: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def thin(points: np.ndarray, directions: np.ndarray, variance: np.ndarray, cell: float) -> Thinned:
-    """Return the means of points in cells, with the σ of the means.
-
-    Args:
-        points: [n, 3] metres.
-        directions: [n, 3] unit, from the camera.
-        variance: [n] square metres, along the directions.
-        cell: side of the cells, metres.
-    """
+    """Return the means of points [n, 3] in cells of a side, metres, with the σ of the means; the variance is along the directions."""
     _, of_point, count = np.unique(_cells(points, cell), return_inverse=True, return_counts=True)
 
     def mean(values: np.ndarray) -> np.ndarray:

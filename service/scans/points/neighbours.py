@@ -26,15 +26,7 @@ class Neighbours:
         self._tree = KdTree(np.ascontiguousarray(points, dtype=np.float64), threads)
 
     def nearest(self, points: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest points of the tree, the nearest first.
-
-        Args:
-            points: [m, 3] metres.
-            count: how many; no more than there are.
-
-        Returns:
-            Their indices [m, count] int64 and their distances [m, count] float64, metres.
-        """
+        """Return the indices [m, count] int64 of the nearest points of the tree to points [m, 3], nearest first, and their distances."""
         index, squared = self._tree.batch_knn_search(np.ascontiguousarray(points, dtype=np.float64), min(count, self._count), self._threads)
         return index.astype(np.int64), np.sqrt(squared)
 
@@ -73,10 +65,7 @@ class NearestWithin:
     def search(self, points: np.ndarray, rows: slice, within: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the nearest point of the tree to each point, [m] int64, and its distance [m], metres; infinity beyond `within`.
 
-        Args:
-            points: [m, 3] metres, where the points of some rows are now.
-            rows: which of the points these are.
-            within: metres.
+        The points [m, 3] are where those of some rows are now.
         """
         moved = points - self._place[rows]
         near = np.flatnonzero(self._apart[rows] - np.sqrt((moved * moved) @ np.ones(3)) < within)

@@ -22,12 +22,7 @@ class LocalPlanes(NamedTuple):
 
 
 def local_planes(points: np.ndarray, *, origin: np.ndarray) -> LocalPlanes:
-    """Return the plane that fits the points of the 27 cells around each point.
-
-    Args:
-        points: [n, 3] metres.
-        origin: [3] metres, the side towards which normals point.
-    """
+    """Return the plane that fits the points of the 27 cells around each of [n, 3] points; normals point towards an origin [3]."""
     middle = np.median(points, axis=0).astype(np.float64) if len(points) else np.zeros(3)
     local = points.astype(np.float64) - middle
     cell = _cell_of(local)

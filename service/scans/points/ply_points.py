@@ -35,13 +35,8 @@ class _Element(NamedTuple):
 def read_ply_points(path: Path) -> PlyPoints:
     """Read the vertices of a PLY file.
 
-    Args:
-        path: the file: x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma` and `confidence`
-            where there are any. Other properties and elements are skipped.
-
-    Raises:
-        ResultError: the file is no PLY file, is truncated, or has no vertices with x, y and z.
-        StorageError: the file cannot be read.
+    These are x, y and z of each vertex; nx, ny, nz, red, green, blue (8 bits, or floats from 0 to 1), `sigma` and `confidence` where there
+    are any. Other properties and elements are skipped.
 
     Source:
         Turk, "The PLY Polygon File Format", 1994.

@@ -29,13 +29,7 @@ def logarithm(rotation: np.ndarray) -> np.ndarray:
 
 
 def moved(step: np.ndarray, pivot: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return a pose [4, 4] after a small motion: a rotation vector about a pivot, then a translation.
-
-    Args:
-        step: [6] rotation vector in radians, translation in metres.
-        pivot: [3] the point that the rotation keeps.
-        pose: [4, 4] to whose left the motion is applied.
-    """
+    """Return a pose [4, 4] after a small motion [6]: a rotation vector about a pivot [3], radians, then a translation, metres."""
     motion = np.eye(4)
     motion[:3, :3] = exponential(step[:3])
     motion[:3, 3] = step[3:] + pivot - motion[:3, :3] @ pivot
@@ -68,11 +62,7 @@ def step_between(motion: np.ndarray, pivot: np.ndarray) -> np.ndarray:
 
 
 def about(offset: np.ndarray) -> np.ndarray:
-    """Return what takes a small motion [6] (rotation vector, translation) about one pivot to the same motion about another: [6, 6].
-
-    Args:
-        offset: [3] from the first pivot to the second.
-    """
+    """Return what takes a small motion [6] (rotation vector, translation) about one pivot to that about another, at an offset: [6, 6]."""
     out = np.eye(6)
     out[3:, :3] = -cross_matrix(offset)
     return out
@@ -100,14 +90,7 @@ def nearest_rigid(pose: np.ndarray) -> np.ndarray:
 
 
 def rigid_between(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the rigid transforms that take weighted points nearest to others.
-
-    Args:
-        source, target: [m, n, 3] matched points of m problems.
-        weights: [m, n], not negative.
-
-    Returns:
-        [m, 4, 4] target_from_source.
+    """Return the rigid transforms [m, 4, 4] that take [m, n, 3] weighted source points of m problems nearest to their targets.
 
     Source:
         Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Crystallographica A32, 1976.

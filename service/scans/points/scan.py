@@ -49,11 +49,7 @@ class Scan:
     """Named targets that the scan shows, in its frame."""
 
     def image(self, values: np.ndarray) -> np.ndarray:
-        """Return values of the points as an image: [rows, cols] or [rows, cols, k] of their type, 0 where no point is.
-
-        Args:
-            values: [n] or [n, k], such as -points[:, 2] for the z-depth, or `sigma`.
-        """
+        """Return values [n] or [n, k] of the points as an image: [rows, cols] or [rows, cols, k] of their type, 0 where no point is."""
         assert self.camera is not None and self.pixels is not None
         image = np.zeros((self.camera.height * self.camera.width, *values.shape[1:]), dtype=values.dtype)
         image[self.pixels] = values

@@ -57,12 +57,7 @@ def squares_of(depth: np.ndarray, sigma: np.ndarray, camera: Camera, side: int) 
 
 
 def coarser(scan: Scan, side: int) -> Scan:
-    """Return a range image of a perspective camera whose pixels are squares of those of another, without normals.
-
-    Args:
-        scan: the range image; its maps stay those of its own pixels.
-        side: of a square, pixels.
-    """
+    """Return a range image of a perspective camera whose pixels are squares of those of another, without normals; its maps stay."""
     assert scan.camera is not None
     found = squares_of(scan.image(-scan.points[:, 2]), scan.image(scan.depth_sigma()), scan.camera, side)
     there = found.depth > 0

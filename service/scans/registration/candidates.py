@@ -106,8 +106,6 @@ def overlapping(numbers: Iterable[int], overlaps: Overlaps, least_overlap: float
 
     Args:
         numbers: the scans that have poses.
-        overlaps: at these.
-        least_overlap: the least part of the smaller of two scans.
         count: of all scans; beyond ALL_PAIRS each is tried with PARTNERS others of its scale and OTHER_PARTNERS of other scales, and with
             more where it is among those of these.
         wanted: returns whether a pair is to be considered.
@@ -142,12 +140,7 @@ def likeness(outlines: Mapping[int, Outline]) -> dict[tuple[int, int], float]:
 
 
 def most_alike(unlike: Mapping[tuple[int, int], float], group_of: Mapping[int, int]) -> list[tuple[int, int]]:
-    """Return the pairs of scans of different groups to be tried next: of each scan the most similar, and the next in their order.
-
-    Args:
-        unlike: of each pair that was not tried yet.
-        group_of: the group of scans that are joined already, of each scan.
-    """
+    """Return the pairs of scans of different groups to be tried next: of each scan the most similar, and the next in their order."""
     partners: dict[int, int] = {}
     kept = []
     for a, b in sorted(unlike, key=lambda pair: (pair[1] - pair[0] != 1, unlike[pair], pair)):

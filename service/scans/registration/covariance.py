@@ -25,12 +25,7 @@ def rows_of(pair: Pair) -> Rows:
 
 def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge], rows: Callable[[Pair], Rows] = rows_of
                 ) -> dict[int, np.ndarray]:
-    """Return the covariance of the pose of each scan.
-
-    Args:
-        pairs: with their fits, in the order of the edges.
-        edges: those that `solved` was found from.
-        rows: returns the matched points of a pair.
+    """Return the covariance of the pose of each scan, by pairs with their fits in the order of the edges that `solved` was found from.
 
     Returns:
         [6, 6] of each scan: of a small rotation (radians, about the world's axes through the origin of the scan), then of a translation

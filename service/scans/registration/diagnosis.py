@@ -51,9 +51,7 @@ def why_alone(scan: Scan, others: Sequence[Callable[[], Prepared]], *, extent: f
 
     Args:
         others: return the scans that could, prepared.
-        extent, others_extent: metres.
         cell_m: side of the cells of the rough scale, metres.
-        least_overlap: the least part of the smaller of two scans that must be matched.
     """
     def fits(changed: Scan) -> bool:
         ready = prepare(changed, cell_m=cell_m)
@@ -77,11 +75,7 @@ def why_alone(scan: Scan, others: Sequence[Callable[[], Prepared]], *, extent: f
 
 
 def odd_scales(pairs: Iterable[Pair], numbers: Sequence[int]) -> dict[int, float]:
-    """Return the approximate scale of each scan whose scale is not that of the others.
-
-    Args:
-        pairs: joined pairs, between `numbers` alone.
-    """
+    """Return the approximate scale of each scan whose scale is not that of the others, by the joined pairs between them alone."""
     place = {number: k for k, number in enumerate(numbers)}
     rows, values = [], []
     for pair in pairs:
@@ -106,11 +100,7 @@ def odd_scales(pairs: Iterable[Pair], numbers: Sequence[int]) -> dict[int, float
 
 
 def looks_alike_turned(scan: Prepared, cell_m: float) -> bool:
-    """Return whether a good part of a scan lies on itself after a turn about the axis about which its pose is determined least.
-
-    Args:
-        cell_m: side of the cells of its rough scale, metres.
-    """
+    """Return whether a good part of a scan lies on itself after a turn about the axis about which its pose is determined least."""
     here = fit(scan.rough, scan.rough, np.eye(4), [2 * cell_m])
     if here is None:
         return False

@@ -15,11 +15,7 @@ SMALLER = 3.0
 
 
 def extent_of(scan: Scan) -> float:
-    """Return the diagonal of the box around nearly all points of a scan, metres.
-
-    Raises:
-        ScanError: the points lie at one place.
-    """
+    """Return the diagonal of the box around nearly all points of a scan, metres."""
     low, high = np.percentile(scan.points, (1, 99), axis=0)
     extent = float(np.linalg.norm(high - low))
     if extent == 0:
@@ -36,14 +32,9 @@ def usual_extent(extents: Sequence[float]) -> float:
 def cells_of(extents: Sequence[float], starts: Sequence[np.ndarray | None], cell_m: float | None) -> Mapping[int, float]:
     """Return the side of the cells of the rough scale of each scan that can be registered, metres.
 
-    Args:
-        extents: of all scans, metres.
-        starts: world_from_scan [4, 4] of each, or None.
-        cell_m: the side for all but scans that are far larger or smaller; None: a sixtieth of their usual extent.
-
-    Returns:
-        One side for all scans of about one extent. A scan that is far smaller or larger and has a start has another, that times the nearest
-        power of two; a scan so far off that its unit may be wrong is left out if it has none.
+    There is one side for all scans of about one extent: `cell_m`, or a sixtieth of their usual extent. A scan that is far smaller or larger
+    and has a start has another, that times the nearest power of two; a scan so far off that its unit may be wrong is left out if it has
+    none.
     """
     odd, usual = odd_scans(extents), usual_extent(extents)
     common = cell_m or usual / CELLS_ACROSS

@@ -30,11 +30,9 @@ class FixedPoses(NamedTuple):
 
 def check_fixed(scans: Sequence[Scan], poses: Sequence[np.ndarray], *, threads: int, cell_m: float | None, least_overlap: float,
                 advance: Callable[[float], None] = lambda done: None) -> FixedPoses:
-    """Compare fixed poses with what the surfaces of overlapping scans ask for.
+    """Compare fixed poses, world_from_scan [4, 4], with what the surfaces of overlapping scans ask for.
 
     Args:
-        scans: two or more.
-        poses: world_from_scan [4, 4] of each.
         threads: pairs that are compared at one time.
         cell_m: side of the cells of the rough scale, metres; None: a sixtieth of the median extent of the scans.
         least_overlap: the least part of the smaller of two scans that must be matched.

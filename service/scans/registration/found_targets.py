@@ -44,14 +44,9 @@ class ImagePoint(NamedTuple):
 
 
 def markers_in(image: np.ndarray, dictionary: str) -> list[ImagePoint]:
-    """Return the four corners of every coded marker in an image.
+    """Return the four corners of every coded marker in a linear image, named `marker 7 corner 2`; NaN counts as black.
 
-    Args:
-        image: [rows, cols] linear; NaN counts as black.
-        dictionary: a name of DICTIONARIES.
-
-    Returns:
-        The corners, named `marker 7 corner 2`. A marker that is there twice is left out: nothing says which is which.
+    A marker that is there twice is left out: nothing says which is which.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -70,15 +65,10 @@ def markers_in(image: np.ndarray, dictionary: str) -> list[ImagePoint]:
 
 
 def board_in(image: np.ndarray, board: tuple[int, int]) -> list[ImagePoint]:
-    """Return the inner corners of a chessboard in an image, named `board 3,1` by column and row.
+    """Return the inner corners of a chessboard in a linear image, named `board 3,1` by column and row; none where it is not whole.
 
-    Args:
-        image: [rows, cols] linear; NaN counts as black.
-        board: the count of inner corners across and down, of which one is odd and one even: so the colours of the squares say which end is
-            which. The first corner has a dark square towards the second row and column.
-
-    Returns:
-        The corners; none where the board is not whole in the image.
+    Of the counts of inner corners across and down one is odd and one even: so the colours of the squares say which end is which. The first
+    corner has a dark square towards the second row and column. NaN counts as black.
     """
     corners = find_corners(np.nan_to_num(image), board)
     if corners is None:
@@ -100,10 +90,7 @@ def board_in(image: np.ndarray, board: tuple[int, int]) -> list[ImagePoint]:
 
 
 def placed(points: list[ImagePoint], scan: Scan) -> tuple[Target, ...]:
-    """Return the targets at image points, by the depths of a range image; those without enough depths around them are left out.
-
-    Args:
-        points: in an image of the camera of the scan.
+    """Return the targets at points of an image by the camera of a range image; those without enough depths around them are left out.
 
     Convention:
         The depth of a target is the mean of at most MOST_AVERAGED independent depths.

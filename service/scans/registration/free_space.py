@@ -80,10 +80,9 @@ def _of_squares(values: np.ndarray, step: int, least: np.ufunc) -> np.ndarray:
 
 
 def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float) -> Sight:
-    """Compare points with what a range image says of the space before and behind its surface.
+    """Compare points of another scan with what a range image says of the space before and behind its surface.
 
     Args:
-        points: [n, 3] metres, of another scan.
         pose: [4, 4] from the frame of the points to that of the image.
         tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
     """
@@ -111,16 +110,10 @@ def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
 
 def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float
                   ) -> Contradiction:
-    """Return which parts of the points in sight lie where the other camera saw through.
+    """Return which parts of the points in sight lie where the other camera saw through, at a pose a_from_b; a set of points says nothing.
 
     On a part of the surface lie points whose neighbours are contradicted too, that are on no border and that the other camera does not see
     edge-on: where a pixel takes in the edge of a surface and what is behind it, its point lies on neither.
-
-    Args:
-        a, b: the range images; None: a set of points, which says nothing.
-        cloud_a, cloud_b: in the frames of a and b.
-        pose: [4, 4] a_from_b.
-        tolerance: metres.
     """
     through = contradicted = in_sight = 0
     for image, cloud, way in ((a, cloud_b, pose), (b, cloud_a, inverse(pose))):
@@ -146,14 +139,7 @@ def _facing(image: DepthRange, points: np.ndarray, normals: np.ndarray, pose: np
 
 def both_sights(a: DepthRange | None, b: DepthRange | None, points_a: np.ndarray, points_b: np.ndarray, pose: np.ndarray,
                 tolerance: float) -> Sight:
-    """Return the sum of what both scans say of each other's points.
-
-    Args:
-        a, b: the range images; None: a set of points, which says nothing.
-        points_a, points_b: [n, 3] and [m, 3] in the frames of a and b.
-        pose: [4, 4] a_from_b.
-        tolerance: metres.
-    """
+    """Return the sum of what both scans say of each other's points at a pose a_from_b; a set of points, None, says nothing."""
     parts = [sight(a, points_b, pose, tolerance)] if a is not None else []
     parts += [sight(b, points_a, inverse(pose), tolerance)] if b is not None else []
     return Sight(*(sum(values) for values in zip(*parts, strict=True))) if parts else Sight(0, 0, 0)

@@ -7,7 +7,7 @@ import numpy as np
 
 from service.scans.points.cloud import Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, inverse
-from service.scans.registration.features import fpfh
+from service.scans.registration.coarse import fpfh
 from service.scans.registration.pairs import FEATURE_CELLS, FINE_POINTS, ROUGH_POINTS, Pair, PairState, Prepared, refine, search
 
 START_CELLS, NEAR_CELLS = 2.0, 1.0
@@ -39,7 +39,6 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
     Args:
         cell_m: side of the cells of the rough scale of each, metres. If they differ, the part of the larger scan around the smaller one is
             taken at the scale of that, which takes a start.
-        least_overlap: the least part of the smaller of two scans that must be matched.
     """
     numbers, cell = (task.a, task.b), min(cell_m)
     if task.start is None and cell_m[0] != cell_m[1]:

@@ -10,8 +10,7 @@ import numpy as np
 from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
 from service.scans.points.rigid import inverse, moved, step_between
 from service.scans.points.scan import Scan
-from service.scans.registration.coarse import is_near, rough_poses
-from service.scans.registration.features import fpfh
+from service.scans.registration.coarse import fpfh, is_near, rough_poses
 from service.scans.registration.fine import TUKEY, Fit, fit
 from service.scans.registration.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
 
@@ -120,12 +119,7 @@ def is_contradicted(found: Contradiction) -> bool:
 
 
 def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
-    """Thin a scan to both scales and describe its rough points.
-
-    Args:
-        cell_m: side of the cells of the rough scale, metres.
-        threads: for the search of neighbours.
-    """
+    """Thin a scan to both scales and describe its rough points; cell_m is the side of the cells of the rough scale, metres."""
     thinned = thinned_scan(scan)
     rough = cloud_of(rough_scan(scan, thinned, cell_m), most=ROUGH_POINTS, threads=threads)
     fine = cloud_of(thinned, most=FINE_POINTS, threads=threads)
@@ -134,13 +128,7 @@ def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
 
 
 def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
-    """Register two scans without a start.
-
-    Args:
-        numbers: of the scans, for the result.
-        cell_m: side of the cells of the rough scale, metres.
-        least_overlap: the least part of the smaller scan that must be matched.
-    """
+    """Register two scans, whose numbers are kept in the result, without a start; cell_m is the side of the rough scale's cells, metres."""
     poses = rough_poses(a.rough, b.rough, a.features, b.features, cell_m=cell_m, most=MOST_POSES)
     return _best(a, b, _settled(a, b, poses, cell_m), numbers, cell_m, least_overlap)
 

@@ -192,14 +192,7 @@ def joined_groups(count: int, pairs: Iterable[Pair]) -> list[set[int]]:
 
 
 def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
-    """Return first poses: along the pairs with the most agreeing loops and the most matches.
-
-    Args:
-        pairs: joined pairs between the members, which connect them.
-        members: the scans.
-        reference: the scan that has `pose`.
-        pose: [4, 4] its world_from_scan.
-    """
+    """Return first poses: along the joined pairs with the most agreeing loops and the most matches, from that of the reference."""
     relative: dict[tuple[int, int], np.ndarray] = {}
     worth: dict[tuple[int, int], float] = {}
     for pair in pairs:

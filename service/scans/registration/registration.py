@@ -24,7 +24,6 @@ from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_C
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
 from service.scans.registration.target_pairs import TargetPlace, against_surfaces, pairs_by_targets, target_places
-from service.scans.registration.turntable import angle_of, freedom, turned_pose
 from stage.errors import ScanError
 from stage.sets.scan_set import Turntable
 
@@ -94,13 +93,9 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
     """Find the poses of scans of one object, all of which are in memory.
 
     Args:
-        scans: two or more.
         starts: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
         table: the turntable, if its axis is right and only the angles are to be found.
         advance: told how far the work is, from 0 to 1.
-
-    Raises:
-        ScanError: no two scans can be joined.
     """
     with ThreadPoolExecutor(options.threads) as pool:
         return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
@@ -110,17 +105,11 @@ def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options
 def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], starts: Sequence[np.ndarray | None],
                 options: RegistrationOptions, *, table: Turntable | None = None, targets: Mapping[int, Sequence[Target]] | None = None,
                 advance: Advance = lambda done: None) -> Registration:
-    """Find the poses of scans of one object.
+    """Find the poses of scans of one object, whose names are for messages; other arguments as of `register`.
 
     Args:
-        work: makes and keeps what is needed of scans and pairs.
-        names: of the scans, for messages.
         extents: of the scans, as `extent_of` returns it.
-        starts, options, table, advance: as of `register`.
         targets: the targets that each scan shows. None: there are none.
-
-    Raises:
-        ScanError: no two scans can be joined.
     """
     count = len(names)
     cells = dict(cells_of(extents, starts, options.cell_m))
@@ -258,14 +247,7 @@ def _groups(count: int, pairs: Sequence[Pair]) -> dict[int, int]:
 
 def _predicted(outlines: dict[int, Outline], pairs: dict[tuple[int, int], Pair], tried: set[tuple[int, int]], solved: Solved | None,
                count: int, options: RegistrationOptions, registered: Registered) -> dict[tuple[int, int], Pair]:
-    """Return further joined pairs, of scans that overlap at the poses that were found.
-
-    Args:
-        pairs: what became of each pair that was tried.
-        tried: pairs that this function tried before, to which it adds.
-        solved: the poses; None: there are none.
-        count: of all scans.
-    """
+    """Return further joined pairs, of scans that overlap at the poses that were found; add those that were tried to `tried`."""
     if solved is None:
         return {}
     poses = solved.poses
@@ -298,10 +280,10 @@ def _solved(count: int, pairs: Sequence[Pair], starts: Sequence[np.ndarray | Non
         ways: dict[int, np.ndarray] = {}
         priors: dict[int, np.ndarray] = {}
         if table is not None:
-            poses = {number: turned_pose(table, angle_of(table, pose)) for number, pose in poses.items()}
-            ways = {number: freedom(table) for number in poses}
+            poses = {number: table.pose_at(table.angle_of(pose)) for number, pose in poses.items()}
+            ways = {number: table.freedom() for number in poses}
             if table.angle_sigma_deg > 0 and table.angles_deg is not None:
-                poses = {number: turned_pose(table, table.angles_deg[number]) for number in poses}
+                poses = {number: table.pose_at(table.angles_deg[number]) for number in poses}
                 priors = {number: np.array([[np.radians(table.angle_sigma_deg) ** -2]]) for number in poses}
         solved = solve([edge_of(pair) for pair in kept], poses, fixed=reference, freedoms=ways, priors=priors)
         left = [pair for pair, weight in zip(kept, solved.weights, strict=True) if weight > REFUSED]

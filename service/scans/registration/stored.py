@@ -9,11 +9,11 @@ import numpy as np
 
 from service.scans.points.cloud import Cloud
 from service.scans.points.neighbours import Neighbours
-from service.scans.points.packed_arrays import packed
 from service.scans.registration.fine import Fit, Rows
 from service.scans.registration.free_space import DepthRange
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared
 from stage.capture.camera import Camera
+from stage.formats.npy import packed
 
 CLOUD = ("points", "normals", "near_normals", "directions", "sigma", "spacing")
 """The arrays of a cloud that are stored in single precision, as scans are."""

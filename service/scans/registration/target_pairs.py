@@ -35,12 +35,7 @@ class TargetPlace(NamedTuple):
 
 
 def pairs_by_targets(shown: Mapping[int, Sequence[Target]], ready: Callable[[int], Prepared]) -> dict[tuple[int, int], Pair]:
-    """Return the pairs of scans that have targets in common.
-
-    Args:
-        shown: the targets of each scan that shows some.
-        ready: returns a scan at both scales.
-    """
+    """Return the pairs of scans that have targets in common."""
     points = {number: len(ready(number).fine.points) for number in shown}
     found = {}
     for a, b in combinations(sorted(shown), 2):
@@ -51,13 +46,7 @@ def pairs_by_targets(shown: Mapping[int, Sequence[Target]], ready: Callable[[int
 
 
 def against_surfaces(pair: Pair, surface: Pair | None, ready: Callable[[int], Prepared]) -> Pair:
-    """Return a pair by targets, refused if the surfaces of the two scans contradict its pose.
-
-    Args:
-        pair: with a pose by targets.
-        surface: what became of the same pair by its surfaces; None: it was not tried.
-        ready: returns a scan at both scales.
-    """
+    """Return a pair with a pose by targets, refused if the surfaces of the two scans, where they were tried, contradict it."""
     assert pair.fit is not None
     if surface is not None and surface.state is PairState.JOINED and surface.fit is not None:
         step = step_between(pair.fit.pose @ inverse(surface.fit.pose), pair.fit.pivot)
@@ -83,10 +72,7 @@ def target_places(shown: Mapping[int, Sequence[Target]], poses: Mapping[int, np.
                   ) -> list[TargetPlace]:
     """Return where each target is that two or more scans with a pose show, and the scans that show it elsewhere.
 
-    Args:
-        shown: the targets of each scan that shows some.
-        poses: world_from_scan [4, 4] of those that have one.
-        covariances: [6, 6] as `stage.sets.scan_set.Covariance`; a scan without one has an exact pose.
+    A scan without a covariance has an exact pose.
 
     Convention:
         A place counts if more than half of the scans agree about it within their standard deviations.

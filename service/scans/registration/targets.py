@@ -44,7 +44,6 @@ def pose_by_targets(a: Sequence[Target], b: Sequence[Target], *, first_row: tupl
     """Find the pose of scan b against scan a by the targets that both show.
 
     Args:
-        a, b: the targets of the scans; names are unlike within a scan.
         first_row: from which number on `Rows.at` and `Rows.of` count the targets, 3 numbers each, in the order of a and of b, so that
             the covariance of a pose graph tells them from points of the surface.
     """

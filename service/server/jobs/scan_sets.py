@@ -68,7 +68,7 @@ def _register(request: RegisterJob, files: StepFiles, sharing: "SharedPieces") -
 def _fuse(request: FuseJob, files: StepFiles, sharing: "SharedPieces") -> None:
     """Fuse the depths that another job has registered."""
     from service.requests.register import FuseRequest
-    from service.scans.fuse import fuse, help_fuse
+    from service.scans.fusion.fuse import fuse, help_fuse
 
     _, scans = read_scan_set(files.maps(request.registered) / SCAN_SET_FILE)
     with _in_folder(scans, files, request.registered) as folder:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.captures.front_lights import front_lights
+from service.captures.info import front_lights
 
 
 def ring(degrees: float, count: int) -> np.ndarray:

@@ -3,18 +3,20 @@
 import numpy as np
 import pytest
 
-from service.depth.laser.stripes import SweepEnergy
+from service.depth.laser.stripes import Signal, Sweep
 
 RNG = np.random.default_rng(0)
 ALBEDO = np.exp(RNG.normal(0, 0.4, (40, 120)))
 
 
 def swept(step, *, width=1.6, noise=0.0, albedo=ALBEDO, first=10.0, last=110.0):
-    energy, cols = SweepEnergy(albedo.shape), np.arange(albedo.shape[1]) + 0.5
+    sweep, cols = Sweep(), np.arange(albedo.shape[1]) + 0.5
     for place in np.arange(first, last, step):
         frame = albedo * np.exp(-((cols - place) ** 2) / (2 * width**2)) + RNG.normal(0, noise, albedo.shape)
-        energy.add(frame.astype(np.float32), max(noise, 1e-5))
-    return energy.albedo()
+        last_frame = Signal(frame.astype(np.float32), 0, max(noise, 1e-5))
+        sweep.add(last_frame)
+    sweep.close()
+    return sweep.albedo_for(last_frame)
 
 
 @pytest.mark.parametrize("step", [0.7, 1.5])
@@ -39,6 +41,7 @@ def test_noise_is_not_taken_for_texture():
 
 
 def test_one_frame_tells_nothing():
-    energy = SweepEnergy((4, 4))
-    energy.add(np.ones((4, 4), np.float32), 0.01)
-    assert energy.albedo() is None
+    sweep, frame = Sweep(), Signal(np.ones((4, 4), np.float32), 0, 0.01)
+    sweep.add(frame)
+    sweep.close()
+    assert sweep.albedo_for(frame) is None

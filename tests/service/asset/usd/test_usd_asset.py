@@ -13,7 +13,7 @@ from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 from service.asset.content import textures
 from service.asset.usd import files
 from service.asset.usd.asset import write_asset
-from service.asset.usd.points import write_points
+from service.asset.usd.depth_asset import write_points
 from service.errors import AssetError
 from stage.errors import StorageError
 from stage.formats.ply import PointCloud

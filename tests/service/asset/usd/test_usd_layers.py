@@ -9,7 +9,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdValidation, Vt
 
 from service.asset.usd.files import install, temporary_folder_beside
 from service.asset.usd.layers import LAYER_FILES, AssetLayers, Description, prim_name
-from service.asset.usd.points import define_points
+from service.asset.usd.scene import define_points
 from stage.capture.camera import Camera
 from stage.stack.fingerprint import digest
 

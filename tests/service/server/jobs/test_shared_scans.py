@@ -13,7 +13,7 @@ import pytest
 from service.requests.base.identifiers import JOB, new_id
 from service.requests.jobs import FuseJob, RegisterJob
 from service.requests.register import FuseOptions, FuseRequest, RegisterRequest
-from service.scans.fuse import fuse
+from service.scans.fusion.fuse import fuse
 from service.scans.register import register_scans
 from service.server.database import jobs
 from service.server.storage import layout

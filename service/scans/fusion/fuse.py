@@ -1,0 +1,198 @@
+"""Fuse the scans of a set into one surface: mesh.ply, report.json, and a textured asset."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.fusion.bricks import MEMORY_BOUND
+from service.asset.content.uv_unwrap import textured_mesh, unwrapper
+from service.errors import RequestError
+from service.export.writers import WRITERS
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import REPORT_FILE, metadata, report
+from service.requests.register import FuseRequest
+from service.scans.fusion.bake import bake
+from service.scans.fusion.fused_bricks import SEEN_BY, FusedBricks, fused_bricks, scan_facts, short
+from service.scans.fusion.fused_surface import Surface, joined_surface, triangle_mesh
+from service.scans.fusion.holes import Holes, find_holes
+from service.scans.fusion.joined_normals import join_normals
+from service.scans.fusion.tiles import write_tiles
+from service.scans.pieces import SharedPieces
+from stage.files import write_text
+from stage.sets.scan_set import ScanSet, read_scan_set
+from stage.stack.fingerprint import digest
+
+MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
+LISTED_HOLES = 50
+"""Holes that the report lists, the longest first."""
+LOST_SHARE = 0.05
+"""Share of the pixels of a scan that may lie at no fused surface before it is said."""
+MANY_CONTRADICTED = 0.25
+"""Part of the vertices with photometric normals at which these may contradict the depth before it is said."""
+FAR_SIGMAS = 1.5
+"""Median distance of the pixels of a scan from the fused surface, in their standard deviations, above which it is said: .67 is expected."""
+NORMAL_SIGMA = float(np.radians(1.0))
+"""Standard deviation of photometric normals whose maps do not say it."""
+MOST_CONTRADICTED = 0.5
+"""Part of the vertices with photometric normals at which these may contradict the depth before both are refused as not of one surface."""
+
+
+class FuseResult(NamedTuple):
+    """The files of a fusion, and what its user should know."""
+
+    mesh_path: Path | None  # None: tiles were asked for
+    asset_path: Path | None  # None: neither a texture nor tiles were asked for
+    report_path: Path
+    facts: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+def fuse(request: FuseRequest, progress: Progress | None = None, sharing: SharedPieces | None = None) -> FuseResult:
+    """Fuse the scans of a set.
+
+    Args:
+        sharing: the part of this worker in a fusion that others help with; None: there are no others.
+
+    Raises:
+        AssetError: xatlas is not installed, and a texture is asked for.
+        RequestError: a scan has no pose or no lines of sight, too few scans remain, or their poses contradict each other.
+        ManifestError, ResultError, ImageError: the scan set or a file of it cannot be used.
+        StorageError: a file cannot be read or written.
+    """
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    file, scan_set = read_scan_set(request.scan_set)
+    if request.texture and not request.tiles:
+        unwrapper()
+    with fused_bricks(request, timings, sharing) as fused:
+        inputs = digest(file)
+        provenance = metadata(request, capture=scan_set.name, inputs=inputs)
+        made = (_tiles(request, scan_set, file, fused, provenance, timings) if request.tiles else
+                _whole(request, scan_set, file, fused, provenance, timings, device))
+    facts = made.facts
+    warnings = [*fused.warnings, *_fusion_warnings(facts)]
+    report_path = request.out / REPORT_FILE
+    write_text(report_path, report(request, inputs={"name": scan_set.name, "scan_set": inputs},
+                                   device=devices.describe(device), timings_s=timings.close(), **facts, warnings=warnings))
+    return FuseResult(made.mesh_path, made.asset_path, report_path, facts, tuple(warnings))
+
+
+def help_fuse(request: FuseRequest, progress: Progress, sharing: SharedPieces) -> None:
+    """Do pieces of a fusion that another worker leads, and write no result."""
+    with fused_bricks(request, Timings(progress), sharing):
+        pass
+
+
+class _Made(NamedTuple):
+    mesh_path: Path | None
+    asset_path: Path | None
+    facts: dict[str, Any]
+
+
+def _whole(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, provenance: dict[str, str], timings: Timings,
+           device: str) -> _Made:
+    """Write one mesh, and the asset with its textures."""
+    timings.stage("join", 1)
+    surface = joined_surface(fused.bricks(), len(fused.used))
+    _require_surface(file, len(surface.faces), fused.voxel)
+    joined = None
+    if request.join_normals:
+        if not surface.photometric.any():
+            raise RequestError(f"--join-normals: no scan of {file} has photometric normals: name results of relit solve as maps of the "
+                               "scans")
+        timings.stage("normals", 1)
+        surface, joined = with_joined_normals(surface, fused, str(file))
+    baked = None
+    if request.texture:
+        timings.stage("texture", 1)
+        textured = textured_mesh(surface.points, surface.faces, most_faces=request.texture_faces, texture_px=request.texture_px)
+        scans = [fused.scan(place) for place in range(len(fused.used))]
+        baked = textured, bake(textured.mesh, scans, fused.names, fused.voxel, request.texture_px, device=device)
+    timings.stage("holes", 1)
+    holes = find_holes(surface.points, surface.faces)
+    facts = _facts(fused, surface, holes) | ({} if joined is None else {"joined_normals": joined})
+    timings.stage("write", 1)
+    mesh = triangle_mesh(surface, fused.names)
+    asset_path = None
+    if baked is not None:
+        asset_path = request.out / ASSET_FILE
+        facts["texture"] = {"vertices": int(baked[0].place.max()) + 1, "faces": len(baked[0].mesh.triangles),
+                            "seen_share": round(baked[1].seen_share, 4)}
+        WRITERS[asset_path.suffix].fused(baked[0], baked[1], asset_path, name=scan_set.name, provenance=provenance)
+    mesh_path = request.out / MESH_FILE
+    WRITERS[mesh_path.suffix].mesh(mesh, mesh_path, comments=(f"made by relit fuse from {scan_set.name}", "coordinates in metres"))
+    return _Made(mesh_path, asset_path, facts)
+
+
+def _tiles(request: FuseRequest, scan_set: ScanSet, file: Path, fused: FusedBricks, provenance: dict[str, str], timings: Timings
+           ) -> _Made:
+    """Write one mesh for each brick, and a layer that refers to all."""
+    timings.stage("tiles", max(len(fused.places), 1))
+    written = write_tiles(fused, request.out, name=scan_set.name, provenance=provenance, advance=timings.advance)
+    _require_surface(file, written.facts["faces"], fused.voxel)
+    return _Made(None, written.path, written.facts | {"scans": scan_facts(fused, written.tallies)})
+
+
+def _require_surface(file: Path, faces: int, voxel: float) -> None:
+    if faces == 0:
+        raise RequestError(f"{file}: no surface is left at voxels of {1e3 * voxel:.4g} mm: give a larger --voxel-m, of the order of "
+                           "the distance between pixels")
+
+
+def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]:
+    """Return what the report says."""
+    area = holes.face_areas_m2
+    least = surface.seen[surface.faces].min(axis=1)
+    missing = sum(hole.area_m2 for hole in holes.holes)
+    return {
+        "voxel_m": fused.voxel,
+        "bricks": surface.bricks, "blocks": surface.blocks, "brick_memory_bound_bytes": MEMORY_BOUND,
+        "vertices": len(surface.points), "faces": len(surface.faces),
+        "sigma_m": {"median": short(np.median(surface.sigma)), "p95": short(np.percentile(surface.sigma, 95))},
+        "area_m2": short(holes.area_m2),
+        "area_share_seen_by": {str(count): round(float(area[least >= count].sum() / holes.area_m2), 4) for count in SEEN_BY},
+        "holes": {"count": len(holes.holes), "open_edges": holes.open_edges, "open_length_m": short(holes.open_length_m),
+                  "area_m2": short(missing), "closed_share": round(holes.area_m2 / (holes.area_m2 + missing), 4),
+                  "edges_of_more_than_two_faces": holes.shared_edges,
+                  "longest": [{"length_m": short(hole.length_m), "area_m2": short(hole.area_m2), "edges": hole.edges,
+                               "centre_m": [round(float(x), 6) for x in hole.centre], "closed": hole.closed}
+                              for hole in holes.holes[:LISTED_HOLES]]},
+        "scans": scan_facts(fused, surface.tallies)}
+
+
+def _fusion_warnings(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what the residuals of the scans against the fused surface say, and the normals that were joined with it."""
+    if (normals := facts.get("joined_normals")) is not None and normals["contradicted_share"] > MANY_CONTRADICTED:
+        yield (f"normals: at {normals['contradicted_share']:.0%} of the vertices the photometric normals contradict the depth, which "
+               "decides there: the maps may be of other scans, or the σ of the depth too small")
+    for scan in facts["scans"]:
+        if not scan["fused"]:
+            continue
+        if (share := scan["lost_share"] + scan["seen_through_share"]) > LOST_SHARE:
+            yield (f"scan {scan['name']}: {share:.0%} of its pixels are not on the fused surface ({scan['seen_through_share']:.0%} because "
+                   "other scans saw their places to be empty): a part may be thinner than two voxels, or the pose wrong")
+        if scan["residual_median_sigmas"] > FAR_SIGMAS:
+            yield (f"scan {scan['name']}: its pixels lie {scan['residual_median_sigmas']:.2g} of their σ from the fused surface in the "
+                   "median, where 0.67 is expected: its σ is too small, its pose wrong, or the voxels too large for what it shows")
+
+
+def with_joined_normals(surface: Surface, fused: FusedBricks, where: str) -> tuple[Surface, dict[str, Any]]:
+    """Return a surface that has the photometric normals of its views, and what the report says of it."""
+    summaries = [fused.summaries[number] for number in fused.used]
+    told = [summary.normal_sigma for summary in summaries if summary.normal_sigma > 0]
+    tilt = float(np.median(told)) if told else NORMAL_SIGMA
+    found = join_normals(surface.points, surface.faces, surface.sigma, surface.normals, np.where(surface.photometric, tilt, np.inf),
+                         pixel_m=float(np.median([summary.pitch for summary in summaries])))
+    contradicted = found.contradicted / max(int(found.used.sum()), 1)
+    if contradicted > MOST_CONTRADICTED:
+        raise RequestError(f"{where}: the photometric normals contradict the depth at {contradicted:.0%} of the vertices: the maps are of "
+                           "other scans, their axes are flipped, or the σ of the depth is too small: leave out --join-normals")
+    moved = float(np.sqrt(np.mean(found.moved[found.used].astype(np.float64) ** 2))) if found.used.any() else 0.0
+    facts = {"vertices_share": round(float(found.used.mean()), 4), "moved_rms_m": float(f"{moved:.4g}"),
+             "normal_sigma_degrees": float(f"{np.degrees(tilt):.4g}"), "normal_drift_degrees": float(f"{found.drift_degrees:.4g}"),
+             "contradicted_vertices": found.contradicted,
+             "contradicted_share": round(contradicted, 4)}
+    return surface._replace(points=found.points, normals=found.normals.astype(np.float32)), facts

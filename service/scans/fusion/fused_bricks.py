@@ -1,0 +1,164 @@
+"""The phases of a fusion: scans are looked at, compared with each other, and fused brick by brick; each phase in pieces that are kept.
+
+A piece reads the scans that it needs alone, so that memory is bounded whatever the number of scans and the size of the site, and several
+workers can do the pieces of one fusion.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from kernels.fusion.bricks import BRICK_VOXELS
+from service.errors import RequestError
+from service.reporting.progress import Timings
+from service.requests.register import FuseRequest, Misplaced
+from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
+from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
+from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
+from service.scans.fusion.range_images import WIDTHS, PreparedScan
+from service.scans.pieces import FolderPieces, SharedPieces, stamps
+from service.solve.sharing.sharing import digest, kind_of_worker
+from stage.formats.npy import packed, unpacked
+from stage.sets.scan_set import read_scan_set
+
+
+class FusedBricks(NamedTuple):
+    """Results of the finished phases."""
+
+    summaries: list[ScanSummary]
+    placings: list[Placing]
+    used: list[int]
+    """The scans that were fused."""
+    names: tuple[str, ...]  # the layers of all scans
+    voxel: float  # metres
+    places: np.ndarray  # [n, 3] int64 of each brick, in bricks from the origin, in ascending order
+    brick: Callable[[int], BrickSurface]
+    """Returns the surface of the brick of a number; its tallies are those of `used`."""
+    scan: Callable[[int], PreparedScan]
+    """Returns the scan of a place in `used`."""
+    warnings: list[str]
+
+    def bricks(self) -> Iterator[BrickSurface]:
+        """Yield the surfaces of the bricks in their order."""
+        return (self.brick(number) for number in range(len(self.places)))
+
+
+@contextmanager
+def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces | None = None) -> Iterator[FusedBricks]:
+    """Fuse the scans of a set brick by brick. What is kept of scans and bricks lies on the disk until the context ends."""
+    file, scan_set = read_scan_set(request.scan_set)
+    with ExitStack() as held:
+        work = Path(held.enter_context(TemporaryDirectory(prefix="relit-fuse-")))
+        pieces = sharing or SharedPieces(FolderPieces(request.cache or work / "pieces"))
+        device = devices.resolve(request.device)
+        places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
+        pieces.identify(scan_set.model_dump_json(), stamps(places, timed=sharing is None), kind_of_worker(device))
+        (work / "scans").mkdir()
+        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m, device=device),
+                      pieces, timings, device)
+
+
+def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:
+    numbers = [f"{number:05d}" for number in range(len(scans))]
+    threads = request.threads or os.cpu_count() or 1
+    timings.stage("read", len(scans))
+    content = pieces.do("read", numbers, lambda piece: scans.summary(int(piece)).packed(), follows_from=request.voxel_m,
+                        threads=threads, advance=timings.advance)
+    summaries = [ScanSummary.unpacked(content(piece)) for piece in numbers]
+    names = tuple(name for name in WIDTHS if any(name in summary.names for summary in summaries))
+    voxel = request.voxel_m or _voxel(summaries)
+    known = digest([np.frombuffer(summary.packed(), dtype=np.uint8) for summary in summaries])
+
+    timings.stage("compare", len(scans))
+    samples = [summary.sample for summary in summaries]
+    reach = reach_of(samples, voxel)
+    content = pieces.do("compare", numbers, lambda piece: scans.of(int(piece), lambda scan: packed(readings_of(
+        scan, int(piece), samples, reach, device=device)._asdict())), follows_from=(known, reach),
+        advance=timings.advance)
+    readings = [Readings(**unpacked(content(piece))) for piece in numbers]
+    placings = place_scans(samples, readings, voxel) if len(scans) > 1 else [Placing(0, 0.0, 0.0, 0.0, False)]
+    warnings = list(placing_warnings([summary.name for summary in summaries], placings, request.misplaced))
+    used = [number for number, placing in enumerate(placings) if not (placing.misplaced and request.misplaced is Misplaced.LEAVE_OUT)]
+    if 2 * len(used) < len(scans) + (len(scans) == 2) or not used:
+        raise RequestError(f"{file}: " + "; ".join(warnings) + ": the poses contradict each other: run relit register first")
+
+    timings.stage("bricks", len(used))
+    origin = origin_of(np.stack([summaries[number].centre for number in used]), voxel)
+    content = pieces.do("bricks", [numbers[number] for number in used],
+                        lambda piece: scans.of(int(piece), lambda scan: packed({"places": places_near(scan, origin, voxel)})),
+                        follows_from=(known, voxel, tuple(used)), threads=threads, advance=timings.advance)
+    near = np.unique(np.concatenate([unpacked(content(numbers[number]))["places"] for number in used]), axis=0)
+    places, of_brick = np.unique(near // BRICK_VOXELS, axis=0, return_inverse=True)
+    outlines = [summaries[number].outline() for number in used]
+
+    def fused(piece: str) -> bytes:
+        return packed_brick(fuse_brick(near[of_brick.ravel() == int(piece)], outlines, lambda place: scans.with_layers(used[place], names),
+                                       names, voxel, origin, device=device))
+
+    timings.stage("fuse", max(len(places), 1))
+    content = pieces.do("fuse", [f"{number:06d}" for number in range(len(places))], fused, follows_from=(known, voxel, tuple(used), near),
+                        advance=timings.advance)
+    return FusedBricks(summaries, placings, used, names, voxel, places, lambda number: unpacked_brick(content(f"{number:06d}")),
+                       lambda place: scans.with_layers(used[place], names), warnings)
+
+
+def _voxel(summaries: list[ScanSummary]) -> float:
+    """Return half the median distance between neighbouring pixels on the surface, or the median noise where that is larger, metres."""
+    pitch, noise = ([getattr(summary, name) for summary in summaries] for name in ("pitch", "noise"))
+    return float(f"{max(np.median(pitch) / 2, np.median(noise)):.3g}")
+
+
+def placing_warnings(names: list[str], placings: list[Placing], choice: Misplaced) -> Iterator[str]:
+    """Yield which scans lie beside the others, by what becomes of these, and which have nothing in common with any."""
+    for name, placing in zip(names, placings, strict=True):
+        if placing.misplaced:
+            end = "it was left out" if choice is Misplaced.LEAVE_OUT else "it was fused all the same, and the surface is doubled there"
+            yield (f"scan {name}: lies {1e3 * placing.displacement_m:.3g} mm beside the surface of the others, whose noise explains "
+                   f"{1e3 * placing.sigma_m:.2g} mm: its pose is wrong, and {end}")
+        elif placing.compared < LEAST_COMMON and len(names) > 1:
+            yield f"scan {name}: has next to no surface in common with the others, so that nothing tells whether its pose is right"
+
+
+def packed_brick(surface: BrickSurface) -> bytes:
+    """Return the surface of a brick as bytes."""
+    arrays = {name: getattr(surface, name) for name in (*VERTEX, "edge", "faces", "blocks")}
+    numbers = np.array(list(surface.tallies), dtype=np.int64)
+    return packed(arrays | {"scans": numbers, "tallies": np.array(list(surface.tallies.values()), dtype=np.float64)})
+
+
+def unpacked_brick(content: bytes) -> BrickSurface:
+    """Return the surface of `packed_brick`."""
+    found = unpacked(content)
+    tallies = dict(zip(map(int, found.pop("scans")), found.pop("tallies"), strict=True))
+    blocks = int(found.pop("blocks"))
+    return BrickSurface(**found, tallies=tallies, blocks=blocks)
+
+
+SEEN_BY = (1, 2, 3, 5)
+"""Numbers of scans for which reports say what share of the area so many see."""
+
+
+def scan_facts(fused: FusedBricks, tallies: list[Tally]) -> list[dict[str, Any]]:
+    """Return what the report says of each scan."""
+    of_scan = dict(zip(fused.used, tallies, strict=True))
+    return [{"name": scan.name, "fused": number in of_scan, "photometric_normals": scan.photometric, "square_px": scan.square_px,
+             "compared_pixels": fused.placings[number].compared, "displacement_m": short(fused.placings[number].displacement_m),
+             **(_tally(of_scan[number]) if number in of_scan else {})} for number, scan in enumerate(fused.summaries)]
+
+
+def _tally(tally: Tally) -> dict[str, Any]:
+    pixels = max(tally.pixels, 1)
+    return {"pixels": tally.pixels, "fused_share": round(tally.fused / pixels, 5), "seen_through_share": round(tally.refused / pixels, 5),
+            "lost_share": round(tally.lost / pixels, 5), "residual_rms_m": short(tally.rms_m),
+            "residual_median_sigmas": round(tally.median_sigmas, 3)}
+
+
+def short(value: Any) -> float:
+    """Return a number as reports have it, with four digits."""
+    return float(f"{float(value):.4g}")

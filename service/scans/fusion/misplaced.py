@@ -1,0 +1,143 @@
+"""Scans that lie beside the surface of the others by more than their noise explains: their poses are wrong."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.fusion.residuals import compare_views
+from kernels.fusion.views import upload_views
+from service.scans.fusion.fused_surface import world_points
+from service.scans.fusion.range_images import PreparedScan
+
+SAMPLES = 3000
+"""Pixels of a scan that are compared with the others."""
+LEAST_COMMON = 50
+"""Fewest pixels of a scan, of SAMPLES, that another must see before the place of the scan can be told."""
+REACH = 0.02
+"""Largest distance between two surfaces that are still compared, in the median extent of the scans."""
+SAME_SIGMAS = 4.0
+"""Distance from another surface, in standard deviations, up to which that is the same surface. Where a point has one, what other scans
+measured farther in front of it hides it from them, and says nothing of its place."""
+LARGEST_SIGMAS = 2.0
+"""Displacement, in median standard deviations of the comparison, from which on a scan counts as misplaced; smaller ones harm little."""
+UNDETERMINED = 1e-10
+"""Directions in which a motion is determined less than this part of the best determined one do not move."""
+ROUNDS = 5
+"""Rounds of reweighting of the fit of a motion, which begins with none: points that agree as they are decide, if they are most."""
+
+
+class Placing(NamedTuple):
+    """The place of a scan relative to the others."""
+
+    compared: int  # pixels that another scan sees too
+    displacement_m: float  # RMS over the compared pixels along their normals, of the small motion that fits best
+    median_m: float  # median distance to the others, without a motion
+    sigma_m: float  # median standard deviation of that distance
+    misplaced: bool
+
+
+class Sample(NamedTuple):
+    """Points of one scan that are compared with the others."""
+
+    points: np.ndarray  # [n, 3] metres, world
+    normals: np.ndarray  # [n, 3] unit, world
+    variance: np.ndarray  # [n] square metres, of each point along its normal
+
+
+class Readings(NamedTuple):
+    """The points of all samples, one after another, that a scan sees too."""
+
+    at: np.ndarray  # [k] int64
+    distance: np.ndarray  # [k] float32 metres, from the surface of the scan
+    expected: np.ndarray  # [k] float32 metres, standard deviation of that
+
+
+def sample_of(scan: PreparedScan, number: int) -> Sample:
+    """Return points of a scan with a pose, drawn by its number."""
+    there, used = world_points(scan)
+    image = scan.image
+    normal = np.asarray(image.normal).reshape(-1, 3)[used]
+    usable = np.flatnonzero(normal.any(axis=1))
+    picked = np.sort(np.random.default_rng(number).choice(usable, min(SAMPLES, len(usable)), replace=False))
+    world = np.linalg.inv(image.camera_from_world)
+    turned = normal[picked] @ world[:3, :3].T
+    sigma = np.asarray(image.sigma).ravel()[used[picked]]
+    if image.orthographic:
+        along = sigma * (turned @ world[:3, 2])
+    else:
+        sight = there[picked] - world[:3, 3]
+        depth = np.asarray(image.depth).ravel()[used[picked]].astype(np.float64)
+        along = sigma / depth * np.einsum("ni,ni->n", turned, sight)
+    return Sample(there[picked], turned, along**2)
+
+
+def reach_of(samples: list[Sample], voxel: float) -> float:
+    """Return the distance, metres, beyond which two surfaces are not compared."""
+    return max(REACH * float(np.median([np.ptp(sample.points, axis=0).max() for sample in samples])), 10 * voxel)
+
+
+def readings_of(scan: PreparedScan, number: int, samples: list[Sample], reach: float, *, device: str) -> Readings:
+    """Return how far the points of all samples but its own lie from the surface of a scan."""
+    origin = samples[number].points.mean(axis=0)  # near the scan, so that coordinates are short in single precision
+    views = upload_views([scan.image], origin, device=device)
+    whole = Sample(*(np.concatenate(parts) for parts in zip(*samples, strict=True)))
+    distance, expected = (values[:, 0].copy() for values in compare_views(
+        views, whole.points - origin, whole.normals, whole.variance, skipped=-1, reach=reach, device=device))
+    first = sum(len(sample.points) for sample in samples[:number])
+    expected[first:first + len(samples[number].points)] = 0
+    at = np.flatnonzero(expected)
+    return Readings(at, distance[at], expected[at])
+
+
+def place_scans(samples: list[Sample], readings: list[Readings], voxel: float) -> list[Placing]:
+    """Compare every scan with the others and find those that are misplaced, the worst first taken out of the comparison of the rest.
+
+    Displacements below half a voxel (metres) do no harm.
+    """
+    firsts = np.cumsum([0, *(len(sample.points) for sample in samples)])
+    ranges = [np.searchsorted(each.at, firsts) for each in readings]
+
+    def placing(number: int) -> Placing:
+        distance, expected = (np.zeros((len(samples[number].points), len(samples)), dtype=np.float32) for _ in range(2))
+        for other, (each, places) in enumerate(zip(readings, ranges, strict=True)):
+            part = slice(places[number], places[number + 1])
+            distance[each.at[part] - firsts[number], other] = each.distance[part]
+            expected[each.at[part] - firsts[number], other] = each.expected[part]
+        return _placing(samples[number], distance, expected, left_out - {number}, voxel)
+
+    left_out: set[int] = set()
+    placings = [placing(number) for number in range(len(samples))]
+    while True:
+        wrong = [number for number, each in enumerate(placings) if each.misplaced and number not in left_out]
+        if not wrong:
+            return [each._replace(misplaced=number in left_out) for number, each in enumerate(placings)]
+        worst = max(wrong, key=lambda number: placings[number].displacement_m)
+        left_out.add(worst)
+        touched = [number for number in range(len(samples)) if ranges[worst][number + 1] > ranges[worst][number]]
+        for number in touched:
+            placings[number] = placing(number)
+
+
+def _placing(sample: Sample, distance: np.ndarray, expected: np.ndarray, left_out: set[int], voxel: float) -> Placing:
+    """Return how a scan lies to those that are not left out."""
+    known = expected > 0
+    known[:, sorted(left_out)] = False
+    agreeing = known & (np.abs(distance) <= SAME_SIGMAS * expected)
+    known &= ~agreeing.any(axis=1, keepdims=True) | (distance >= -SAME_SIGMAS * expected)
+    seen = known.any(axis=1)
+    if np.count_nonzero(seen) < LEAST_COMMON:
+        return Placing(int(seen.sum()), 0.0, 0.0, 0.0, False)
+    ordered = np.sort(np.where(known[seen], distance[seen], np.inf).astype(np.float64), axis=1)
+    count = known[seen].sum(axis=1)
+    offset = np.take_along_axis(ordered, np.stack([(count - 1) // 2, count // 2], axis=1), axis=1).mean(axis=1)  # the median
+    sigma = float(np.median(expected[seen][known[seen]]))
+    place, normal = sample.points[seen] - sample.points[seen].mean(axis=0), sample.normals[seen]
+    rows = np.concatenate([np.cross(place, normal), normal], axis=1) * ([1 / max(np.abs(place).max(), 1e-12)] * 3 + [1.0] * 3)
+    fit = np.zeros(len(rows))
+    for _ in range(ROUNDS):
+        rest = np.abs(offset - fit)
+        weighted = rows / (1 + (rest / max(1.5 * float(np.median(rest)), 1e-9)) ** 2)[:, None]
+        fit = rows @ (np.linalg.pinv(weighted.T @ rows, rcond=UNDETERMINED, hermitian=True) @ (weighted.T @ offset))
+    displacement = float(np.sqrt(np.mean(fit**2)))
+    return Placing(int(seen.sum()), displacement, float(np.median(np.abs(offset))), sigma,
+                   displacement > max(LARGEST_SIGMAS * sigma, voxel / 2))

@@ -1,1 +1,0 @@
-"""Fused meshes: holes, bands of vertices, and normals joined to them."""

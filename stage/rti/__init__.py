@@ -1,1 +1,0 @@
-"""File formats of reflectance transformation imaging (RTI): polynomial texture maps and hemispherical harmonics."""

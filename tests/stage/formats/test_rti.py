@@ -1,0 +1,146 @@
+"""PTM and RTI files: byte for byte as described, back as written, and refused with a reason."""
+
+import numpy as np
+import pytest
+
+from stage.errors import ImageError, StorageError
+from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, read_hsh, read_ptm, write_hsh, write_ptm
+from tests.reference.light_basis import harmonics, polynomial, render_ptm, render_rti
+from tests.scenes.captures import files_in
+
+ROWS, COLS = 3, 4
+RNG = np.random.default_rng(5)
+LIGHTS = np.array([[0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
+QUANTIZATION = quantization_of_range(RNG.uniform(-300, 0, 6), RNG.uniform(0, 300, 6))
+
+
+def stored(channels, terms):
+    return RNG.integers(0, 256, (channels, ROWS, COLS, terms), dtype=np.uint8)
+
+
+def make_ptm(channels):
+    return Ptm(stored(channels, 6), QUANTIZATION, RNG.integers(0, 256, (ROWS, COLS, 3), dtype=np.uint8) if channels == 1 else None)
+
+
+def make_hsh(terms):
+    return Hsh(stored(3, terms), quantization_of_range(RNG.uniform(-1, 0, terms), RNG.uniform(0, 1, terms)))
+
+
+def test_a_ptm_in_colour_byte_for_byte(tmp_path):
+    bytes_of = np.arange(36, dtype=np.uint8).reshape(3, 2, 1, 6)  # two rows of one pixel
+    quantization = Quantization(np.array([16, 1, 0.015625, 0.5, 2, 1.25], dtype=np.float32), np.array([141, 0, 255, 3, 128, 7]))
+    write_ptm(tmp_path / "a.ptm", Ptm(bytes_of, quantization, None))
+    header = b"PTM_1.2\nPTM_FORMAT_RGB\n1\n2\n16.0 1.0 0.015625 0.5 2.0 1.25\n141 0 255 3 128 7\n"
+    body = bytes([*range(6, 12), *range(6), *range(18, 24), *range(12, 18), *range(30, 36), *range(24, 30)])  # the lower row first
+    assert (tmp_path / "a.ptm").read_bytes() == header + body
+    assert files_in(tmp_path) == {"a.ptm"}
+
+
+def test_a_ptm_of_the_luminance_byte_for_byte(tmp_path):
+    bytes_of, colour = np.arange(12, dtype=np.uint8).reshape(1, 2, 1, 6), np.arange(90, 96, dtype=np.uint8).reshape(2, 1, 3)
+    quantization = Quantization(np.ones(6, dtype=np.float32), np.zeros(6, dtype=int))
+    write_ptm(tmp_path / "a.ptm", Ptm(bytes_of, quantization, colour))
+    header = b"PTM_1.2\nPTM_FORMAT_LRGB\n1\n2\n1.0 1.0 1.0 1.0 1.0 1.0\n0 0 0 0 0 0\n"
+    assert (tmp_path / "a.ptm").read_bytes() == header + bytes([*range(6, 12), *range(6), 93, 94, 95, 90, 91, 92])
+
+
+def test_harmonics_byte_for_byte(tmp_path):
+    bytes_of = np.arange(24, dtype=np.uint8).reshape(3, 2, 1, 4)
+    quantization = Quantization(np.array([1, 2, 4, 0.5], dtype=np.float32), np.array([0, 1, 2, 255]))
+    write_hsh(tmp_path / "a.rti", Hsh(bytes_of, quantization))
+    header = b"#HSH1.2\r\n3\r\n1 2 3\r\n4 2 1\r\n"
+    numbers = np.array([255, 510, 1020, 127.5, 0, -2, -8, -127.5], dtype="<f4").tobytes()
+    top, bottom = [*range(4), *range(8, 12), *range(16, 20)], [*range(4, 8), *range(12, 16), *range(20, 24)]
+    assert (tmp_path / "a.rti").read_bytes() == header + numbers + bytes(top + bottom)
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_a_ptm_comes_back(tmp_path, channels):
+    made = make_ptm(channels)
+    write_ptm(tmp_path / "a.ptm", made)
+    back = read_ptm(tmp_path / "a.ptm")
+    assert np.array_equal(back.stored, made.stored)
+    assert np.array_equal(back.quantization.step, made.quantization.step) and np.array_equal(back.quantization.zero, made.quantization.zero)
+    assert (back.colour is None) == (made.colour is None)
+    assert back.colour is None or np.array_equal(back.colour, made.colour)
+
+
+@pytest.mark.parametrize("terms", [4, 9, 16])
+def test_harmonics_come_back(tmp_path, terms):
+    made = make_hsh(terms)
+    write_hsh(tmp_path / "a.rti", made)
+    back = read_hsh(tmp_path / "a.rti")
+    assert np.array_equal(back.stored, made.stored) and np.array_equal(back.quantization.zero, made.quantization.zero)
+    assert np.allclose(back.quantization.step, made.quantization.step, rtol=1e-6)  # a float times 255 and back
+
+
+@pytest.mark.parametrize("channels", [3, 1])
+def test_a_viewer_shows_a_ptm_as_meant(tmp_path, channels):
+    made = make_ptm(channels)
+    write_ptm(tmp_path / "a.ptm", made)
+    coefficients = dequantize(np.moveaxis(made.stored, -1, 0), made.quantization)
+    wanted = np.einsum("lt,tcrx->lrxc", polynomial(LIGHTS), coefficients)
+    if made.colour is not None:
+        wanted = wanted * made.colour / 255
+    shown = render_ptm((tmp_path / "a.ptm").read_bytes(), LIGHTS)
+    assert np.allclose(shown, np.clip(wanted / 255, 0, 1), atol=1e-5)  # coefficients in float
+
+
+def test_a_viewer_shows_harmonics_as_meant(tmp_path):
+    made = make_hsh(9)
+    write_hsh(tmp_path / "a.rti", made)
+    wanted = np.einsum("lt,tcrx->lrxc", harmonics(LIGHTS, 9), dequantize(np.moveaxis(made.stored, -1, 0), made.quantization))
+    assert np.allclose(render_rti((tmp_path / "a.rti").read_bytes(), LIGHTS), np.clip(wanted, 0, 1), atol=1e-5)
+
+
+def test_a_header_as_the_specification_also_allows_it(tmp_path):
+    """Comments in an RTI file, and line feeds alone."""
+    made = make_hsh(4)
+    write_hsh(tmp_path / "a.rti", made)
+    data = (tmp_path / "a.rti").read_bytes()
+    end = data.index(b"4 2 1\r\n") + 7
+    (tmp_path / "b.rti").write_bytes(b"#HSH1.2\n# by hand\n" + data[9:end].replace(b"\r", b"") + data[end:])
+    assert np.array_equal(read_hsh(tmp_path / "b.rti").stored, made.stored)
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda data: b"", "is not a PTM file"),
+    (lambda data: data.replace(b"PTM_1.2", b"PTM_1.1"), "is not a PTM file of version 1.2"),
+    (lambda data: data.replace(b"FORMAT_RGB", b"FORMAT_JPEG_RGB"), "is PTM_FORMAT_JPEG_RGB: relit reads"),
+    (lambda data: data.replace(b"RGB\n4\n3\n", b"RGB\n4 3\n\n"), "damaged header: lines 3 to 6"),
+    (lambda data: data.replace(b"RGB\n4\n3\n", b"RGB\n0\n3\n"), "damaged header"),
+    (lambda data: data[:-1], "holds 215 bytes of pixels, 4x3 take 216"),
+    (lambda data: data + b" ", "holds 217 bytes"),
+])
+def test_what_is_no_ptm_is_refused(tmp_path, change, words):
+    write_ptm(tmp_path / "a.ptm", make_ptm(3))
+    (tmp_path / "b.ptm").write_bytes(change((tmp_path / "a.ptm").read_bytes()))
+    with pytest.raises(ImageError, match=words):
+        read_ptm(tmp_path / "b.ptm")
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda data: b"", "is not an RTI file"),
+    (lambda data: b"PTM" + data, "is not an RTI file"),
+    (lambda data: data.replace(b"\r\n3\r\n", b"\r\n1\r\n"), "is of file type 1"),
+    (lambda data: data.replace(b"9 2 1", b"9 1 1"), "basis type 1"),
+    (lambda data: data.replace(b"9 2 1", b"10 2 1"), "10 terms"),
+    (lambda data: data.replace(b"4 3 3", b"4 x 3"), "damaged header"),
+    (lambda data: data[:-1], "bytes after its header, 4x3 with 9 terms take 396"),
+])
+def test_what_is_no_rti_file_is_refused(tmp_path, change, words):
+    write_hsh(tmp_path / "a.rti", make_hsh(9))
+    (tmp_path / "b.rti").write_bytes(change((tmp_path / "a.rti").read_bytes()))
+    with pytest.raises(ImageError, match=words):
+        read_hsh(tmp_path / "b.rti")
+
+
+def test_a_folder_that_is_none_and_a_file_that_is_not_there(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for write, made in ((write_ptm, make_ptm(3)), (write_hsh, make_hsh(4))):
+        with pytest.raises(StorageError, match="cannot write"):
+            write(tmp_path / "file" / "a", made)
+    for read in (read_ptm, read_hsh):
+        with pytest.raises(StorageError, match="cannot read"):
+            read(tmp_path / "nothing")
+    assert files_in(tmp_path) == {"file"}
