@@ -125,7 +125,7 @@ def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured
     ("service.server.pages", ("service.cli", "service.client", "service.server.api", "service.server.database", "service.server.jobs",
                               "service.server.storage", *PRODUCTS, *WRITERS, "stage", "kernels")),
     ("service.client", ("service.cli", "service.farm", "service.server", *PRODUCTS, *WRITERS, "stage", "kernels")),
-    ("service.requests.views", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
+    ("service.requests.answers", (*DOORS, *PRODUCTS, *WRITERS, "service.reporting", "stage", "kernels")),
 ])
 def test_what_a_part_of_the_roof_must_not_know(package, forbidden):
     assert {i for i in imports() if under(i.importer, package) and under(i.target, *forbidden)} == set()

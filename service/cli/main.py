@@ -13,48 +13,48 @@ from typer.exceptions import TyperException
 from service.cli.groups import make_group
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("commands.demo", "Solve, export and relight the shipped sample."),
-    "bench": ("commands.demo", "Measure the speed of the kernels, and in the same run that of NumPy and of a plain copy."),
-    "info": ("commands.captures", "Say what a capture holds, and what is wrong with it."),
-    "view": ("commands.captures", "Write the files that a browser needs to show a capture, its maps, its object under new light, and its "
+    "demo": ("demo", "Solve, export and relight the shipped sample."),
+    "bench": ("demo", "Measure the speed of the kernels, and in the same run that of NumPy and of a plain copy."),
+    "info": ("captures", "Say what a capture holds, and what is wrong with it."),
+    "view": ("captures", "Write the files that a browser needs to show a capture, its maps, its object under new light, and its "
              "depth as points."),
-    "solve": ("commands.solve", "Normals, albedo and height of a light-stage capture."),
-    "export": ("commands.export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
-    "basis": ("commands.export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
-    "join": ("commands.export", "One surface from solved maps and a depth of the same view: the detail of the normals, and the shape and "
+    "solve": ("solve", "Normals, albedo and height of a light-stage capture."),
+    "export": ("export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
+    "basis": ("export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
+    "join": ("export", "One surface from solved maps and a depth of the same view: the detail of the normals, and the shape and "
              "place of the depth."),
-    "inspect": ("commands.inspect", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
+    "inspect": ("inspect", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
                 "provenance, validators."),
-    "depth": ("commands.depth", "Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."),
-    "separate": ("commands.depth", "Direct and global light of a capture under fine, shifted phase patterns."),
-    "scan": ("commands.depth", "Shots of a scanning laser, from a platform that may move, as one point cloud."),
-    "patterns": ("commands.depth", "The images to project, and their manifest entries; or, with --plan, what each code costs."),
-    "inspect-board": ("commands.boards", "Stitch the tiles of a board to one height map, compare it with a golden map or a design, and "
+    "depth": ("depth", "Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."),
+    "separate": ("depth", "Direct and global light of a capture under fine, shifted phase patterns."),
+    "scan": ("depth", "Shots of a scanning laser, from a platform that may move, as one point cloud."),
+    "patterns": ("depth", "The images to project, and their manifest entries; or, with --plan, what each code costs."),
+    "inspect-board": ("boards", "Stitch the tiles of a board to one height map, compare it with a golden map or a design, and "
                       "list what is wrong."),
-    "gauge-board": ("commands.boards", "Repeatability and reproducibility of inspections of the same boards (gauge R&R)."),
-    "register": ("commands.scans", "Find the poses of scans of one object by their surfaces, and say how sure each is and which scans "
+    "gauge-board": ("boards", "Repeatability and reproducibility of inspections of the same boards (gauge R&R)."),
+    "register": ("scans", "Find the poses of scans of one object by their surfaces, and say how sure each is and which scans "
                  "could not be joined."),
-    "fuse": ("commands.scans", "Fuse the scans of a set, whose poses are known, into one surface."),
-    "relight": ("commands.light", "Frames under HDR environments and animated lights."),
-    "shade": ("commands.light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
-    "doctor": ("commands.doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "
+    "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),
+    "relight": ("light", "Frames under HDR environments and animated lights."),
+    "shade": ("light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
+    "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "
                "and the service here."),
-    "serve": ("service.server", "Run the service: the API, and a worker on each device."),
-    "worker": ("service.server", "Run one more worker, on any machine that reaches the database and the storage."),
-    "backup": ("service.server", "Save the database and the files of the service, which may run meanwhile, with their checksums."),
-    "restore": ("service.server", "Make a service from a backup, in a new data folder (--data) and an empty database; jobs that ran go on "
+    "serve": ("server", "Run the service: the API, and a worker on each device."),
+    "worker": ("server", "Run one more worker, on any machine that reaches the database and the storage."),
+    "backup": ("server", "Save the database and the files of the service, which may run meanwhile, with their checksums."),
+    "restore": ("server", "Make a service from a backup, in a new data folder (--data) and an empty database; jobs that ran go on "
                 "when it starts."),
-    "audit": ("service.keys", "Show who did what to which object, the newest first."),
-    "simulate": ("commands.depth", "The raw frames that a time-of-flight camera would make of a depth."),
-    "keys": ("service.keys", "Make, list and revoke the keys of the service."),
-    "import": ("commands.imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
-    "calibrate": ("commands.calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "
+    "audit": ("keys", "Show who did what to which object, the newest first."),
+    "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
+    "keys": ("keys", "Make, list and revoke the keys of the service."),
+    "import": ("imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
+    "calibrate": ("calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "
                   "residuals."),
-    "submit": ("service.submit", "Submit work to a service, with the options of the commands that do it on this machine."),
-    "jobs": ("service.jobs", "List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results."),
-    "farm": ("commands.farm", "Jobs for render farms; docs/farm.md."),
+    "submit": ("submit", "Submit work to a service, with the options of the commands that do it on this machine."),
+    "jobs": ("jobs", "List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results."),
+    "farm": ("farm", "Jobs for render farms; docs/farm.md."),
 }
-"""The commands in the order of the help: the module of service.cli that registers each, and the sentence that the list of commands shows.
+"""The commands in the order of the help: the module of service.cli.commands that registers each, and its sentence in the list of commands.
 The program loads the modules that it needs: to import all of them takes longer than many runs."""
 
 ABOUT = "Active-illumination captures to normals, materials, depth, USD assets and relit frames."
@@ -65,15 +65,11 @@ the cores, and matrices of some hundred rows cost more to divide than to solve."
 
 
 def program(wanted: str | None = None) -> typer.Typer:
-    """Return the program.
-
-    Args:
-        wanted: the command that will run: only its module is imported. None, or a name that is no command: all modules are.
-    """
+    """Return the program; of a command that is `wanted` only its module is imported, else all modules are."""
     app = _empty()
     modules = [COMMANDS[wanted][0]] if wanted in COMMANDS else dict.fromkeys(module for module, _ in COMMANDS.values())
     for module in modules:
-        importlib.import_module(f"service.cli.{module}").register(app)
+        importlib.import_module(f"service.cli.commands.{module}").register(app)
     return app
 
 

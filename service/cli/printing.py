@@ -30,11 +30,7 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 def check_single(request: "SolveRequest | DepthRequest") -> None:
-    """Check that a capture that is no sequence has no option of sequences.
-
-    Raises:
-        RequestError: it has.
-    """
+    """Raise RequestError if a capture that is no sequence has an option of sequences."""
     from service.errors import RequestError
 
     for name, given in (("--no-temporal", not request.temporal), ("--frame-rate", request.frame_rate is not None)):

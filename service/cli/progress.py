@@ -39,7 +39,6 @@ class ProgressBar:
     """A service.reporting.progress.Progress that draws one line for each stage on standard error."""
 
     def __init__(self) -> None:
-        """Draw nothing before the first stage, and nothing at all where standard error is not a terminal."""
         self._task: TaskID | None = None
         self._bar: RichProgress | None = None
         if sys.stderr.isatty():
@@ -93,7 +92,6 @@ class OpenJdProgress:
     """
 
     def __init__(self) -> None:
-        """Print nothing before the first stage."""
         self._stage, self._total, self._told = "", 0, -1
 
     def __enter__(self) -> Self:

@@ -59,15 +59,10 @@ class Given(Generic[Model]):
     """The values that were typed for the options of a model, without those that were left out."""
 
     def __init__(self, model: type[Model], values: Mapping[str, Any]) -> None:
-        """Keep values by the names of the options of a model."""
         self.model, self.values = model, dict(values)
 
     def build(self, **changes: Any) -> Model:
-        """Make the model, with some values in place of those that were typed.
-
-        Raises:
-            RequestError: a value cannot be used, or one is missing; the message names the option as it is typed.
-        """
+        """Make the model, with some values in place of those that were typed; errors name an option as it is typed."""
         try:
             return build(self.model, {**self.values, **changes})
         except ValidationError as error:
@@ -83,12 +78,9 @@ def local_command(group: typer.Typer, name: str, function: Callable[..., None]) 
 
 def command(group: typer.Typer, name: str, function: Callable[..., None], *, without: frozenset[Role] = frozenset(),
             device: bool = False, words: Callable[[Option, Any], str] = help_text) -> None:
-    """Add a command that is made from a function.
+    """Add a command that is made from a function, as the docstring of this module says.
 
     Args:
-        group: takes the command.
-        name: of the command.
-        function: as the docstring of this module says.
         without: roles of options that the command does not have.
         device: whether it takes --device also where no model asks for it.
         words: gives the help of an option of a model.

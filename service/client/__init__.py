@@ -22,7 +22,7 @@ from service.client.errors import (
 )
 from service.client.intakes import Intakes
 from service.client.jobs import Jobs
-from service.requests.base.address import DEFAULT_SERVER
+from service.requests.base.identifiers import DEFAULT_SERVER
 
 __all__ = ["Busy", "Client", "ClientError", "Conflict", "Faulty", "FileError", "IntakeRefused", "Invalid", "JobEnded", "NotAllowed",
            "NotFound", "Refused", "Unreachable"]
@@ -43,9 +43,6 @@ class Client:
             timeout_s: how long to wait for a connection, or for the next bytes.
             parallel: number of files that are sent or fetched at once.
             transport: an httpx2 transport, for a proxy, a certificate authority or a socket; None: httpx2's default.
-
-        Raises:
-            ClientError: the URL or the key is malformed.
         """
         self._connection = Connection(server, key, patience_s=patience_s, timeout_s=timeout_s, transport=transport)
         self.captures = Intakes(self._connection, "/v1/captures", "folder", parallel=parallel)

@@ -20,10 +20,9 @@ NOT_SENT = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 
 
 class Backoff:
-    """Exponential backoff with jitter: pauses between tries that grow, until a time limit."""
+    """Exponential backoff with jitter: pauses between tries that grow, until a limit of seconds since creation or the last `reset`."""
 
     def __init__(self, limit_s: float) -> None:
-        """Args: limit_s: seconds since creation or the last `reset` after which `wait` gives up."""
         self._limit_s = limit_s
         self.reset()
 
@@ -32,11 +31,7 @@ class Backoff:
         self._pause, self._deadline = FIRST_PAUSE_S, time.monotonic() + self._limit_s
 
     def wait(self, asked_s: float | None = None) -> bool:
-        """Sleep before the next try: as long as the service asked for, or its own pause.
-
-        Returns:
-            Whether to try again; False, without sleeping, if the pause would exceed the time limit.
-        """
+        """Sleep before the next try, as long as the service asked for or its own pause; return False at once if that exceeds the limit."""
         pause = self._pause * random.uniform(0.5, 1.0) if asked_s is None else asked_s  # so that clients do not come back all at once
         if time.monotonic() + pause > self._deadline:
             return False
@@ -50,7 +45,6 @@ class Connection:
 
     def __init__(self, server: str, key: str | None, *, patience_s: float, timeout_s: float,
                  transport: httpx2.BaseTransport | None = None) -> None:
-        """Args: as for `Client`."""
         self.server, self._patience_s = server.rstrip("/").removesuffix("/v1"), patience_s
         if key is not None and not (key.isascii() and key.isprintable()):
             raise ClientError("the key has characters that no key has")
@@ -84,10 +78,6 @@ class Connection:
             method, path, options: of the request, as httpx2 takes them.
             repeatable: whether carrying the request out twice has the same effect as once; if not, it is repeated only where it is
                 certain that it was not carried out.
-
-        Raises:
-            Refused: the service answers with an error.
-            Unreachable: the service does not answer.
         """
         backoff = self.backoff()
         while True:

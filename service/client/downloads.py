@@ -23,17 +23,12 @@ class Download:
     """The download of one file: into a hidden file named after its ETag, so that parts of two versions are never mixed."""
 
     def __init__(self, connection: Connection, results: str, name: str, folder: Path, progress: TransferProgress) -> None:
-        """Args: connection: to the service. results: path of the job's results in the API. name: of the file. folder, progress: of all."""
         self._connection, self._name, self._progress = connection, name, progress
         self._url, self._target = f"{results}/{quote(name)}", folder / _safe(name)
         self._etag, self._size, self._got = "", -1, 0
 
     def run(self, stop: Event) -> Path:
-        """Fetch the bytes that are missing, until the file is complete.
-
-        Raises:
-            Stopped: `stop` was set.
-        """
+        """Fetch the bytes that are missing, until the file is complete or `stop` is set."""
         with file_errors(self._target.parent, "make"):
             self._target.parent.mkdir(parents=True, exist_ok=True)
         if self._parts():

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import httpx2
 
-from service.requests.views.intakes import IntakeView
-from service.requests.views.jobs import JobView
+from service.requests.answers import IntakeView, JobView
 
 
 class ClientError(Exception):
@@ -44,10 +43,9 @@ class Fault(NamedTuple):
 
 
 class Refused(ClientError):
-    """The service answers with an error."""
+    """The service answers with an error: its status, its kind (not-found, conflict …), one sentence, and the fields that are invalid."""
 
     def __init__(self, status: int, kind: str, detail: str, *, request_id: str = "", errors: tuple[Fault, ...] = ()) -> None:
-        """Args: status: of HTTP. kind: not-found, conflict … detail: the sentence. request_id: in the log. errors: invalid values."""
         super().__init__(detail)
         self.status, self.kind, self.detail, self.request_id, self.errors = status, kind, detail, request_id, errors
 
@@ -80,7 +78,6 @@ class IntakeRefused(ClientError):
     """The check of a capture or environment found that it cannot be used."""
 
     def __init__(self, intake: IntakeView) -> None:
-        """Args: intake: the capture or environment."""
         super().__init__(f"{intake.name} ({intake.id}): {intake.problem}")
         self.intake = intake
 
@@ -89,7 +86,6 @@ class JobEnded(ClientError):
     """A job failed or was cancelled."""
 
     def __init__(self, job: JobView) -> None:
-        """Args: job: as it ended."""
         super().__init__(job.error if job.error is not None else f"{job.id} was {job.state}")
         self.job = job
 
@@ -100,12 +96,7 @@ OF_STATUS: dict[int, type[Refused]] = {401: NotAllowed, 403: NotAllowed, 404: No
 
 
 def refusal(answer: httpx2.Response) -> ClientError:
-    """Return the error for an answer with status 300 or more.
-
-    Args:
-        answer: of the service, with a problem (RFC 9457) as its body; or of something else that answers in its place, such as a proxy.
-            A streamed answer is read to its end here.
-    """
+    """Return the error for an answer with status 300 or more, of the service (RFC 9457) or of a proxy in its place; read it to its end."""
     body, status = answer.read(), answer.status_code
     problem = _problem(body) if answer.headers.get("content-type", "").partition(";")[0].strip() == PROBLEM else None
     if problem is None:

@@ -12,8 +12,8 @@ from service.client.local_files import files_of, hash_files, hash_of_all
 from service.client.transfer import TransferProgress, transfer_all
 from service.client.uploads import Upload
 from service.reporting.progress import Progress
-from service.requests.views.intakes import IntakePage, IntakeView
-from service.requests.views.states import CHECKING, READY, RECEIVING, REFUSED
+from service.requests.answers import IntakePage, IntakeView
+from service.requests.states import CHECKING, READY, RECEIVING, REFUSED
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 """First and longest pause, in seconds, between two requests for the state of an intake that is being checked; each pause is 1.5 times the
@@ -26,7 +26,6 @@ class Intakes:
     """The captures of a project, or its environments: the two kinds of files that jobs take in."""
 
     def __init__(self, connection: Connection, path: str, source: str, *, parallel: int) -> None:
-        """Args: connection: to the service. path: in the API. source: field of a path on the server. parallel: files sent at once."""
         self._connection, self._path, self._source, self._parallel = connection, path, source, parallel
 
     def upload(self, source: Path, *, name: str | None = None, progress: Progress | None = None) -> IntakeView:
@@ -75,23 +74,16 @@ class Intakes:
         return self.wait(self.create(name, path=path).id)
 
     def create(self, name: str, *, path: str | None = None, token: str | None = None) -> IntakeView:
-        """Create an intake that receives files, or one that registers a path of the server; `upload` and `register` call this.
+        """Create an intake that receives files or, with `path`, one that registers a path of the server; `upload` and `register` call this.
 
-        Args:
-            name: shown to people.
-            path: on the server; None: files will be uploaded.
-            token: Idempotency-Key; None: a new one.
+        `token` is the Idempotency-Key; None: a new one.
         """
         answer = self._connection.send("POST", self._path, json={"name": name, **({} if path is None else {self._source: path})},
                                        headers={"Idempotency-Key": token or self._connection.new_token()})
         return IntakeView.model_validate_json(answer.content)
 
     def validate(self, intake: str) -> IntakeView:
-        """End the upload and begin the check; an intake that is being checked or is ready does not change.
-
-        Raises:
-            Conflict: a file is not complete.
-        """
+        """End the upload and begin the check; an intake that is being checked or is ready does not change."""
         try:
             return IntakeView.model_validate_json(self._connection.send("POST", f"{self._at(intake)}/validate").content)
         except Conflict:
@@ -101,11 +93,7 @@ class Intakes:
             return found
 
     def wait(self, intake: str) -> IntakeView:
-        """Wait until an intake is checked.
-
-        Raises:
-            IntakeRefused: the check found a fault.
-        """
+        """Wait until an intake is checked; raise IntakeRefused if the check found a fault."""
         pause = FIRST_PAUSE_S
         while (found := self.get(intake)).state == CHECKING:
             time.sleep(pause)

@@ -11,9 +11,9 @@ from service.client.downloads import Download
 from service.client.errors import FileError, JobEnded
 from service.client.transfer import TransferProgress, transfer_all
 from service.reporting.progress import Progress
+from service.requests.answers import JobPage, JobView, ResultPage, ResultView
 from service.requests.base.base import JobRequest
-from service.requests.views.jobs import JobPage, JobView, ResultPage, ResultView
-from service.requests.views.states import ENDED, SUCCEEDED, JobState
+from service.requests.states import ENDED, SUCCEEDED, JobState
 
 PATH = "/v1/jobs"
 EVENT = "job"
@@ -27,18 +27,12 @@ class Jobs:
     """The jobs of a project."""
 
     def __init__(self, connection: Connection, *, parallel: int) -> None:
-        """Args: connection: to the service. parallel: number of results that are fetched at once."""
         self._connection, self._parallel = connection, parallel
 
     def submit(self, request: JobRequest, *, token: str | None = None) -> JobView:
-        """Submit a job.
+        """Submit a job: a SolveJob, RelightJob … of service.requests.jobs.
 
-        Args:
-            request: a SolveJob, RelightJob … of service.requests.jobs.
-            token: Idempotency-Key: the same request with the same token returns the same job; None: a new job.
-
-        Raises:
-            Refused: a capture, environment or job that it names does not exist or is not ready, or a value is invalid.
+        The same request with the same token (Idempotency-Key) returns the same job; None: a new job.
         """
         answer = self._connection.send("POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
                                        headers={"Idempotency-Key": token or self._connection.new_token()})
@@ -63,11 +57,7 @@ class Jobs:
         return follow(self._connection, self._at(job))
 
     def wait(self, job: str, *, progress: Progress | None = None) -> JobView:
-        """Wait until a job has succeeded, and tell `progress` of its stages.
-
-        Raises:
-            JobEnded: it failed or was cancelled.
-        """
+        """Wait until a job has succeeded, and tell `progress` of its stages; raise JobEnded if it failed or was cancelled."""
         stage, ended = None, None
         for ended in self.follow(job):
             if progress is not None and ended.progress is not None:
@@ -112,20 +102,12 @@ class Jobs:
                 return found
 
     def download(self, job: str, folder: Path, *, names: Sequence[str] | None = None, progress: Progress | None = None) -> list[Path]:
-        """Download results, several files at once; a download that was interrupted is continued.
+        """Download results, several files at once, and return their paths by name; an interrupted download is continued.
 
         Args:
-            job: its identifier.
             folder: to write the files into; it is made if it does not exist.
             names: of the files; None: all.
             progress: told of the stage `download`, in MiB.
-
-        Returns:
-            The paths of the files, by name.
-
-        Raises:
-            FileError: the job has no result of a name, or a file cannot be written.
-            ClientError: the service answers with an error, or does not answer.
         """
         found = self.results(job)
         if names is not None:
@@ -144,16 +126,7 @@ class Jobs:
 
 
 def follow(connection: Connection, job: str) -> Iterator[JobView]:
-    """Yield a job as it is now, and again after every change, until it has ended.
-
-    Args:
-        connection: to the service.
-        job: path of the job in the API.
-
-    Raises:
-        Refused: there is no such job, or the key does not allow to read it.
-        Unreachable: the service does not answer.
-    """
+    """Yield a job, given by its path in the API, as it is now, and again after every change, until it has ended."""
     last: JobView | None = None
     pause = FIRST_PAUSE_S
     while True:

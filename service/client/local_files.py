@@ -35,11 +35,8 @@ def file_errors(path: Path, action: str = "read") -> Iterator[None]:
 def files_of(path: Path) -> list[tuple[Path, str]]:
     """Return the file, or all files below the folder, with their names in an upload, sorted by name.
 
-    Files and folders whose names begin with a dot are left out.
-
-    Raises:
-        FileError: there is no such file or folder, the folder has no files, or it has a link that leads out of it or to a folder, or
-            something else that is no file.
+    Files and folders whose names begin with a dot are left out. A FileError names what cannot be sent: a folder without files, a link that
+    leads out of it or to a folder, or something else that is no file.
     """
     if path.is_file():
         return [(path, path.name)]
@@ -52,11 +49,7 @@ def files_of(path: Path) -> list[tuple[Path, str]]:
 
 
 def hash_files(files: list[tuple[Path, str]], *, parallel: int, progress: TransferProgress) -> list[LocalFile]:
-    """Return the sizes and hashes of files, which are read in several threads.
-
-    Raises:
-        FileError: a file cannot be read.
-    """
+    """Return the sizes and hashes of files, which are read in several threads."""
     with ThreadPoolExecutor(parallel) as pool:
         return list(pool.map(lambda one: _hash_file(one[0], one[1], progress), files))
 

@@ -21,7 +21,6 @@ class TransferProgress:
     """Reports transferred bytes to a `Progress` in whole MiB; several threads may add to one."""
 
     def __init__(self, progress: Progress | None, stage: str, total: int) -> None:
-        """Args: progress: is told; None: nobody is. stage: name of the stage. total: bytes."""
         self._progress, self._done, self._lock = progress, 0, Lock()
         if progress is not None:
             progress.stage(stage, max(1, _whole_mib(total)))

@@ -21,16 +21,11 @@ class Upload:
     """The upload of one file; bytes that the server has already are not sent again."""
 
     def __init__(self, connection: Connection, intake: str, file: LocalFile, progress: TransferProgress) -> None:
-        """Args: connection: to the service. intake: path of the capture or environment in the API. file: to send. progress: of all."""
         self._connection, self._intake, self._file, self._progress = connection, intake, file, progress
         self._sent = 0
 
     def run(self, stop: Event) -> None:
-        """Send the bytes that the server does not have, until it has all.
-
-        Raises:
-            Stopped: `stop` was set.
-        """
+        """Send the bytes that the server does not have, until it has all or `stop` is set."""
         if stop.is_set():
             raise Stopped
         file = self._file

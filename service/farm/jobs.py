@@ -43,11 +43,7 @@ class JobFiles(NamedTuple):
 
 
 def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job:
-    """Return a job whose tasks make parts of the frames, `chunk_frames` each unless who submits it says otherwise.
-
-    Raises:
-        RequestError: a text that no farm takes.
-    """
+    """Return a job whose tasks make parts of the frames, `chunk_frames` each unless who submits it says otherwise."""
     given = Parameters()
     words = given.words(request)
     folder, _, name = str(Path(request.out)).rpartition("/")
@@ -61,11 +57,7 @@ def relight_job(request: RelightRequest, *, chunk_frames: int, gpu: bool) -> Job
 
 
 def shade_job(request: ShadeRequest, *, turns: int | None, gpu: bool) -> Job:
-    """Return a job of one picture, or of `turns` pictures over which the environment turns once around; the request's turn is the first.
-
-    Raises:
-        RequestError: turns without an environment, too many, or no run of # in the picture's name for their number.
-    """
+    """Return a job of one picture, or of `turns` pictures over which the environment turns once around; the request's turn is the first."""
     given = Parameters()
     words = given.words(request if turns is None else request.model_copy(update={"turn_degrees": 0.0}))
     folder = given.folder("OutputFolder", request.out.parent, "OUT", "Where the picture goes.")
@@ -115,9 +107,7 @@ def _job(command: str, subject: Path, words: list[str], request: Request, given:
 def write_job(made: Job, where: Path) -> JobFiles:
     """Write the template of a job and its values.
 
-    Args:
-        made: the job.
-        where: NAME.yaml, and NAME.values.yaml beside it; any other name is a folder, with template.yaml and parameter_values.yaml.
+    `where` is NAME.yaml, with NAME.values.yaml beside it, or a folder for template.yaml and parameter_values.yaml.
     """
     if where.suffix.lower() in TEMPLATE_SUFFIXES:
         files = JobFiles(where, where.with_suffix(f".values{where.suffix}"), False)

@@ -20,7 +20,6 @@ class Parameters:
     """Parameters in the order of the template. Each method adds one and returns the text that stands for its value there."""
 
     def __init__(self) -> None:
-        """Begin without parameters."""
         self.definitions: list[Mapping[str, Any]] = []
         self.values: dict[str, str] = {}
         """The values of the parameters that have no default."""

@@ -26,7 +26,6 @@ class Timings:
     """A Progress that measures the seconds of each stage for reports, and passes every call on."""
 
     def __init__(self, inner: Progress | None = None) -> None:
-        """Args: inner: receives every call too; None: there is no other."""
         self._inner = inner
         self._started: tuple[str, float] | None = None
         self._furthest = 0
@@ -61,11 +60,7 @@ class Timings:
             self.parts[name] = round(self.parts.get(name, 0.0) + time.perf_counter() - began, 6)
 
     def close(self) -> dict[str, float]:
-        """End the last stage, and return the seconds of every stage.
-
-        Returns:
-            Seconds by the name of the stage, rounded to milliseconds.
-        """
+        """End the last stage, and return the seconds of every stage by its name, rounded to milliseconds."""
         if self._started is not None:
             name, began = self._started
             self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - began, 3)

@@ -40,12 +40,9 @@ def versions() -> dict[str, str]:
 
 def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0,
              contents: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return string attributes for result files. They are equal for two runs on the same inputs.
+    """Return string attributes for result files. They are equal for two runs on the same inputs, wherever those are made.
 
     Args:
-        request: what was asked; paths and device are left out, so that results do not depend on where they were made, and so is
-            what was not asked for.
-        capture: its name.
         inputs: content hash of the images.
         method: the one that was used, where the request left the choice open.
         near_lights: how many point lights were taken as distant ones.
@@ -63,15 +60,9 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
 
 
 def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str | None:
-    """Return the sentence for maps of which nothing tells whether they were solved from some images; None where they were.
+    """Return the sentence for maps of which nothing tells whether they were solved from the images with this content hash.
 
-    Args:
-        provenance: attributes of the maps.
-        inputs: content hash of the images.
-        maps: their file, for the sentence.
-
-    Raises:
-        ResultError: the maps were solved from other images.
+    None: they were. Maps that were solved from other images raise a ResultError.
     """
     if provenance.get("relit:inputs", inputs) == inputs:
         return None
@@ -84,9 +75,7 @@ def other_inputs(provenance: Mapping[str, str], inputs: str, maps: Path) -> str 
 def export_metadata(request: Options, contents: Mapping[str, str]) -> dict[str, str]:
     """Return the string attributes that an export adds to the provenance of what it exports.
 
-    Args:
-        request: what was asked; as in `metadata`.
-        contents: content hash of each file that the asset was made from, by the name of its stem, such as maps.
+    `contents` is the content hash of each file that the asset was made from, by the name of its stem, such as maps.
     """
     options = {name: value for name, value in choices(request).items() if value is not None and value is not False}
     return {"relit:export_version": __version__, "relit:export_options": json.dumps(options, sort_keys=True),

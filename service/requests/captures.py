@@ -1,337 +1,14 @@
-"""The options of `relit info` and `relit import`: one frozen model for each layout of files."""
+"""The options of `relit info` and `relit view`."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
-from service.requests.base.base import CAPTURE, Choice, Commas, Options, PixelOptions, Role, Spelling, WidthHeight
-from service.requests.patterns import PatternAxis
-from stage.colour.colour_spaces import ColorSpaceName
-from stage.model import Count, Finite, Line, Positive, Resolution
+from service.requests.base.base import CAPTURE, PixelOptions, Request, Role, Spelling, StackOptions
 
-
-class ImportRequest(Options):
-    """Base of every layout: where the files are, and where the capture comes to be."""
-
-    source: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SRC")]
-    """Folder of the data."""
-    destination: Annotated[Path | None, Role.OUTPUT, Spelling(argument=True, metavar="DST")] = None
-    """Folder for the capture, which gets links to the files; None: SRC, where nothing but capture.json is written."""
-
-    @property
-    def folder(self) -> Path:
-        """The folder for the capture."""
-        return self.destination or (self.source.parent if self.source.is_file() else self.source)
-
-
-class DiligentImport(ImportRequest):
-    """An object's folder of the DiLiGenT benchmark."""
-
-
-class LpImport(ImportRequest):
-    """An RTI light list (.lp) with its images; SRC may be the .lp file."""
-
-
-class OpencvGrayImport(ImportRequest):
-    """Images of a Gray code in the order of OpenCV's GrayCodePattern: columns and rows, each with its inverse, then white and black."""
-
-    projector: Annotated[Resolution, WidthHeight, Spelling(metavar="1280x800")]
-    """Width and height of the projector in pixels, which say how many bits there are."""
-    calibration: Annotated[Path | None, Role.INPUT] = None
-    """OpenCV file (.yml, .xml, .json) with the intrinsics of camera and projector, R and T; relit calibrate procam measures them without
-    such a file."""
-    unit_m: Positive = 1.0
-    """Metres in one unit of T, such as 0.001 for millimetres."""
-
-
-def _one_or_two(values: tuple[float, ...]) -> tuple[float, ...]:
-    if len(values) not in (1, 2):
-        raise ValueError("give one focal length, or two with a comma between")
-    return values
-
-
-def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
-    if len(values) not in (4, 5):
-        raise ValueError("give k1,k2,p1,p2 or k1,k2,p1,p2,k3")
-    return values
-
-
-class LensOptions(Options):
-    """Focal length, principal point and distortion of a camera's lens."""
-
-    focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
-                        Spelling(metavar="F[,F]")] = None
-    """Focal length in pixels, one or that of columns and rows; None: the camera is orthographic."""
-    principal_px: Annotated[tuple[Finite, Finite] | None, Commas, Spelling(metavar="U,V")] = None
-    """Principal point in pixels, where the centre of the first pixel is 0.5,0.5 (add 0.5 to OpenCV's); None: the centre of the image."""
-    distortion: Annotated[tuple[Finite, ...] | None, Commas, AfterValidator(lambda v: v and _four_or_five(v)),
-                          Spelling(metavar="K1,K2,P1,P2[,K3]")] = None
-    """Lens distortion as OpenCV has it."""
-
-
-class CameraOptions(LensOptions):
-    """The camera; without a focal length it is taken to be orthographic."""
-
-    pixel_size_m: Positive | None = None
-    """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
-    surface_z_m: Finite | None = None
-    """Mean z of the object in the camera frame, metres: negative before a perspective camera. None: under near lights relit solve
-    estimates it; else it is 0 for an orthographic camera."""
-
-
-class ImageOptions(Options):
-    """The images of the folder that are frames, and their encoding."""
-
-    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the ambient image."""
-    mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image of the mask; None: the one with the word mask in its name, if there is one."""
-    ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image without any of the lights, which is subtracted; None: the one with the word ambient in its name, if there is one."""
-    color_space: ColorSpaceName | None = None
-    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
-
-
-class Sense(Choice):
-    """The direction of the vectors of a table."""
-
-    TO_LIGHT = "to-light", "directions to the light, or its position seen from the object"
-    FROM_LIGHT = "from-light", "along the rays, away from the light"
-
-
-class Run(Choice):
-    """The rows or columns of a table of numbers, each a light."""
-
-    ROWS = "rows"
-    COLUMNS = "columns"
-
-
-class AxisWay(Choice):
-    """The direction of an axis, as seen by the camera."""
-
-    RIGHT = "right"
-    LEFT = "left"
-    UP = "up"
-    DOWN = "down"
-    TOWARDS = "towards"
-    AWAY = "away"
-
-
-Axes = Annotated[tuple[AxisWay, AxisWay, AxisWay], Commas, Spelling(metavar="X,Y,Z")]
-
-
-class OlatImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one far light each, with a table of the lights: .csv, .txt, .json, .mat or .npy."""
-
-    axes: Axes
-    """Where x, y and z of the table point as seen by the camera: right or left, up or down, towards the camera or away from it. relit and
-    OpenGL have right,up,towards, OpenCV has right,down,away."""
-    sense: Annotated[Sense, Spelling(flag="--vectors")]
-    """The meaning of the vectors of the table."""
-    lights: Annotated[Path | None, Role.INPUT] = None
-    """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
-    SRC."""
-    variable: Line | None = None
-    """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
-    lights_in: Run | None = None
-    """A light's numbers in the table are a row or a column; None: as its shape says."""
-    strengths: Annotated[Path | None, Role.INPUT] = None
-    """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
-
-
-class PhotosImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one far light each where nothing says where the lights were: relit solve --lights unknown finds them, or relit
-    calibrate measures them."""
-
-
-class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one near light each (LEDs), with a .mat or .json file of the rig as near_ps has it: S, Dir, Phi and mu."""
-
-    axes: Axes
-    """Where x, y and z of the rig point as seen by the camera, whose centre is their origin: right or left, up or down, towards the camera
-    or away from it. near_ps and OpenCV have right,down,away."""
-    unit_m: Positive
-    """Metres in one unit of the positions: near_ps has millimetres, 0.001."""
-    lights: Annotated[Path | None, Role.INPUT] = None
-    """File of the rig: positions and, if they are known, directions, intensities and mu (anisotropy); None: the only table in SRC."""
-    camera: Annotated[Path | None, Role.INPUT] = None
-    """File with the matrix of the camera: K of a .mat file, or an OpenCV file (.yml, .xml, .json); None: as the other options say."""
-
-
-class RelightlabImport(ImportRequest):
-    """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""
-
-
-class PlaneForm(Choice):
-    """The equation to which the four coefficients of a plane belong."""
-
-    ZERO = "zero", "a x + b y + c z + d = 0"
-    EQUALS = "equals", "a x + b y + c z = d"
-
-
-class LaserImport(LensOptions, ImageOptions, ImportRequest):
-    """Images of the stripe of a laser on a scene that stands still, one for each place of its plane."""
-
-    camera: Annotated[Path | None, Role.INPUT] = None
-    """File with the matrix of the camera: an OpenCV file (.yml, .xml, .json), or K of a .mat file; None: as the other options say."""
-    planes: Annotated[Path | None, Role.INPUT] = None
-    """File with the plane of each image: rows of four coefficients, or of a point and a normal (.csv, .txt, .npy, .mat), or a calibration
-    file with them; None: relit calibrate laser-planes measures them."""
-    form: PlaneForm | None = None
-    """The equation to which four coefficients of a plane belong."""
-    axes: Axes | None = None
-    """Where x, y and z of the planes point as seen by the camera, whose centre is their origin; OpenCV has right,down,away. Needed with
-    planes."""
-    unit_m: Positive | None = None
-    """Metres in one unit of the planes, such as 0.001 for millimetres. Needed with planes."""
-
-    @model_validator(mode="after")
-    def _of_the_planes(self) -> Self:
-        if self.planes is not None and (self.axes is None or self.unit_m is None):
-            raise ValueError(f"--planes {self.planes}: needs --axes, right,down,away for OpenCV's, and --unit-m, 0.001 for millimetres")
-        if self.planes is None and (self.axes is not None or self.unit_m is not None or self.form is not None):
-            raise ValueError("--axes, --unit-m and --form are those of --planes, which is not given")
-        return self
-
-
-class RigOptions(Options):
-    """The projector and the calibration of a rig."""
-
-    projector: Annotated[Resolution, WidthHeight, Spelling(metavar="1280x800")]
-    """Width and height of the projector in pixels."""
-    calibration: Annotated[Path | None, Role.INPUT] = None
-    """OpenCV file (.yml, .xml, .json) or that of SLStudio with the intrinsics of camera and projector and the pose of both; None: relit
-    calibrate procam measures them."""
-    unit_m: Positive = 1.0
-    """Metres in one unit of the translation in `calibration`, such as 0.001 for millimetres."""
-
-
-class ExposureOrder(Choice):
-    """The order of the images of several exposures."""
-
-    EXPOSURE = "exposure", "each pattern at all exposures, then the next pattern"
-    PATTERN = "pattern", "all patterns at one exposure, then at the next"
-
-
-class PatternImageOptions(Options):
-    """The images of the folder that are frames of patterns."""
-
-    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, such as 'phase_*.png', taken in natural order; None: every image that is not named otherwise."""
-    mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image of the mask; None: the one with the word mask in its name, if there is one."""
-    white: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image under a white projection; None: the one with the word white in its name, if there is one."""
-    black: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image under a black projection; None: the one with the word black in its name, if there is one."""
-    color_space: ColorSpaceName = "lin_rec709_scene"
-    """Colour space of the images: those of most scanners are linear."""
-    video_frames: Annotated[Line | None, Spelling(metavar="FIRST-LAST[:STEP]")] = None
-    """Frames of the video that SRC is, counted from 0, such as 12-600:6 where each pattern was shown for six frames; None: all."""
-    exposures_s: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="S,S,…")] = None
-    """Exposure times in seconds at which every pattern was taken, in the order of the images; None: one, which is not needed."""
-    exposure_order: ExposureOrder = ExposureOrder.EXPOSURE
-    """The part that changes first from image to image where there are several exposures."""
-
-
-class Inverses(Choice):
-    """The place of the inverse images of a Gray code."""
-
-    PAIRS = "pairs", "each image is followed by its inverse"
-    BLOCKS = "blocks", "all images of an axis, then their inverses"
-    NONE = "none", "there are none"
-
-
-class GrayImport(PatternImageOptions, RigOptions, ImportRequest):
-    """Images of a Gray code in any order."""
-
-    sequence: Annotated[tuple[Line, ...], Commas, Spelling(metavar="PART,PART,…")] = ("columns", "rows", "white", "black")
-    """The order of the parts in the images: columns, rows, white and black, each once or not at all."""
-    inverses: Inverses = Inverses.PAIRS
-    """The place of the inverse images."""
-    fine_first: bool = False
-    """The finest stripes come first; else the coarsest."""
-    column_bits: Count | None = None
-    """Number of images that code the columns, the finest left out where they are fewer; None: all bits of the projector."""
-    row_bits: Count | None = None
-    """Number of images that code the rows; None: all bits of the projector."""
-
-
-class PhaseShift(Choice):
-    """The direction in which the waves move from step to step."""
-
-    MINUS = "minus", "cos(2πu/P − 2πi/N), to larger columns, as relit and SLStudio do"
-    PLUS = "plus", "cos(2πu/P + 2πi/N)"
-
-
-class WaveOrigin(Choice):
-    """The place of column 0 of a wave in the projector."""
-
-    EDGE = "edge", "at the outer edge of the first pixel, as relit has it"
-    CENTRE = "centre", "at its centre, as in cos(2πx/P) with the number x of the pixel"
-
-
-class PhaseImport(PatternImageOptions, RigOptions, ImportRequest):
-    """Images of phase shifts in any order, with a Gray code that numbers the periods or without."""
-
-    periods: Annotated[tuple[Positive, ...], Commas, Spelling(metavar="P,P,…")]
-    """Periods in projector pixels, in the order of the images."""
-    steps: Annotated[int, Field(ge=3)]
-    """Number of images for each period."""
-    axis: PatternAxis = PatternAxis.COLUMN
-    """The projector coordinate that is coded; both: columns first."""
-    row_periods: Annotated[tuple[Positive, ...] | None, Commas, Spelling(metavar="P,P,…")] = None
-    """Periods along the rows; None: as `periods`."""
-    order: Annotated[tuple[Line, ...], Commas, Spelling(metavar="WORD,WORD,WORD")] = ("axis", "period", "step")
-    """The order in which axis, period and step change from image to image, slowest first."""
-    shift: PhaseShift = PhaseShift.MINUS
-    """Direction in which the waves move from step to step."""
-    offset_deg: Finite = 0.0
-    """Phase at `origin` in the first step, degrees. Waves that are sines have -90."""
-    origin: WaveOrigin = WaveOrigin.EDGE
-    """The place of column 0 of the waves."""
-    gray_images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the images of a Gray code that numbers the periods."""
-    gray_stripe: Positive | None = None
-    """Width of the finest stripe of the Gray code in projector pixels: half a period, or less."""
-    gray_inverses: Inverses = Inverses.NONE
-    """The place of the inverse images of the Gray code."""
-    gray_fine_first: bool = False
-    """The finest stripes of the Gray code come first."""
-
-    @model_validator(mode="after")
-    def _stripe_of_the_code(self) -> Self:
-        if (self.gray_images is None) != (self.gray_stripe is None):
-            raise ValueError("--gray-images and --gray-stripe belong together: give both, or none")
-        return self
-
-
-class Codec(Choice):
-    """The patterns that a scanning program projects, and their order."""
-
-    OPENCV_GRAY = "opencv-gray", "GrayCodePattern: columns and rows with inverses, white, black"
-    SLSTUDIO_GRAY = "slstudio-gray", "white, black, ten bits of columns, six of rows"
-    SLSTUDIO_PHASE_2X3 = "slstudio-phase-2x3", "three steps of 16 periods, three of one"
-    SLSTUDIO_PHASE_3 = "slstudio-phase-3", "three steps of one period"
-    SLSTUDIO_PHASE_4 = "slstudio-phase-4", "four steps of one period"
-
-
-class ScannerImport(ImportRequest):
-    """Images of a scanning program (SLStudio, or any in OpenCV's order) with its calibration file."""
-
-    calibration: Annotated[Path, Role.INPUT]
-    """Calibration of camera and projector: SLStudio's calibration.xml, or an OpenCV file (.yml, .xml, .json)."""
-    codec: Codec
-    """The patterns that were projected."""
-    unit_m: Positive
-    """Metres in one unit of the translation: SLStudio has millimetres, 0.001."""
-    axis: PatternAxis = PatternAxis.COLUMN
-    """The projector coordinate that is coded."""
-    projector: Annotated[Resolution | None, WidthHeight, Spelling(metavar="1280x800")] = None
-    """Width and height of the projector in pixels; None: as the calibration says."""
-    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, taken in natural order; None: every image but the mask."""
+MOST_TERMS = 256
+"""Layers that a texture of any browser with WebGL2 can have (OpenGL ES 3.0, table 6.29)."""
 
 
 def _png(path: Path | None) -> Path | None:
@@ -348,3 +25,22 @@ class InfoRequest(PixelOptions):
     picture: Annotated[Path | None, AfterValidator(_png), Role.RUN] = None
     """PNG that shows what was understood: the lights on the dome with their images, those that disagree with the others in red, the mask,
     and how bright the readings are."""
+
+
+class ViewOptions(StackOptions):
+    """Options for showing a capture."""
+
+    terms: Annotated[int, Field(ge=1, le=MOST_TERMS)] | None = None
+    """Most coefficient images that the object is relit with in the browser; fewer where fewer show the object as well. More are closer to
+    `relit relight` where highlights and shadows are sharp. None: 32."""
+
+
+class ViewRequest(ViewOptions, Request):
+    """Write the files that a browser needs to show a capture, its maps, its object under new light, and its depth as points."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json."""
+    maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
+    """Folder with the maps.exr or depth.exr of the capture, or the file; None: the capture alone is shown."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder for view.json, view.bin and thumbnails.jpg."""

@@ -9,6 +9,7 @@ from service.requests.base.base import CAPTURE, JobRequest, Role, SequenceOption
 from service.requests.base.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
 from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
+from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.inspect_board import InspectBoardOptions
@@ -18,7 +19,6 @@ from service.requests.register import FuseOptions, RegisterOptions
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
-from service.requests.view import ViewOptions
 from stage.model import Count, Line
 from stage.sets.board import BoardRegions, GaugeRuns
 

@@ -14,7 +14,7 @@ from service.captures.info import standing_faults
 from service.relight.outputs import check_outputs
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
-from service.requests.view import ViewRequest
+from service.requests.captures import ViewRequest
 from service.viewing.block_file import BlockFile
 from service.viewing.capture_frames import describe_frames, read_images, write_thumbnails
 from service.viewing.layers import status_codes, write_layers

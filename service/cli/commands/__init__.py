@@ -1,1 +1,1 @@
-"""The commands that work on this machine."""
+"""The commands, one module for each group."""

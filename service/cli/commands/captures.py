@@ -5,8 +5,7 @@ import typer
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.requests.captures import InfoRequest
-from service.requests.view import ViewRequest
+from service.requests.captures import InfoRequest, ViewRequest
 
 
 def register(app: typer.Typer) -> None:

@@ -41,14 +41,8 @@ def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
 
 
 def open_service(data: Path, device: str | None, result: "DemoResult | None" = None) -> None:
-    """Run a service for this machine alone, with the sample in it.
-
-    Args:
-        data: folder of the service.
-        device: of its worker; None: every GPU, else the CPU.
-        result: of the demo, which the service then has too, prepared for its pages; None: the sample alone.
-    """
-    from service.cli.service.server import settings_of
+    """Run a service for this machine alone in the folder `data`, with the sample in it and, if given, the result of the demo."""
+    from service.cli.commands.server import settings_of
     from service.demo.demo import sample_folder
     from service.server.process.sample import show_sample
     from service.server.process.serve import serve
@@ -62,7 +56,7 @@ def open_service(data: Path, device: str | None, result: "DemoResult | None" = N
 def _results(result: "DemoResult", device: str | None) -> "SampleResults":
     """Return the files of the demo, and of views of the sample, which are made here."""
     from service.demo.demo import sample_folder
-    from service.requests.view import ViewRequest
+    from service.requests.captures import ViewRequest
     from service.server.process.sample import SampleResults
     from service.viewing.view_files import view
     from stage.stack.ingest import CACHE_FOLDER

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.service.server import ConfigOption, DataOption, settings_of
+from service.cli.commands.server import ConfigOption, DataOption, settings_of
 
 ROOTS = ("stage", "kernels", "service")
 

@@ -8,7 +8,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.request_commands import local_command
-from service.requests.captures import (
+from service.requests.imports import (
     DiligentImport,
     ExposureOrder,
     GrayImport,

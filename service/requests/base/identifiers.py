@@ -1,4 +1,4 @@
-"""Identifiers of captures, environments, uploads, jobs and keys: a prefix, and 20 random letters and digits."""
+"""Identifiers of captures, environments, uploads, jobs and keys: a prefix, and 20 random letters and digits; the default address."""
 
 import secrets
 from typing import Annotated
@@ -8,6 +8,9 @@ from pydantic import StringConstraints
 ALPHABET = "0123456789abcdefghjkmnpqrstvwxyz"
 """Crockford's base 32 in small letters: none that are mistaken for another."""
 LENGTH = 20
+DEFAULT_PORT = 8470
+DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
+"""The address at which a client looks for the service, where nothing else is given."""
 PROJECT_PATTERN = r"^[a-z0-9][a-z0-9-]{0,62}$"
 
 CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY = "cap", "env", "up", "job", "key"

@@ -82,11 +82,7 @@ def places_of(model: type[BaseModel]) -> Iterator[tuple[tuple[str, ...], Option]
 
 
 def build(model: type[Model], given: Mapping[str, Any]) -> Model:
-    """Make a model from options by name; what is not given has its default.
-
-    Raises:
-        ValidationError: a value cannot be used, or one is missing.
-    """
+    """Make a model from options by name; what is not given has its default."""
     return model.model_validate(_values(model, given))
 
 

@@ -9,14 +9,9 @@ MAX_FRAMES = 100_000
 
 
 def frame_numbers(text: str | None, steps: int) -> list[int]:
-    """Return the numbers of `7` or `1-24`.
+    """Return the numbers of `7` or `1-24`; None: 1, or 1 to the number of steps.
 
-    Args:
-        text: None: 1, or 1 to the number of steps.
-        steps: captures of the sequence, each of which gives one frame; 1 for a single capture, which gives any number.
-
-    Raises:
-        RequestError: not that form, backwards, more than MAX_FRAMES, or not one frame a step.
+    `steps` are the captures of the sequence, each of which gives one frame; 1 for a single capture, which gives any number.
     """
     first, last = _ends("--frames", text if text is not None else f"1-{steps}")
     count = last - first + 1
@@ -29,15 +24,7 @@ def frame_numbers(text: str | None, steps: int) -> list[int]:
 
 
 def part_of(numbers: list[int], text: str) -> range:
-    """Return the numbers of a part of a range of frames, given in the same form.
-
-    Args:
-        numbers: of the whole range, one after the other.
-        text: `7` or `1-24`.
-
-    Raises:
-        RequestError: not that form, or not within the range.
-    """
+    """Return the numbers of a part, `7` or `1-24`, of a range of consecutive frames."""
     first, last = _ends("--only", text)
     if first < numbers[0] or last > numbers[-1]:
         raise RequestError(f"--only {text}: lies outside the frames {numbers[0]}-{numbers[-1]}")

@@ -120,10 +120,5 @@ class LightKeys(Strict):
 
     @classmethod
     def read(cls, path: Path) -> "LightKeys":
-        """Read and check a file.
-
-        Raises:
-            StorageError: it cannot be read.
-            ManifestError: not JSON, or a field is wrong; the message names file and field.
-        """
+        """Read and check a file; errors name the file and the field."""
         return read_record(path, cls, SCHEMA)

@@ -24,13 +24,7 @@ DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. doc
 
 
 def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None, *, max_streams: int = MAX_STREAMS) -> FastAPI:
-    """Create the app over a prepared database.
-
-    Args:
-        settings, database: of the service.
-        tracing: makes the spans of requests; None: there are none.
-        max_streams: event streams of this process at most.
-    """
+    """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams."""
     app = FastAPI(title="Relit", version=__version__, description=DESCRIPTION, openapi_url="/v1/openapi.json",
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)

@@ -71,11 +71,7 @@ bearer = HTTPBearer(auto_error=False, scheme_name="key", description="A key of `
 
 
 def authenticate(request: Request) -> Caller:
-    """Return who sent the request; a second call of the same request returns the same.
-
-    Raises:
-        ApiError: there is no valid key and none may be left out, or the key asks too often.
-    """
+    """Return who sent the request; a second call of the same request returns the same."""
     known: Caller | None = getattr(request.state, "caller", None)
     if known is not None:
         return known
@@ -134,11 +130,8 @@ IdempotencyKey = Annotated[str | None, Header(
 def require_local(request: Request) -> None:
     """Refuse a request that a program of this machine did not send.
 
-    A page in a browser of this machine can send requests to a loopback address: under its own name, which it has made to point there (the
-    Host shows it), or from another site (the Origin shows it).
-
-    Raises:
-        ApiError: the request came through a proxy, or from a page of another site.
+    A page in a browser here can send requests to a loopback address: under its own name, which it has made to point there (the Host shows
+    it), or from another site (the Origin shows it).
     """
     host = request.headers.get("host", "")
     if not is_loopback(_name(host)):
@@ -158,11 +151,7 @@ def _name(host: str) -> str:
 
 
 def require_valid(service: Service, caller: Caller) -> None:
-    """Refuse a caller whose key or token was revoked or has expired since the request began.
-
-    Raises:
-        ApiError: it was, or has.
-    """
+    """Refuse a caller whose key or token was revoked or has expired since the request began."""
     revoked = (caller.key or "").startswith(f"{KEY}_") and not keys.still_valid(service.database, [str(caller.key)])
     if revoked or (caller.until is not None and caller.until < time.time()):
         raise ApiError("unauthenticated", "the key was revoked or has expired", headers={"WWW-Authenticate": "Bearer"})
@@ -176,10 +165,6 @@ def has_space(settings: Settings, length: int = 0) -> bool:
 
 
 def require_space(service: Service, purpose: str, length: int = 0) -> None:
-    """Refuse a request, for `purpose` (FOR_WORK or FOR_UPLOAD), for whose `length` bytes there is no space.
-
-    Raises:
-        ApiError: less than `min_free_bytes` would be left.
-    """
+    """Refuse a request, for `purpose` (FOR_WORK or FOR_UPLOAD), after whose `length` bytes less than `min_free_bytes` would be left."""
     if not has_space(service.settings, length):
         raise ApiError("full", f"the service has no space left for {purpose}", headers={"Retry-After": str(SPACE_RETRY_S)})

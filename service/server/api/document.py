@@ -1,6 +1,6 @@
 """The OpenAPI document: that of FastAPI, with the headers, examples and problems that it leaves out."""
 
-from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 from fastapi import FastAPI
@@ -48,20 +48,14 @@ WITH_BODY = (400, 413, 415)
 
 def install(app: FastAPI) -> None:
     """Make the app serve the document of its routes."""
-
-    def document() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            app.openapi_schema = _document(app)
-        return app.openapi_schema
-
-    app.openapi = document  # type: ignore[method-assign]
+    app.openapi = cache(lambda: _document(app))  # type: ignore[method-assign]
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
     made = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes,
                        tags=[{"name": name, "description": text} for name, text in TAGS.items()],
                        license_info={"name": "Apache-2.0", "identifier": "Apache-2.0"})
-    for operation in _operations(made):
+    for operation in (path[method] for path in made["paths"].values() for method in METHODS if method in path):
         _describe(operation)
     for name, example in EXAMPLES.items():
         made["components"]["schemas"][name]["examples"] = [example]
@@ -70,11 +64,6 @@ def _document(app: FastAPI) -> dict[str, Any]:
             if "description" in field:
                 field["description"] = field["description"].replace("None:", "null:")  # docstrings are about Python
     return made
-
-
-def _operations(document: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    for path in document["paths"].values():
-        yield from (path[method] for method in METHODS if method in path)
 
 
 def _describe(operation: dict[str, Any]) -> None:

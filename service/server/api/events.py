@@ -9,12 +9,12 @@ from fastapi import APIRouter, Depends, Header, Response
 from fastapi.sse import KEEPALIVE_COMMENT, EventSourceResponse, format_sse_event
 from starlette.types import Receive, Scope, Send
 
-from service.requests.views.jobs import JobView
-from service.requests.views.states import ENDED
+from service.requests.answers import JobView
+from service.requests.states import ENDED
 from service.server.api.context import Reader, Service, ServiceDep
 from service.server.api.jobs import get_job
 from service.server.api.problems import responses
-from service.server.api.watch import Change, Listener
+from service.server.api.watch import Listener
 from service.server.database.keys import Caller
 
 router = APIRouter(tags=["events"], responses=responses(401, 403, 429, 503))
@@ -76,12 +76,9 @@ async def _events(listener: Listener, *, to_its_end: bool) -> AsyncIterator[byte
         if not news:
             yield KEEPALIVE_COMMENT
         for change in news:
-            yield _event(change, identified=to_its_end)
+            if change.data is None:
+                yield format_sse_event(event="gone", data_str=json.dumps({"id": change.job}))
+            else:
+                yield format_sse_event(event="job", data_str=change.data, id=str(change.revision) if to_its_end else None)
         if to_its_end and any(change.ended for change in news):
             return
-
-
-def _event(change: Change, *, identified: bool) -> bytes:
-    if change.data is None:
-        return format_sse_event(event="gone", data_str=json.dumps({"id": change.job}))
-    return format_sse_event(event="job", data_str=change.data, id=str(change.revision) if identified else None)

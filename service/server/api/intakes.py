@@ -1,18 +1,19 @@
 """Routes of captures and environments: create for an upload, or register where they lie on the server; check, list, delete."""
 
 import os
-from pathlib import Path
+from collections.abc import Callable
+from pathlib import Path as FilePath
 from typing import Annotated
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Body, Query, Response
+from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, CaptureId, EnvironmentId, new_id
+from service.requests import states
+from service.requests.answers import IntakePage, IntakeView
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id, pattern
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
-from service.requests.views import states
-from service.requests.views.intakes import IntakePage, IntakeView
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
@@ -25,10 +26,6 @@ from service.server.database.keys import Caller
 from service.server.storage import layout
 from stage.files import resolved
 from stage.model import Line
-
-captures = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
-environments = APIRouter(prefix="/v1/environments", tags=["environments"], responses=responses(401, 403, 422, 429, 503),
-                         route_class=JsonRoute)
 
 Limit = Annotated[int, Query(ge=1, le=500)]
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
@@ -54,14 +51,85 @@ class NewEnvironment(BaseModel):
     """File of the server below one of its roots, as `folder` of a capture."""
 
 
+def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
+    """Return the row of a capture or environment of the caller's project, or refuse the request."""
+    row = intakes.find(service.database, identifier, caller.project)
+    if row is None:
+        raise ApiError("not-found", f"there is no {identifier} in this project")
+    return row
+
+
+def _routes(kind: str, a: str, prefix: str) -> APIRouter:
+    """Return the routes that captures and environments have alike; `kind` is their word, `a` the same with its article."""
+    router = APIRouter(prefix=f"/v1/{kind}s", tags=[f"{kind}s"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
+    one, is_id = f"/{{{kind}}}", pattern(prefix)
+
+    @router.get("", name=f"list_{kind}s", summary=f"List {kind}s, the newest first", responses=responses(404),
+                description=f"List the {kind}s of the project, one page at a time.")
+    def list_intakes(service: ServiceDep, caller: Reader, limit: Limit = 100,
+                     before: Annotated[str | None, Query(pattern=is_id)] = None) -> IntakePage:
+        after = None
+        if before is not None:
+            row = row_of(service, caller, before)
+            after = row["created_at"], row["id"]
+        rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
+        return IntakePage(items=[intake_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+
+    @router.get(one, name=f"get_{kind}", summary=f"Look at {a}", responses=responses(404),
+                description=f"Return the state of {a} and the facts that its check found.")
+    def get_intake(service: ServiceDep, caller: Reader, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> IntakeView:
+        return intake_view(row_of(service, caller, intake))
+
+    @router.post(f"{one}/validate", name=f"validate_{kind}", status_code=202, summary=f"Check an uploaded {kind}",
+                 responses=responses(404, 409, 507), description="Accept no more files, and check names, headers and, of a capture, the "
+                 f"manifest; jobs may use the {kind} when it is ready.")
+    def validate_intake(service: ServiceDep, caller: Writer, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> IntakeView:
+        before = row_of(service, caller, intake)
+
+        def work(connection: sa.Connection) -> bool:
+            if not intakes.begin_check(connection, intake):
+                return False
+            if (file := uploads.unfinished(connection, intake)) is not None:
+                raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
+            submit(service, caller, CheckJob(kind="check", intake=intake), connection, [intake])
+            audit.record(connection, caller, "intake.validate", intake)
+            return True
+
+        if not service.database.transact(work):
+            raise ApiError("conflict", f"{intake} is {before['state']} already")
+        return intake_view(row_of(service, caller, intake))
+
+    @router.delete(one, name=f"delete_{kind}", status_code=204, summary=f"Delete {a}", responses=responses(404, 409),
+                   description=f"Delete {a} that no queued or running job reads; what was registered stays where it lies.")
+    def delete_intake(service: ServiceDep, caller: Writer, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> None:
+        row = row_of(service, caller, intake)
+        if row["state"] == states.CHECKING:
+            raise ApiError("conflict", f"{intake} is being checked")
+
+        def work(connection: sa.Connection) -> list[str] | None:
+            if users := jobs.users_of(connection, intake, active=True):
+                raise ApiError("conflict", f"{intake} is read by {users[0]}, which has not ended")
+            audit.record(connection, caller, "intake.delete", intake)
+            return intakes.remove(connection, intake)
+
+        parts = service.database.transact(work)
+        if parts is not None and row["folder"] is None:
+            for upload in parts:
+                service.parts.discard(upload)
+            service.storage.remove(layout.intake(caller.project, intake))
+
+    return router
+
+
+captures, environments = _routes("capture", "a capture", CAPTURE), _routes("environment", "an environment", ENVIRONMENT)
+
+
 @captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
 def create_capture(service: ServiceDep, caller: Writer, response: Response, wanted: Annotated[NewCapture, Body(
         openapi_examples={"upload": {"value": {"name": "owl"}}, "register": {"value": {"name": "owl", "folder": "/captures/owl"}}})],
                    token: IdempotencyKey = None) -> IntakeView:
     """Create a capture, whose files are then uploaded; or register a folder of the server, which is checked at once."""
-    folder = None if wanted.folder is None else _registered(service, caller, "folder", wanted.folder)
-    if folder is not None and not os.path.isdir(folder):
-        raise ApiError("invalid", "folder: there is no such folder")
+    folder = _registered(service, caller, "folder", wanted.folder, os.path.isdir)
     return _create(service, caller, CAPTURE, wanted.name, folder, token, response)
 
 
@@ -70,85 +138,28 @@ def create_environment(service: ServiceDep, caller: Writer, response: Response, 
         openapi_examples={"upload": {"value": {"name": "sky"}}, "register": {"value": {"name": "sky", "file": "/hdr/sky.exr"}}})],
                        token: IdempotencyKey = None) -> IntakeView:
     """Create an environment, whose one lat-long image is then uploaded; or register a file of the server, which is checked at once."""
-    file = None if wanted.file is None else _registered(service, caller, "file", wanted.file)
-    if file is not None and not os.path.isfile(file):
-        raise ApiError("invalid", "file: there is no such file")
+    file = _registered(service, caller, "file", wanted.file, os.path.isfile)
     return _create(service, caller, ENVIRONMENT, wanted.name, file, token, response)
 
 
-@captures.get("", responses=responses(404), summary="List captures, the newest first")
-def list_captures(service: ServiceDep, caller: Reader, limit: Limit = 100, before: CaptureId | None = None) -> IntakePage:
-    """List the captures of the project, one page at a time."""
-    return _page(service, caller, CAPTURE, limit, before)
-
-
-@environments.get("", responses=responses(404), summary="List environments, the newest first")
-def list_environments(service: ServiceDep, caller: Reader, limit: Limit = 100, before: EnvironmentId | None = None) -> IntakePage:
-    """List the environments of the project, one page at a time."""
-    return _page(service, caller, ENVIRONMENT, limit, before)
-
-
-@captures.get("/{capture}", responses=responses(404), summary="Look at a capture")
-def get_capture(service: ServiceDep, caller: Reader, capture: CaptureId) -> IntakeView:
-    """Return the state of a capture and the facts that its check found."""
-    return intake_view(row_of(service, caller, capture))
-
-
-@environments.get("/{environment}", responses=responses(404), summary="Look at an environment")
-def get_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> IntakeView:
-    """Return the state of an environment and the facts that its check found."""
-    return intake_view(row_of(service, caller, environment))
-
-
-@captures.post("/{capture}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded capture")
-def validate_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> IntakeView:
-    """Accept no more files, and check manifest, names and headers; jobs may use the capture when it is ready."""
-    return _validate(service, caller, capture)
-
-
-@environments.post("/{environment}/validate", status_code=202, responses=responses(404, 409, 507), summary="Check an uploaded environment")
-def validate_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> IntakeView:
-    """Accept no more files, and check the image's header; jobs may use the environment when it is ready."""
-    return _validate(service, caller, environment)
-
-
-@captures.delete("/{capture}", status_code=204, responses=responses(404, 409), summary="Delete a capture")
-def delete_capture(service: ServiceDep, caller: Writer, capture: CaptureId) -> None:
-    """Delete a capture that no queued or running job reads; a registered folder stays where it lies."""
-    _delete(service, caller, capture)
-
-
-@environments.delete("/{environment}", status_code=204, responses=responses(404, 409), summary="Delete an environment")
-def delete_environment(service: ServiceDep, caller: Writer, environment: EnvironmentId) -> None:
-    """Delete an environment that no queued or running job reads; a registered file stays where it lies."""
-    _delete(service, caller, environment)
-
-
-def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
-    """Return the row of a capture or environment of the caller's project.
-
-    Raises:
-        ApiError: the project has no such capture or environment.
-    """
-    row = intakes.find(service.database, identifier, caller.project)
-    if row is None:
-        raise ApiError("not-found", f"there is no {identifier} in this project")
-    return row
-
-
-def _registered(service: Service, caller: Caller, field: str, given: str) -> Path:
+def _registered(service: Service, caller: Caller, field: str, given: str | None, exists: Callable[[FilePath], bool]) -> FilePath | None:
+    """Return the folder or file of the server that is to be registered, or refuse the request; None: nothing is."""
+    if given is None:
+        return None
     if not caller.may(Scope.ADMIN):
         raise ApiError("forbidden", f"{field}: the key has the scope {caller.scope}, to register what lies on the server needs admin")
-    path = Path(given)
+    path = FilePath(given)
     if not path.is_absolute() or ".." in path.parts:
         raise ApiError("invalid", f"{field}: give an absolute path of the server, without ..")
     place = resolved(path)
     if place is None or not any(place.is_relative_to(root) for root in service.settings.roots_of(caller.project)):
         raise ApiError("invalid", f"{field}: lies in none of the folders that the operator allows")
+    if not exists(place):
+        raise ApiError("invalid", f"{field}: there is no such {field}")
     return place
 
 
-def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Path | None, token: str | None,
+def _create(service: Service, caller: Caller, prefix: str, name: str, folder: FilePath | None, token: str | None,
             response: Response) -> IntakeView:
     service.limiter.take(caller.key, CREATION_COST - 1)  # as a request it has taken one token already
     require_space(service, FOR_WORK)
@@ -167,47 +178,3 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Pa
     identifier, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
     return intake_view(row_of(service, caller, identifier))
-
-
-def _page(service: Service, caller: Caller, prefix: str, limit: int, before: str | None) -> IntakePage:
-    after = None
-    if before is not None:
-        row = row_of(service, caller, before)
-        after = row["created_at"], row["id"]
-    rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
-    return IntakePage(items=[intake_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
-
-
-def _validate(service: Service, caller: Caller, identifier: str) -> IntakeView:
-    before = row_of(service, caller, identifier)
-
-    def work(connection: sa.Connection) -> bool:
-        if not intakes.begin_check(connection, identifier):
-            return False
-        if (file := uploads.unfinished(connection, identifier)) is not None:
-            raise ApiError("conflict", f"{identifier}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
-        submit(service, caller, CheckJob(kind="check", intake=identifier), connection, [identifier])
-        audit.record(connection, caller, "intake.validate", identifier)
-        return True
-
-    if not service.database.transact(work):
-        raise ApiError("conflict", f"{identifier} is {before['state']} already")
-    return intake_view(row_of(service, caller, identifier))
-
-
-def _delete(service: Service, caller: Caller, identifier: str) -> None:
-    row = row_of(service, caller, identifier)
-    if row["state"] == states.CHECKING:
-        raise ApiError("conflict", f"{identifier} is being checked")
-
-    def work(connection: sa.Connection) -> list[str] | None:
-        if users := jobs.users_of(connection, identifier, active=True):
-            raise ApiError("conflict", f"{identifier} is read by {users[0]}, which has not ended")
-        audit.record(connection, caller, "intake.delete", identifier)
-        return intakes.remove(connection, identifier)
-
-    parts = service.database.transact(work)
-    if parts is not None and row["folder"] is None:
-        for upload in parts:
-            service.parts.discard(upload)
-        service.storage.remove(layout.intake(caller.project, identifier))

@@ -10,16 +10,16 @@ from fastapi.openapi.models import Example
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, TypeAdapter
 from pydantic_core import CoreSchema, core_schema
 
+from service.requests import states
+from service.requests.answers import JobLog, JobPage, JobView
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import JobId
 from service.requests.jobs import CheckJob, UserJob
-from service.requests.views import states
-from service.requests.views.jobs import JobLog, JobPage, JobView
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
-from service.server.api.views import job_view, log_view
+from service.server.api.views import job_view
 from service.server.database import audit, idempotency, jobs, quotas
 from service.server.database.keys import Caller
 from service.server.storage import layout
@@ -41,14 +41,13 @@ EXAMPLES: dict[str, Example] = {
 
 
 class StrictJson:
-    """Annotation of a body that is read as JSON, without conversions: "5" is not taken for 5, nor 1 for true.
+    """Annotation of a body that is read as JSON of the given type, without conversions: "5" is not taken for 5, nor 1 for true.
 
     FastAPI gives Pydantic Python objects, and of these it converts values, which the OpenAPI document does not promise. Its strict mode
     works for JSON text only: of Python objects it refuses every list for a tuple and every text for an enumeration.
     """
 
     def __init__(self, kind: Any) -> None:
-        """Args: kind: the type to read, of which the annotated type is a base."""
         self._kind, self._adapter = kind, TypeAdapter[Any](kind)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -110,7 +109,7 @@ def get_job(service: ServiceDep, caller: Reader, job: JobName) -> JobView:
 def get_log(service: ServiceDep, caller: Reader, job: JobName) -> JobLog:
     """Return what happened to a job and when: its stages, workers that it lost, and how it ended."""
     view(service, caller, job)
-    return log_view(jobs.log_of(service.database, job))
+    return JobLog.model_validate({"entries": [dict(row) for row in jobs.log_of(service.database, job)]})
 
 
 @router.post("/{job}/cancel", status_code=202, responses=responses(404, 409), summary="Cancel a job")
@@ -171,11 +170,7 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
 
 
 def view(service: Service, caller: Caller, job: str) -> JobView:
-    """Return a job of the caller's project.
-
-    Raises:
-        ApiError: the project has no such job.
-    """
+    """Return a job of the caller's project, or refuse the request."""
     row = jobs.find(service.database, job, caller.project)
     if row is None:
         raise ApiError("not-found", f"there is no {job} in this project")

@@ -50,12 +50,7 @@ class _JsonRequest(Request):
 
 
 def parse(body: bytes) -> Any:
-    """Return what a body of JSON says.
-
-    Raises:
-        HTTPException: the body is nested too deeply, has an object with too many fields, or is not UTF-8 text.
-        JSONDecodeError: the body is not JSON.
-    """
+    """Return what a body of JSON says; refuse one that is nested too deeply, has too many fields, or is not UTF-8 text."""
     try:
         found = json.loads(body.decode(), object_pairs_hook=_object)
     except UnicodeDecodeError:

@@ -23,7 +23,6 @@ class RateLimiter:
     """A token bucket for each key, in this process."""
 
     def __init__(self, per_second: float, burst: int, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Args: per_second: tokens that a bucket gains. burst: tokens that it holds. clock: returns seconds."""
         self._per_second, self._burst, self._clock = per_second, burst, clock
         self._buckets: dict[str | None, tuple[float, float]] = {}  # tokens, and when they were counted
         self._lock = threading.Lock()
@@ -33,11 +32,7 @@ class RateLimiter:
         return len(self._buckets)
 
     def take(self, key: str | None, cost: int = 1) -> None:
-        """Take tokens from the bucket of a key: `cost` of them, or all that the bucket holds if that is less.
-
-        Raises:
-            ApiError: there are fewer in the bucket.
-        """
+        """Take `cost` tokens from the bucket of a key, or all that it holds if that is less; refuse if there are fewer in it."""
         now, cost = self._clock(), min(cost, self._burst)
         with self._lock:
             tokens = self._tokens(key, now)
@@ -49,11 +44,7 @@ class RateLimiter:
         self._refuse(tokens, cost)
 
     def require(self, key: str | None) -> None:
-        """Take nothing from the bucket of a key, of which it need not be known whether it is right.
-
-        Raises:
-            ApiError: the bucket is empty.
-        """
+        """Refuse a key whose bucket is empty, and take nothing; whether the key is right need not be known."""
         if key in self._buckets and (tokens := self._tokens(key, self._clock())) < 1:
             self._refuse(tokens, 1)
 
@@ -74,16 +65,11 @@ class AtOnce:
     """Counts what each holder (a key or a project) has under way in this process. Everything runs in the event loop."""
 
     def __init__(self, most: int, what: str) -> None:
-        """Args: most: of one holder. what: is counted, as a refusal names it."""
         self._most, self._what = most, what
         self._running: Counter[str | None] = Counter()
 
     def enter(self, holder: str | None) -> None:
-        """Count one more, which `leave` must end.
-
-        Raises:
-            ApiError: the holder has as many as it may.
-        """
+        """Count one more, which `leave` must end; refuse a holder that has as many as it may."""
         if self._running[holder] >= self._most:
             raise ApiError("too-many", f"{self._most} {self._what}", headers={"Retry-After": str(RETRY_S)})
         self._running[holder] += 1

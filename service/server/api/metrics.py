@@ -15,7 +15,7 @@ from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from service import __version__
-from service.requests.views.states import ACTIVE, ENDED
+from service.requests.states import ACTIVE, ENDED
 from service.server.base.settings import Settings
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database
@@ -32,7 +32,6 @@ class Metrics:
     """The metrics of one API process, and those from the database."""
 
     def __init__(self, settings: Settings, database: Database) -> None:
-        """Args: settings, database: of the service."""
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         GCCollector(registry=self._registry)

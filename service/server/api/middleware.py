@@ -26,7 +26,6 @@ class RequestLog:
     """Gives every request an identifier, which its answer and its lines in the log carry, and counts it for /metrics."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        """Args: app: the next application. metrics: of this process."""
         self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -80,7 +79,6 @@ class Bodies:
     """
 
     def __init__(self, app: ASGIApp) -> None:
-        """Args: app: the next application."""
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -93,11 +91,11 @@ class Bodies:
         if scope["type"] != "http" or scope["path"].startswith(UPLOADS):
             await self._app(scope, receive, send)
             return
-        length = headers.get(b"content-length", b"0")
+        length, kind = headers.get(b"content-length", b"0"), headers.get(b"content-type", b"").partition(b";")[0].strip().lower()
         if int(length) > MAX_BYTES:  # the server has refused a length that is not a number
             await answer(Request(scope), "too-large", TOO_LARGE)(scope, receive, send)
             return
-        if (int(length) > 0 or b"transfer-encoding" in headers) and not _is_json(headers.get(b"content-type", b"")):
+        if (int(length) > 0 or b"transfer-encoding" in headers) and kind != b"application/json":
             await answer(Request(scope), "unsupported-media-type", "the body must be JSON: send Content-Type: application/json")(
                 scope, receive, send)
             return
@@ -112,7 +110,3 @@ class Bodies:
             return message
 
         await self._app(scope, limited, send)
-
-
-def _is_json(content_type: bytes) -> bool:
-    return content_type.partition(b";")[0].strip().lower() == b"application/json"

@@ -31,7 +31,6 @@ class Readiness:
     """The last result of the readiness checks."""
 
     def __init__(self) -> None:
-        """Create it without a result."""
         self._lock = threading.Lock()
         self._looked_at, self._wrong = -KEEP_S, list[str]()
 

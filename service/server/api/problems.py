@@ -84,10 +84,9 @@ class Problem(BaseModel):
 
 
 class ApiError(Exception):
-    """Raised to refuse a request."""
+    """Raised to refuse a request, with a kind of KINDS, one sentence, and headers of the answer."""
 
     def __init__(self, kind: str, detail: str, *, headers: Mapping[str, str] | None = None) -> None:
-        """Args: kind: name in KINDS. detail: one sentence. headers: of the answer."""
         super().__init__(detail)
         self.kind, self.detail, self.headers = kind, detail, dict(headers or {})
 
@@ -113,19 +112,17 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestError)
     async def unasked(request: Request, error: RequestError) -> JSONResponse:
-        return answer(request, "invalid", sentence(error))
-
-    @app.exception_handler(QuotaExceeded)
-    async def beyond_quota(request: Request, error: QuotaExceeded) -> JSONResponse:
-        if error.quota == BYTES:
-            return answer(request, "too-large", str(error))
-        return answer(request, "too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)})
+        if isinstance(error, QuotaExceeded) and error.quota != BYTES:
+            return answer(request, "too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)})
+        return answer(request, "too-large" if isinstance(error, QuotaExceeded) else "invalid", sentence(error))
 
     @app.exception_handler(HTTPException)
     async def routed(request: Request, error: HTTPException) -> JSONResponse:
         kind, headers = OF_STATUS.get(error.status_code, "bad-request"), dict(error.headers or {})
         if error.status_code == KINDS["method-not-allowed"].status:
-            headers["Allow"] = ", ".join(_allowed(request))
+            path = request.scope["path"]  # the router names the methods of its first route alone
+            found = (route.methods or () for route in iter_route_contexts(request.app.routes) if route.path_regex.match(path))
+            headers["Allow"] = ", ".join(sorted({method for methods in found for method in methods}))
         return answer(request, kind, str(error.detail or HTTPStatus(error.status_code).phrase), headers=headers)
 
     @app.exception_handler(StorageError)
@@ -145,13 +142,6 @@ def install(app: FastAPI) -> None:
 def plain(text: str) -> str:
     """Return text that can be sent: cut to MAX_TEXT, and with halves of characters, which UTF-8 does not have, written as escapes."""
     return text[:MAX_TEXT].encode("utf-8", "backslashreplace").decode()
-
-
-def _allowed(request: Request) -> list[str]:
-    """Return the methods of all routes of a path; the router names those of the first only."""
-    path = request.scope["path"]
-    found = (route.methods or () for route in iter_route_contexts(request.app.routes) if route.path_regex.match(path))
-    return sorted({method for methods in found for method in methods})
 
 
 def answer(request: Request, kind: str, detail: str, *, faults: list[Fault] | None = None,

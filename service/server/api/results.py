@@ -19,9 +19,9 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
+from service.requests.answers import ResultPage
 from service.requests.base.identifiers import EnvironmentId
-from service.requests.views.jobs import ResultPage
-from service.requests.views.states import READY
+from service.requests.states import READY
 from service.server.api.context import Reader, ServiceDep
 from service.server.api.intakes import row_of
 from service.server.api.jobs import JobName, view
@@ -68,11 +68,7 @@ class Opened(NamedTuple):
 
 
 def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, name: Name) -> Iterator[Opened]:
-    """Open a result until the answer has been sent.
-
-    Raises:
-        ApiError: there is no such result.
-    """
+    """Open a result until the answer has been sent, or refuse the request."""
     view(service, caller, job)
     nothing = ApiError("not-found", f"{job} has no such result")
     try:
@@ -91,11 +87,7 @@ def opened(service: ServiceDep, caller: Reader, request: Request, job: JobName, 
 
 
 def opened_environment(service: ServiceDep, caller: Reader, environment: EnvironmentId) -> Iterator[Opened]:
-    """Open the image of an environment until the answer has been sent.
-
-    Raises:
-        ApiError: the project has no such environment, it is not ready, or its file is not there any more.
-    """
+    """Open the image of an environment until the answer has been sent, or refuse the request."""
     row = row_of(service, caller, environment)
     if row["state"] != READY:
         raise ApiError("conflict", f"{environment} is {row['state']}, not ready")
@@ -180,13 +172,7 @@ def _names(header: str, etag: str, *, strong: bool) -> bool:
 
 
 def _part(header: str, file: Opened) -> range | None:
-    """Return the bytes of a file that a Range header names, or None where it is not read.
-
-    A server may ignore the header (RFC 9110, 14.2). This one does so where it is malformed, and where it names several ranges.
-
-    Raises:
-        ApiError: the range lies outside the file.
-    """
+    """Return the bytes that a Range header names; None where it is malformed or names several, which may be ignored (RFC 9110, 14.2)."""
     found = RANGE.fullmatch(header)
     if found is None:
         return None

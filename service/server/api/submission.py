@@ -4,27 +4,13 @@ from collections.abc import Sequence
 
 import sqlalchemy as sa
 
+from service.requests import jobs as asked
+from service.requests import states
 from service.requests.base.base import JobRequest, SequenceOptions
 from service.requests.calibration_jobs import TofCalibrationJob
 from service.requests.export import AssetFormat
-from service.requests.jobs import (
-    CheckJob,
-    DepthJob,
-    ExportJob,
-    FuseJob,
-    GaugeBoardJob,
-    InspectBoardJob,
-    JoinJob,
-    PipelineJob,
-    RegisterJob,
-    RelightJob,
-    ShadeJob,
-    SolveJob,
-    ViewJob,
-)
 from service.requests.light.frame_range import frame_numbers
 from service.requests.relight import RelightOptions
-from service.requests.views import states
 from service.server.api.context import Service
 from service.server.api.problems import ApiError
 from service.server.base import telemetry
@@ -35,7 +21,7 @@ from service.server.jobs.context import SEQUENCE
 QUEUE_RETRY_S = 30
 SOLVES = ("solve", "pipeline")
 """Kinds of jobs that solve maps."""
-OF_SEQUENCES = (SolveJob, DepthJob, PipelineJob, RelightJob, ViewJob, TofCalibrationJob)
+OF_SEQUENCES = (asked.SolveJob, asked.DepthJob, asked.PipelineJob, asked.RelightJob, asked.ViewJob, TofCalibrationJob)
 """Jobs whose capture may be a sequence of captures."""
 TIME_SAMPLED: tuple[AssetFormat, ...] = ("usdz", "usdc")
 """Formats of the asset of a sequence."""
@@ -46,7 +32,7 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
     job = service.queue.submit(connection, project=caller.project, key=caller.key, request=request, inputs=inputs,
                               chunk_frames=service.settings.chunk_frames, trace=telemetry.current())
     require_queue(service, caller, connection)
-    if not isinstance(request, CheckJob):  # of which there is one for each capture
+    if not isinstance(request, asked.CheckJob):  # of which there is one for each capture
         quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)  # it is counted already
         quotas.require(connection, service.settings, quotas.BYTES, caller.project, 0)
     audit.record(connection, caller, "job.submit", job)
@@ -54,22 +40,14 @@ def submit(service: Service, caller: Caller, request: JobRequest, connection: sa
 
 
 def require_queue(service: Service, caller: Caller, connection: sa.Connection) -> None:
-    """Refuse, and so roll back the transaction, if the caller's key has too many queued jobs.
-
-    Raises:
-        ApiError: more than `max_queued` jobs are queued.
-    """
+    """Refuse, and so roll back the transaction, if more than `max_queued` jobs of the caller's key are queued."""
     most = service.settings.max_queued
     if jobs.count_queued(connection, caller.project, caller.key) > most:
         raise ApiError("too-many", f"{most} jobs of this key have not begun", headers={"Retry-After": str(QUEUE_RETRY_S)})
 
 
 def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
-    """Return the identifiers of the captures, environments and jobs that a job reads.
-
-    Raises:
-        ApiError: one of them does not exist or is not ready.
-    """
+    """Return the identifiers of the captures, environments and jobs that a job reads; refuse one that does not exist or is not ready."""
     read = []
     for field in ("capture", "captures", "environment", "reference_ball", "beside", "rig", "apply_to"):
         value = getattr(request, field, None)
@@ -78,46 +56,46 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
             if steps and not (field == "capture" and isinstance(request, OF_SEQUENCES)):
                 raise ApiError("invalid", f"{field}: {identifier} is a sequence of {steps} captures: give one capture here; "
                                           "solve, depth, relight and pipeline take sequences")
-            if field == "capture" and isinstance(request, SolveJob | DepthJob | PipelineJob):
+            if field == "capture" and isinstance(request, asked.SolveJob | asked.DepthJob | asked.PipelineJob):
                 _require_sequence(request, steps)
-            if isinstance(request, ViewJob):
+            if isinstance(request, asked.ViewJob):
                 _require_step(request, steps)
             read.append(identifier)
-    if isinstance(request, RelightJob | ShadeJob | ExportJob | ViewJob) and request.maps is not None:
-        kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, ExportJob | ViewJob) else ()))
-        of_sequences = isinstance(request, RelightJob | ExportJob) or (isinstance(request, ViewJob) and request.step is not None)
+    if isinstance(request, asked.RelightJob | asked.ShadeJob | asked.ExportJob | asked.ViewJob) and request.maps is not None:
+        kinds = (*SOLVES, "join", *(("depth",) if isinstance(request, asked.ExportJob | asked.ViewJob) else ()))
+        of_sequences = request.step is not None if isinstance(request, asked.ViewJob) else not isinstance(request, asked.ShadeJob)
         row = _require_results(service, project, "maps", request.maps, kinds, sequences=of_sequences)
-        if isinstance(request, ViewJob) and request.step is not None and SEQUENCE not in row["finished_steps"]:
+        if isinstance(request, asked.ViewJob) and request.step is not None and SEQUENCE not in row["finished_steps"]:
             raise ApiError("invalid", f"maps: {request.maps} is of one capture, and {request.capture} is a sequence: give a job of it")
-        if isinstance(request, ExportJob) and SEQUENCE in row["finished_steps"]:
+        if isinstance(request, asked.ExportJob) and SEQUENCE in row["finished_steps"]:
             _require_format(request.format)
         read.append(request.maps)
-    if isinstance(request, JoinJob):
+    if isinstance(request, asked.JoinJob):
         _require_results(service, project, "maps", request.maps, SOLVES)
         _require_results(service, project, "depth", request.depth, ("depth",))
         read += [request.maps, request.depth]
-    if isinstance(request, RegisterJob):
+    if isinstance(request, asked.RegisterJob):
         read += _require_scans(service, project, request)
-    if isinstance(request, FuseJob):
+    if isinstance(request, asked.FuseJob):
         row = _require_results(service, project, "registered", request.registered, ("register",))
-        read += [request.registered, *_require_scans(service, project, RegisterJob.model_validate(row["request"]))]
-    if isinstance(request, InspectBoardJob) and request.golden is not None:
+        read += [request.registered, *_require_scans(service, project, asked.RegisterJob.model_validate(row["request"]))]
+    if isinstance(request, asked.InspectBoardJob) and request.golden is not None:
         _require_results(service, project, "golden", request.golden, (request.kind,))
         read.append(request.golden)
-    if isinstance(request, GaugeBoardJob):
+    if isinstance(request, asked.GaugeBoardJob):
         read += _require_inspections(service, project, request)
     return read
 
 
-def _require_sequence(request: SolveJob | DepthJob | PipelineJob, steps: int) -> None:
+def _require_sequence(request: asked.SolveJob | asked.DepthJob | asked.PipelineJob, steps: int) -> None:
     """Refuse options of sequences for one capture, and assets that cannot hold the steps of a sequence."""
     if not steps and request.sequence != SequenceOptions():
         raise ApiError("invalid", f"sequence: {request.capture} is one capture, and the options are for a sequence of them: leave them out")
-    if steps and isinstance(request, PipelineJob):
+    if steps and isinstance(request, asked.PipelineJob):
         _require_format(request.format)
 
 
-def _require_step(request: ViewJob, steps: int) -> None:
+def _require_step(request: asked.ViewJob, steps: int) -> None:
     """Refuse a view of a sequence that names none of its time steps, and one of a capture that names one."""
     if not steps and request.step is not None:
         raise ApiError("invalid", f"step: {request.capture} is one capture, and no sequence: leave the step out")
@@ -131,17 +109,12 @@ def _require_format(given: AssetFormat) -> None:
 
 
 def spelled_out(service: Service, project: str, request: JobRequest) -> JobRequest:
-    """Return the request with a range of frames in numbers, so that its steps are known before the capture is opened.
-
-    Raises:
-        RequestError: the frames are not a range.
-        ApiError: there are too many frames, or nothing lights them.
-    """
-    if isinstance(request, RelightJob):
+    """Return the request with a range of frames in numbers, so that its steps are known before the capture is opened."""
+    if isinstance(request, asked.RelightJob):
         if request.environment is None and request.keys is None:
             raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights or captured images")
         return request.model_copy(update={"options": _with_frames(service, project, request.capture, request.options)})
-    if isinstance(request, PipelineJob):
+    if isinstance(request, asked.PipelineJob):
         return request.model_copy(update={"relight": _with_frames(service, project, request.capture, request.relight)})
     return request
 
@@ -164,7 +137,7 @@ def _require_ready(service: Service, project: str, field: str, identifier: str) 
     return row
 
 
-def _require_scans(service: Service, project: str, request: RegisterJob) -> list[str]:
+def _require_scans(service: Service, project: str, request: asked.RegisterJob) -> list[str]:
     """Return the identifiers of the jobs whose results are registered, or refuse if one of them is not there any more."""
     for number, identifier in enumerate(request.depths):
         _require_results(service, project, f"depths[{number}]", identifier, ("depth",))
@@ -173,7 +146,7 @@ def _require_scans(service: Service, project: str, request: RegisterJob) -> list
     return [*request.depths, *request.solves]
 
 
-def _require_inspections(service: Service, project: str, request: GaugeBoardJob) -> list[str]:
+def _require_inspections(service: Service, project: str, request: asked.GaugeBoardJob) -> list[str]:
     """Return the identifiers of the jobs that inspected the boards of a study, or refuse if one of them judged no regions."""
     for number, run in enumerate(request.study.runs):
         field = f"study.runs[{number}].result"

@@ -41,11 +41,6 @@ class TokenReader:
     """Reads tokens of one provider."""
 
     def __init__(self, settings: Settings, *, clock: Callable[[], float] = time.time) -> None:
-        """Args: settings: of the service, with `oidc_issuer`. clock: returns seconds since 1970.
-
-        Raises:
-            RequestError: the extra `oidc` is not installed.
-        """
         if importlib.util.find_spec("joserfc") is None:
             raise RequestError("oidc_issuer: tokens need the extra oidc: pip install 'relit[oidc]'")
         self._settings, self._clock = settings, clock
@@ -54,15 +49,7 @@ class TokenReader:
         self._fetched_at = self._tried_at = -STALE_S
 
     def caller(self, token: str, project: str | None) -> Caller | None:
-        """Return who sent a token; None: it is not a valid token of the provider.
-
-        Args:
-            token: as it was sent.
-            project: that the request names, if its token allows several.
-
-        Raises:
-            ApiError: the provider cannot be reached, or the token does not allow the project.
-        """
+        """Return who sent a token, in the project that the request names if the token allows several; None: the token is not valid."""
         claims = self._claims(token)
         if claims is None:
             return None
@@ -77,7 +64,8 @@ class TokenReader:
         if project is None and len(granted) > 1:
             raise ApiError("forbidden", f"the token allows {', '.join(sorted(granted))}: name one in the header {PROJECT_HEADER}")
         chosen = project or next(iter(granted))
-        return Caller(chosen, granted[chosen], _identifier(str(claims["iss"]), str(claims["sub"])), float(claims["exp"]))
+        user = hashlib.sha256(f"{claims['iss']} {claims['sub']}".encode()).hexdigest()  # the same for all tokens of a user
+        return Caller(chosen, granted[chosen], f"oidc_{user[:20]}", float(claims["exp"]))
 
     def _claims(self, token: str) -> dict[str, Any] | None:
         from joserfc import jws, jwt
@@ -135,8 +123,3 @@ def _json(client: httpx2.Client, url: str) -> Any:
             if len(body) > MAX_BYTES:
                 raise ValueError(f"{url} answers with more than {MAX_BYTES} bytes")
     return httpx2.Response(200, content=body).json()
-
-
-def _identifier(issuer: str, subject: str) -> str:
-    """Return the name of a user, which is the same for all tokens of the user."""
-    return f"oidc_{hashlib.sha256(f'{issuer} {subject}'.encode()).hexdigest()[:20]}"

@@ -45,11 +45,7 @@ class Checksum(NamedTuple):
 
     @classmethod
     def of(cls, header: str) -> "Checksum":
-        """Read an Upload-Checksum header.
-
-        Raises:
-            ApiError: the algorithm is unknown, or the digest malformed.
-        """
+        """Read an Upload-Checksum header, or refuse the request."""
         algorithm, _, text = header.partition(" ")
         if algorithm not in ALGORITHMS:
             raise ApiError("bad-request", f"Upload-Checksum: give {' or '.join(ALGORITHMS)}, a space, and the digest in base64")
@@ -67,11 +63,7 @@ class Metadata(NamedTuple):
 
     @classmethod
     def of(cls, header: str) -> "Metadata":
-        """Read an Upload-Metadata header; whether the path is safe is not checked.
-
-        Raises:
-            ApiError: the header is malformed or has an unknown key.
-        """
+        """Read an Upload-Metadata header, or refuse the request; whether the path is safe is not checked."""
         found: dict[str, str] = {}
         for pair in header.split(","):
             key, _, text = pair.strip().partition(" ")
@@ -116,7 +108,6 @@ class TusHeaders:
     """ASGI middleware: answers about uploads, refusals too, name the version of tus; a header may override the method."""
 
     def __init__(self, app: ASGIApp) -> None:
-        """Args: app: the next application."""
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -1,14 +1,22 @@
-"""One PATCH of an upload: its body is appended to the part file, verified, and only then counted."""
+"""One PATCH of an upload: its body is appended to the part file, verified, and only then counted.
 
+The body is in bounded memory on its way to the part file, and is written while more of it arrives.
+"""
+
+import asyncio
 import contextlib
 import hashlib
 import hmac
 import time
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from starlette.requests import ClientDisconnect
 
 from service.server.api.context import FOR_UPLOAD, Service, require_space, require_valid
 from service.server.api.problems import ApiError
 from service.server.api.tus import Checksum
-from service.server.api.upload_body import PartFileWriter
 from service.server.base.log import logger
 from service.server.base.safe_names import shown
 from service.server.database import intakes, uploads
@@ -18,10 +26,111 @@ from service.server.storage import layout
 from service.server.storage.part_files import PartFile, PartFileLocked
 
 BUSY_RETRY_S = 1
+BLOCK = 1 << 20
+"""Bytes that are written at once; two such blocks are in memory."""
+MAX_PIECES = 512
+"""Pieces of a block at most: the system writes 1024 at once, and a client that sends single bytes must not fill the memory."""
+FLUSH_EVERY = 16 << 20
+"""Bytes after which the file is flushed to the disk while more arrive, so that little is left to flush at the end."""
+SAVE_EVERY = 64 << 20
+"""Bytes after which the flushed offset is also recorded."""
+IDLE_S = 60.0
+"""Seconds without a byte after which the client counts as gone; until then the part file is locked, and it cannot continue."""
 
-
+savers = ThreadPoolExecutor(4, thread_name_prefix="relit-save")
+"""Threads that flush, beside those that write."""
 being_written: set[str] = set()
 """Identifiers of the uploads that a PATCH of this process has locked."""
+
+
+class BodyBroken(Exception):
+    """The body did not come to its end; the message is one sentence."""
+
+
+class TooLong(Exception):
+    """More bytes came than the length of the upload."""
+
+
+class PartFileWriter:
+    """Appends blocks to a part file, flushes them, and hashes them in another thread."""
+
+    def __init__(self, part: PartFile, start: int, length: int, *, digests: list[Any], save: Callable[[int], None] | None,
+                 guard: Callable[[], None]) -> None:
+        """Create the writer of a part file that is cut to `start`; `guard` is called from time to time, and raises if no space is left.
+
+        `save` is called with offsets up to which all bytes are on the disk; None: nothing counts before the whole body is verified.
+        """
+        self._part, self._length, self._digests, self._save, self._guard = part, length, digests, save, guard
+        self.at = self._flushed = self._saved = start
+        self._saving: Future[None] | None = None
+
+    async def take(self, pieces: list[bytes]) -> None:
+        """Write and hash one block; the previous one must be finished."""
+        loop = asyncio.get_running_loop()
+        hashing = loop.run_in_executor(None, self._hash, pieces) if self._digests else None
+        try:
+            await loop.run_in_executor(None, self._write, pieces)
+        finally:
+            if hashing is not None:
+                await hashing
+
+    def settle(self) -> None:
+        """Wait for the flush that is under way, and raise its error."""
+        saving, self._saving = self._saving, None
+        if saving is not None:
+            saving.result()
+
+    def _hash(self, pieces: list[bytes]) -> None:
+        for digest in self._digests:
+            for piece in pieces:
+                digest.update(piece)
+
+    def _write(self, pieces: list[bytes]) -> None:
+        size = sum(map(len, pieces))
+        if self.at + size > self._length:
+            raise TooLong
+        self._part.append(pieces)
+        self.at += size
+        if self.at - self._flushed >= FLUSH_EVERY and self.at < self._length:
+            self.settle()
+            self._guard()
+            self._flushed = self.at
+            self._saving = savers.submit(self._flush, self.at)
+
+    def _flush(self, at: int) -> None:
+        self._part.sync()
+        if self._save is not None and at - self._saved >= SAVE_EVERY:
+            self._save(at)
+            self._saved = at
+
+
+async def write_body(stream: AsyncIterator[bytes], writer: PartFileWriter) -> None:
+    """Write a body to a part file, block by block; after BodyBroken or TooLong the bytes that were written stay."""
+    loop = asyncio.get_running_loop()
+    writing: asyncio.Task[None] | None = None
+    block, size = list[bytes](), 0
+    try:
+        async with asyncio.timeout(IDLE_S) as idle:
+            async for chunk in stream:
+                block.append(chunk)
+                size += len(chunk)
+                if size < BLOCK and len(block) < MAX_PIECES:
+                    idle.reschedule(loop.time() + IDLE_S)
+                    continue
+                idle.reschedule(None)  # a slow disk is not the client's fault
+                if writing is not None:
+                    await writing
+                writing, block, size = loop.create_task(writer.take(block)), [], 0
+                idle.reschedule(loop.time() + IDLE_S)
+    except TimeoutError:
+        raise BodyBroken(f"nothing came for {IDLE_S:g} s") from None
+    except ClientDisconnect:
+        raise BodyBroken("the connection ended before the body did") from None
+    finally:
+        if writing is not None:
+            await writing
+        if block:
+            await writer.take(block)
 
 
 class UploadPatch:
@@ -31,14 +140,7 @@ class UploadPatch:
     """
 
     def __init__(self, service: Service, caller: Caller, upload: Row, *, offset: int, checksum: Checksum | None) -> None:
-        """Create the patch; `begin` locks the part file.
-
-        Args:
-            service, caller: of the request.
-            upload: row of the upload, which is read again under the lock.
-            offset: from which the client continues.
-            checksum: of the body; None: the client gave none.
-        """
+        """Create the patch at the offset from which the client continues; `upload` is read again under the lock."""
         self._service, self._caller = service, caller
         self._row, self._offset, self._checksum = upload, offset, checksum
         self._part: PartFile | None = None
@@ -46,11 +148,7 @@ class UploadPatch:
         self._saved = 0
 
     def begin(self) -> None:
-        """Lock the part file and cut off bytes that were not counted.
-
-        Raises:
-            ApiError: it is locked, was deleted, has another offset, or there is no space.
-        """
+        """Lock the part file and cut off bytes that were not counted."""
         try:
             self._part = self._service.parts.open(self._row)
         except PartFileLocked:
@@ -73,17 +171,7 @@ class UploadPatch:
                              guard=self._guard)
 
     def end(self, broken: str | None) -> Row:
-        """Verify and count the bytes that came.
-
-        Args:
-            broken: why the body did not come to its end; None: it did.
-
-        Returns:
-            The row of the upload as it is now.
-
-        Raises:
-            ApiError: a checksum is wrong, the body did not come to its end, or the key was revoked meanwhile.
-        """
+        """Verify and count the bytes that came, and return the row of the upload as it is now; `broken` says why the body did not end."""
         assert self._part is not None
         if self._row["done"]:
             return self._row

@@ -2,33 +2,20 @@
 
 import asyncio
 import time
+from contextlib import closing
 from functools import partial
 from typing import Annotated, Any
 
 import sqlalchemy as sa
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 
-from service.requests.base.identifiers import ENVIRONMENT, UPLOAD, CaptureId, EnvironmentId, UploadId, new_id
-from service.requests.views.intakes import FilePage, FileView
+from service.requests.answers import FilePage, FileView
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, UPLOAD, UploadId, new_id, pattern
+from service.server.api import tus
 from service.server.api.context import FOR_UPLOAD, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import row_of
 from service.server.api.problems import ApiError, responses
-from service.server.api.tus import (
-    ALGORITHMS,
-    CHECKSUM_PATTERN,
-    CONTENT_TYPE,
-    EXTENSIONS,
-    VERSION,
-    Checksum,
-    Metadata,
-    Speaking,
-    documented,
-    expires_at,
-    metadata_header,
-    state_headers,
-)
-from service.server.api.upload_body import BodyBroken, TooLong, write_body
-from service.server.api.upload_patch import UploadPatch, being_written, received_of, settled
+from service.server.api.upload_patch import BodyBroken, TooLong, UploadPatch, being_written, received_of, settled, write_body
 from service.server.base.safe_names import check_path, shown
 from service.server.database import audit, idempotency, intakes, quotas, uploads
 from service.server.database.keys import Caller
@@ -36,7 +23,7 @@ from service.server.database.uploads import Row
 from service.server.storage import layout
 from service.server.storage.part_files import PartFileLocked
 
-router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[Speaking])
+router = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 412, 422, 429, 503), dependencies=[tus.Speaking])
 listings = APIRouter(prefix="/v1", tags=["uploads"], responses=responses(401, 403, 404, 422, 429, 503))
 options = APIRouter(prefix="/v1", tags=["uploads"])
 BREAK_S, LOOK_S = 2.0, 0.02
@@ -50,36 +37,48 @@ UploadMetadata = Annotated[str, Header(
 Limit = Annotated[int, Query(ge=1, le=5000)]
 After = Annotated[str | None, Query(max_length=4096, pattern=r"^[^\x00]*$")]
 CREATED: dict[int | str, dict[str, Any]] = {
-    201: {"description": "Created", "headers": documented("Location", "Upload-Offset", "Upload-Expires")}, **responses(409, 413, 507)}
+    201: {"description": "Created", "headers": tus.documented("Location", "Upload-Offset", "Upload-Expires")}, **responses(409, 413, 507)}
 
 
 @options.options("/uploads", status_code=204, summary="What the server supports of tus",
-                 responses={204: {"headers": documented("Tus-Version", "Tus-Extension", "Tus-Max-Size", "Tus-Checksum-Algorithm")}})
+                 responses={204: {"headers": tus.documented("Tus-Version", "Tus-Extension", "Tus-Max-Size", "Tus-Checksum-Algorithm")}})
 @options.options("/uploads/{upload}", status_code=204, include_in_schema=False)
 @options.options("/captures/{capture}/files", status_code=204, include_in_schema=False)
 @options.options("/environments/{environment}/files", status_code=204, include_in_schema=False)
 def abilities(service: ServiceDep, response: Response) -> None:
     """Return version, extensions and limits."""
-    response.headers.update({"Tus-Version": VERSION, "Tus-Extension": ",".join(EXTENSIONS), "Tus-Checksum-Algorithm": ",".join(ALGORITHMS),
+    response.headers.update({"Tus-Version": tus.VERSION, "Tus-Extension": ",".join(tus.EXTENSIONS),
+                             "Tus-Checksum-Algorithm": ",".join(tus.ALGORITHMS),
                              "Tus-Max-Size": str(service.settings.max_upload_bytes)})
 
 
-@router.post("/captures/{capture}/files", status_code=201, responses=CREATED, summary="Begin to upload a file of a capture")
-def create_capture_file(service: ServiceDep, caller: Writer, response: Response, capture: CaptureId, length: UploadLength,
-                        metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
-    """Create an upload; its file replaces a complete one of the same path, while the capture is receiving or refused."""
-    return _create(service, caller, capture, length, Metadata.of(metadata), token, response)
+def _file_routes(kind: str, a: str, prefix: str) -> None:
+    """Add the routes of the files of captures or environments; `kind` is their word, `a` the same with its article."""
+    path, is_id = f"/{kind}s/{{{kind}}}/files", pattern(prefix)
+
+    @router.post(path, name=f"create_{kind}_file", status_code=201, responses=CREATED, summary=f"Begin to upload a file of {a}",
+                 description=f"Create an upload; its file replaces a complete one of the same path, while the {kind} is receiving or "
+                 "refused.")
+    def create_file(service: ServiceDep, caller: Writer, response: Response, intake: Annotated[str, Path(alias=kind, pattern=is_id)],
+                    length: UploadLength, metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
+        return _create(service, caller, intake, length, tus.Metadata.of(metadata), token, response)
+
+    @listings.get(path, name=f"list_{kind}_files", summary=f"List the files of {a}",
+                  description=f"List the uploaded files, complete or not; a registered {kind} has none.")
+    def list_files(service: ServiceDep, caller: Reader, intake: Annotated[str, Path(alias=kind, pattern=is_id)], limit: Limit = 1000,
+                   after: After = None) -> FilePage:
+        row_of(service, caller, intake)
+        rows = uploads.listing(service.database, intake, limit=limit + 1, after=after)
+        files = [_file_view(service, row) for row in rows[:limit]]
+        return FilePage(files=files, next=files[-1].path if len(rows) > limit else None)
 
 
-@router.post("/environments/{environment}/files", status_code=201, responses=CREATED, summary="Begin to upload the file of an environment")
-def create_environment_file(service: ServiceDep, caller: Writer, response: Response, environment: EnvironmentId, length: UploadLength,
-                            metadata: UploadMetadata, token: IdempotencyKey = None) -> FileView:
-    """Create the upload of the one file of an environment; it replaces a complete one of the same path."""
-    return _create(service, caller, environment, length, Metadata.of(metadata), token, response)
+_file_routes("capture", "a capture", CAPTURE)
+_file_routes("environment", "an environment", ENVIRONMENT)
 
 
 @router.head("/uploads/{upload}", response_class=Response, summary="Look at an upload", responses={
-    200: {"headers": documented("Upload-Offset", "Upload-Length", "Upload-Metadata")}, **responses(410)})
+    200: {"headers": tus.documented("Upload-Offset", "Upload-Length", "Upload-Metadata")}, **responses(410)})
 async def head_upload(service: ServiceDep, caller: Reader, upload: UploadId) -> Response:
     """Return Upload-Offset: the number of bytes that are safe, where the upload is to be continued."""
     deadline = time.monotonic() + BREAK_S
@@ -87,36 +86,33 @@ async def head_upload(service: ServiceDep, caller: Reader, upload: UploadId) -> 
         await asyncio.sleep(LOOK_S)
     row = await asyncio.to_thread(_row, service, caller, upload)
     received = await asyncio.to_thread(received_of, service, row)
-    return Response(headers={**state_headers(row, received, service.settings.upload_hours),
-                             "Upload-Length": str(row["length"]), "Upload-Metadata": metadata_header(row)})
+    return Response(headers={**tus.state_headers(row, received, service.settings.upload_hours),
+                             "Upload-Length": str(row["length"]), "Upload-Metadata": tus.metadata_header(row)})
 
 
 @router.patch("/uploads/{upload}", status_code=204, summary="Continue an upload", openapi_extra={
-    "requestBody": {"required": True, "content": {CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}}}},
-    responses={204: {"headers": documented("Upload-Offset", "Upload-Expires")}, **responses(400, 409, 410, 413, 415, 423, 460, 507)})
+    "requestBody": {"required": True, "content": {tus.CONTENT_TYPE: {"schema": {"type": "string", "format": "binary"}}}}},
+    responses={204: {"headers": tus.documented("Upload-Offset", "Upload-Expires")}, **responses(400, 409, 410, 413, 415, 423, 460, 507)})
 async def patch_upload(
     service: ServiceDep, caller: Writer, request: Request, response: Response, upload: UploadId,
     offset: Annotated[int, Header(alias="Upload-Offset", ge=0, description="Offset of the body: the number of bytes that the server has.")],
     checksum: Annotated[str | None, Header(
-        alias="Upload-Checksum", json_schema_extra={"pattern": CHECKSUM_PATTERN},
+        alias="Upload-Checksum", json_schema_extra={"pattern": tus.CHECKSUM_PATTERN},
         description="`sha1` or `sha256`, a space, and the digest of the body in base64: a body with another digest is dropped.",
         openapi_examples={"none": {"value": "sha1 2jmj7l5rSw0yVb/vlWAYkK/YBwk="}})] = None,
 ) -> None:
     """Append the body to the upload. The last byte completes the file, which is then in the capture."""
-    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != CONTENT_TYPE:
-        raise ApiError("unsupported-media-type", f"Content-Type: give {CONTENT_TYPE}")
-    expected = None if checksum is None else Checksum.of(checksum)
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != tus.CONTENT_TYPE:
+        raise ApiError("unsupported-media-type", f"Content-Type: give {tus.CONTENT_TYPE}")
+    expected = None if checksum is None else tus.Checksum.of(checksum)
     row: Row = await asyncio.to_thread(_row, service, caller, upload)
     announced = request.headers.get("content-length", "0")
     if announced.isdigit() and offset + int(announced) > row["length"]:
         raise _too_long(row)
-    patch = UploadPatch(service, caller, row, offset=offset, checksum=expected)
-    try:
+    with closing(UploadPatch(service, caller, row, offset=offset, checksum=expected)) as patch:
         await asyncio.to_thread(patch.begin)
         row = await _take(patch, request, row)
-    finally:
-        patch.close()
-    response.headers.update(state_headers(row, row["received"], service.settings.upload_hours))
+    response.headers.update(tus.state_headers(row, row["received"], service.settings.upload_hours))
 
 
 @router.delete("/uploads/{upload}", status_code=204, responses=responses(409, 410, 423), summary="Delete an upload")
@@ -141,19 +137,6 @@ def delete_upload(service: ServiceDep, caller: Writer, upload: UploadId) -> None
                 part.drop()
 
 
-@listings.get("/captures/{capture}/files", summary="List the files of a capture")
-def list_capture_files(service: ServiceDep, caller: Reader, capture: CaptureId, limit: Limit = 1000, after: After = None) -> FilePage:
-    """List the uploaded files, complete or not; a registered capture has none."""
-    return _page(service, caller, capture, limit, after)
-
-
-@listings.get("/environments/{environment}/files", summary="List the file of an environment")
-def list_environment_files(service: ServiceDep, caller: Reader, environment: EnvironmentId, limit: Limit = 1000,
-                           after: After = None) -> FilePage:
-    """List the uploaded file, complete or not; a registered environment has none."""
-    return _page(service, caller, environment, limit, after)
-
-
 async def _take(patch: UploadPatch, request: Request, row: Row) -> Row:
     broken = None
     try:
@@ -169,7 +152,7 @@ async def _take(patch: UploadPatch, request: Request, row: Row) -> Row:
     return await asyncio.to_thread(patch.end, broken)
 
 
-def _create(service: Service, caller: Caller, intake: str, length: int, given: Metadata, token: str | None, response: Response,
+def _create(service: Service, caller: Caller, intake: str, length: int, given: tus.Metadata, token: str | None, response: Response,
             ) -> FileView:
     settings = service.settings
     row_of(service, caller, intake)
@@ -209,29 +192,17 @@ def _create(service: Service, caller: Caller, intake: str, length: int, given: M
     if row is None:
         raise ApiError("conflict", f"{upload}: was deleted at the same time")
     if length == 0 and not row["done"]:
-        return _answer(service, _complete_empty(service, caller, row), response)
-    return _answer(service, row, response)
+        with closing(UploadPatch(service, caller, row, offset=0, checksum=None)) as patch:
+            patch.begin()
+            row = patch.end(None)
+    view = _file_view(service, row)
+    response.headers.update({"Location": f"/v1/uploads/{upload}", **tus.state_headers(row, view.received, service.settings.upload_hours)})
+    return view
 
 
 def _file_view(service: Service, row: Row) -> FileView:
     return FileView(upload=row["id"], path=row["path"], length=row["length"], received=received_of(service, row), done=row["done"],
                     sha256=row["sha256"])
-
-
-def _answer(service: Service, row: Row, response: Response) -> FileView:
-    view = _file_view(service, row)
-    response.headers.update({"Location": f"/v1/uploads/{view.upload}",
-                             **state_headers(row, view.received, service.settings.upload_hours)})
-    return view
-
-
-def _complete_empty(service: Service, caller: Caller, row: Row) -> Row:
-    patch = UploadPatch(service, caller, row, offset=0, checksum=None)
-    try:
-        patch.begin()
-        return patch.end(None)
-    finally:
-        patch.close()
 
 
 def _hold(service: Service, caller: Caller, connection: sa.Connection, intake: str) -> None:
@@ -261,14 +232,7 @@ def _row(service: Service, caller: Caller, upload: str) -> Row:
 
 
 def _expired(service: Service, row: Row) -> bool:
-    return not row["done"] and expires_at(row, service.settings.upload_hours) < time.time()
-
-
-def _page(service: Service, caller: Caller, intake: str, limit: int, after: str | None) -> FilePage:
-    row_of(service, caller, intake)
-    rows = uploads.listing(service.database, intake, limit=limit + 1, after=after)
-    files = [_file_view(service, row) for row in rows[:limit]]
-    return FilePage(files=files, next=files[-1].path if len(rows) > limit else None)
+    return not row["done"] and tus.expires_at(row, service.settings.upload_hours) < time.time()
 
 
 def _too_long(row: Row) -> ApiError:

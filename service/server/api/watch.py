@@ -8,7 +8,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from service.requests.base.identifiers import JOB, KEY
-from service.requests.views.states import ENDED
+from service.requests.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.api.views import job_view
 from service.server.base.log import logger
@@ -40,7 +40,7 @@ class Listener:
     """A listener to a job or to all jobs of a project. It keeps only the last change of each job."""
 
     def __init__(self, topic: str, after: int, caller: Caller | None = None) -> None:
-        """Args: topic: a job or a project. after: revision of the job that the client has. caller: who listens; None: this program."""
+        """Listen to a job or a project; `after` is the revision of the job that the client has. Without a caller it is this program."""
         self.topic, self.caller, self.fresh = topic, caller, True
         self._after = after
         self._pending: dict[str, Change] = {}
@@ -78,7 +78,6 @@ class Watcher:
     """Queries the jobs that have listeners. Everything except the queries runs in the event loop."""
 
     def __init__(self, database: Database, closing: threading.Event, *, most: int = MAX_STREAMS) -> None:
-        """Args: database: of the service. closing: set when the service ends, and streams with it. most: listeners at most."""
         self._database, self._closing, self._most = database, closing, most
         self._listeners: dict[str, set[Listener]] = {}
         self._seen: dict[str, tuple[str, int]] = {}  # project and revision of jobs as they were told last
@@ -86,16 +85,7 @@ class Watcher:
         self._keys_until = 0.0
 
     def listen(self, topic: str, *, after: int = 0, caller: Caller | None = None) -> Listener:
-        """Add a listener, which `remove` must remove.
-
-        Args:
-            topic: a job; or a project, for all its jobs that have not ended or ended lately.
-            after: revision of the job that the client has.
-            caller: who listens, whose stream ends with the key; None: this program.
-
-        Raises:
-            ApiError: there are too many listeners, or the service ends.
-        """
+        """Add a listener to a job, or to the jobs of a project that have not ended or ended lately; `remove` must remove it."""
         if self._closing.is_set() or len(self._all()) >= self._most:
             raise ApiError("unavailable", "no further stream of events can be opened here now", headers={"Retry-After": str(RETRY_S)})
         listener = Listener(topic, after, caller)

@@ -6,13 +6,9 @@ from pathlib import Path
 
 
 def take(path: Path, mode: int = 0o600) -> int | None:
-    """Lock a file, which is created if there is none; its folder must exist, and its path must be no link.
+    """Lock a file, which is created if there is none, and return its descriptor; None: another process has the lock.
 
-    Returns:
-        The descriptor, open for reading and writing; closing it releases the lock. None: another process has the lock.
-
-    Raises:
-        OSError: the file cannot be opened.
+    Its folder must exist, and its path must be no link. Closing the descriptor releases the lock.
     """
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, mode)

@@ -28,11 +28,7 @@ REFUSED = (401, 429, 503)
 
 
 def configure(level: str, form: str) -> None:
-    """Log to standard error, from a level on and as json or text, the warnings of libraries too.
-
-    One of pydantic is left out: FastAPI gives a body its parameter's name as an alias, and leaves the warning out itself only where the
-    schema is built at once, not at the first request.
-    """
+    """Log to standard error, from a level on and as json or text, the warnings of libraries too, but not that of FastAPI's bodies."""
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.stdlib.add_log_level,
@@ -52,6 +48,7 @@ def configure(level: str, form: str) -> None:
     root.handlers[:] = [handler]
     root.setLevel(logging.WARNING)  # of libraries
     logging.captureWarnings(True)
+    # FastAPI gives a body its parameter's name as an alias, and leaves this warning out only where the schema is built at once
     warnings.filterwarnings("ignore", "The 'alias' attribute", UnsupportedFieldAttributeWarning)
     logging.getLogger("relit").setLevel(level.upper())
     structlog.configure(processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
@@ -71,7 +68,6 @@ class Repeats(logging.Filter):
     """Lets REPEATS records of a kind through in EVERY_S, and then the number of the others."""
 
     def __init__(self) -> None:
-        """Create the filter."""
         super().__init__()
         self._lock = threading.Lock()
         self._seen: dict[tuple[Hashable, ...], tuple[float, int]] = {}  # when the first record of a kind came, and how many since

@@ -32,19 +32,14 @@ class NameFault(RequestError):
 
 
 def check_path(path: str) -> None:
-    """Refuse a path within a capture, with / between folders, that is not safe on every system.
-
-    Raises:
-        NameFault: the path is not safe.
-    """
+    """Raise NameFault if a path within a capture, with / between folders, is not safe on every system."""
     if fault := _fault(path):
         raise NameFault(f"path {shown(path)}: {fault}")
 
 
 def shown(path: str) -> str:
     """Return a name for a sentence: in quotes, with unprintable characters as escapes, and shortened."""
-    plain = (character if character.isprintable() else ascii(character)[1:-1] for character in path[:SHOWN])
-    text = "".join(plain)
+    text = "".join(character if character.isprintable() else ascii(character)[1:-1] for character in path[:SHOWN])
     return f'"{text}"' if len(path) <= SHOWN else f'"{text}…"'
 
 

@@ -18,8 +18,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, PydanticBaseSettingsSource, SettingsConfigDict
 
 from service.errors import RequestError
-from service.requests.base.address import DEFAULT_PORT
-from service.requests.base.identifiers import PROJECT_PATTERN
+from service.requests.base.identifiers import DEFAULT_PORT, PROJECT_PATTERN
 from service.requests.keys import Scope
 from stage.model import Count, Positive
 
@@ -65,12 +64,7 @@ QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_
 
 
 def _reader(pattern: str, form: str) -> BeforeValidator:
-    """Return a validator that takes a text apart.
-
-    Args:
-        pattern: regular expression with a group for each field; <project> in it stands for the name of a project.
-        form: how the text is written, for the error.
-    """
+    """Return a validator that takes a text apart by the groups of a pattern, where <project> is a project's name; `form` is for errors."""
     whole = re.compile(pattern.replace("<project>", f"({PROJECT_PATTERN.strip('^$')})"))
 
     def read(given: object) -> object:
@@ -90,10 +84,7 @@ ProjectFolder = Annotated[ProjectRoot, _reader("<project>=(.+)", "PROJECT=/folde
 
 
 class Settings(BaseSettings):
-    """The settings that an operator may choose.
-
-    Settings(config=FILE, name=value, …): arguments override the environment, which overrides the file.
-    """
+    """The settings that an operator may choose; arguments override the environment, which overrides the file that `config` names."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, env_ignore_empty=True, validate_default=True,
                                       use_attribute_docstrings=True)
@@ -202,13 +193,9 @@ class Settings(BaseSettings):
         return given
 
     @model_validator(mode="after")
-    def _anonymous_is_local(self) -> Self:
+    def _consistent(self) -> Self:
         if self.anonymous and not self.loopback:
             raise ValueError(f"anonymous: requests without a key are let in on loopback addresses alone, and host is {self.host}")
-        return self
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
         if NO_WORKER in self.devices and len(self.devices) > 1:
             raise ValueError(f"devices: {NO_WORKER} stands alone, and they are {', '.join(self.devices)}")
         for proxy in self.trusted_proxies:
@@ -221,10 +208,6 @@ class Settings(BaseSettings):
         if self.oidc_issuer is not None and not (_is_http(self.oidc_issuer) and (
                 self.oidc_issuer.startswith("https:") or is_loopback(urlsplit(self.oidc_issuer).hostname or ""))):
             raise ValueError(f"oidc_issuer: {self.oidc_issuer} is no https:// address")
-        return self
-
-    @model_validator(mode="after")
-    def _data_is_apart(self) -> Self:
         kept = {"data": self.data}
         if self.storage_url is not None and self.storage_url.startswith("file:"):
             kept["storage_url"] = _absolute(Path(unquote(urlsplit(self.storage_url).path)))

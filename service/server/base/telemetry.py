@@ -19,11 +19,7 @@ PROPAGATOR = TraceContextTextMapPropagator()
 
 
 def provider(settings: Settings) -> "TracerProvider | None":
-    """Create what makes and sends the spans of this process, or nothing if the settings name no collector; call it once.
-
-    Raises:
-        RequestError: the extra `otel` is not installed.
-    """
+    """Create what makes and sends the spans of this process, or nothing if the settings name no collector; call it once."""
     if settings.otel_endpoint is None:
         return None
     try:

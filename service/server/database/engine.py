@@ -35,7 +35,6 @@ class Database:
     """Transactions on the tables of the service."""
 
     def __init__(self, engine: sa.Engine) -> None:
-        """Args: engine: from `connect`."""
         self.engine = engine
 
     @property
@@ -44,16 +43,7 @@ class Database:
         return self.engine.dialect.name == "sqlite"
 
     def transact(self, work: Callable[[sa.Connection], T], *, patience_s: float = 0.0) -> T:
-        """Run `work` in one transaction.
-
-        Args:
-            work: called with the connection; called again if the connection was lost and patience is left, so it may only read and write
-                the database.
-            patience_s: seconds for which to try again while the server cannot be reached or the disk is full.
-
-        Raises:
-            DBAPIError: the database does not answer, or refuses a value.
-        """
+        """Run `work` in one transaction, which may do nothing else, and again for `patience_s` while the database is away or full."""
         pause, deadline = FIRST_PAUSE_S, time.monotonic() + patience_s
         while True:
             try:
@@ -64,6 +54,10 @@ class Database:
                     raise
             time.sleep(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
+
+    def execute(self, statement: sa.Update | sa.Delete | sa.Insert) -> int:
+        """Run one statement in a transaction of its own, and return the number of rows that it changed."""
+        return self.transact(lambda connection: connection.execute(statement).rowcount)
 
     def rows(self, query: "sa.Select[Any]", **parameters: Any) -> list[sa.RowMapping]:
         """Return all rows of a query, with the values of its `bindparam`s."""
@@ -76,7 +70,7 @@ class Database:
         return found[0] if found else None
 
     def check(self) -> None:
-        """Raises: DBAPIError: the database does not answer."""
+        """Raise DBAPIError if the database does not answer."""
         with self.engine.connect() as connection:
             connection.execute(sa.text("SELECT 1"))
 
@@ -86,11 +80,7 @@ class Database:
 
 
 def connect(url: str, *, connections: int = 10) -> Database:
-    """Open a database by its URL for SQLAlchemy (sqlite:///path or postgresql+psycopg://…); nothing is created.
-
-    Raises:
-        DatabaseError: the URL is malformed or of another database.
-    """
+    """Open a database by its URL for SQLAlchemy (sqlite:///path or postgresql+psycopg://…); nothing is created."""
     try:
         parsed = sa.make_url(url)
         if parsed.get_backend_name() == "sqlite":
@@ -108,11 +98,7 @@ def connect(url: str, *, connections: int = 10) -> Database:
 
 
 def open_database(settings: Settings, prepare: Callable[[Settings, Database], None]) -> Database:
-    """Open the database that the settings name; `prepare` makes the tables, or checks that they exist.
-
-    Raises:
-        RequestError: the data folder or the database cannot be used.
-    """
+    """Open the database that the settings name; `prepare` makes the tables, or checks that they exist."""
     with usable(settings):
         database = connect(settings.sqlalchemy_url)
         prepare(settings, database)
@@ -121,11 +107,7 @@ def open_database(settings: Settings, prepare: Callable[[Settings, Database], No
 
 @contextmanager
 def usable(settings: Settings) -> Iterator[None]:
-    """Turn errors of the data folder and the database into one sentence for people, without SQL and without values.
-
-    Raises:
-        RequestError: the data folder or the database cannot be used.
-    """
+    """Turn errors of the data folder and the database into a RequestError for people, without SQL and without values."""
     try:
         yield
     except DatabaseError as error:
@@ -144,10 +126,7 @@ def _sqlite(connection: Any, _record: Any) -> None:
 
 
 def lock_project(connection: sa.Connection, project: str) -> None:
-    """Wait until no other transaction has the lock of a project, and keep it until this one ends; what the others wrote is then seen.
-
-    So a transaction can count what a project has before it adds to it, whichever API process runs it.
-    """
+    """Wait for the lock of a project, and keep it until this transaction ends, which sees what earlier ones wrote and can count it."""
     if connection.dialect.name == "postgresql":
         connection.execute(sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :space))"), {"name": project, "space": PROJECT})
     else:

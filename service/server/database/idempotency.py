@@ -19,27 +19,16 @@ class TokenReused(RequestError):
 
 
 def create_once(database: Database, project: str, token: str | None, asked: Any, make: Callable[[sa.Connection], str]) -> tuple[str, bool]:
-    """Create something once for a token.
+    """Create something once for a token of the client, or, with None, at every request; return its identifier, and if it was created now.
 
-    Args:
-        database: of the service.
-        project: of the caller.
-        token: chosen by the client; None: every request creates.
-        asked: all values of the request, as JSON can hold them.
-        make: creates in the transaction, and returns the identifier of what it created.
-
-    Returns:
-        The identifier, and whether it was created now.
-
-    Raises:
-        TokenReused: the token was sent with another request before.
+    `asked` has all values of the request, as JSON can hold them; `make` creates in the transaction, and returns the identifier.
     """
     if token is None:
         return database.transact(make), True
     fingerprint = _fingerprint(asked)
 
     def work(connection: sa.Connection) -> tuple[str, bool]:
-        row = connection.execute(_by_token(project, token)).mappings().one_or_none()
+        row = connection.execute(sa.select(idempotency).where(*_is(project, token))).mappings().one_or_none()
         if row is not None:
             return _same(row, fingerprint), False
         connection.execute(idempotency.insert().values(project=project, token=token, fingerprint=fingerprint, made="",
@@ -55,8 +44,8 @@ def create_once(database: Database, project: str, token: str | None, asked: Any,
 
 
 def created_by(database: Database, project: str, token: str | None, asked: Any) -> str | None:
-    """Return what was created with a token; None: nothing. Arguments and errors are those of `create_once`."""
-    row = None if token is None else database.row(_by_token(project, token))
+    """Return what was created with a token, as `create_once` does; None: nothing."""
+    row = None if token is None else database.row(sa.select(idempotency).where(*_is(project, token)))
     return None if row is None else _same(row, _fingerprint(asked))
 
 
@@ -68,10 +57,6 @@ def forget_token(connection: sa.Connection, project: str, token: str, gone: str)
 def drop_before(connection: sa.Connection, when: float) -> None:
     """Forget the tokens of requests before a time."""
     connection.execute(idempotency.delete().where(idempotency.c.created_at < when))
-
-
-def _by_token(project: str, token: str) -> "sa.Select[Any]":
-    return sa.select(idempotency).where(*_is(project, token))
 
 
 def _is(project: str, token: str) -> "tuple[sa.ColumnElement[bool], ...]":

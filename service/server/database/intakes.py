@@ -9,7 +9,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from service.requests.views.states import CHECKING, READY, RECEIVING, REFUSED
+from service.requests.states import CHECKING, READY, RECEIVING, REFUSED
 from service.server.database.engine import Database, storable
 from service.server.database.jobs import PATIENCE_S
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first, uploads
@@ -45,13 +45,7 @@ def latest(database: Database, project: str, kind: str, *, limit: int, before: t
 
 
 def lock_for_files(connection: sa.Connection, identifier: str, project: str) -> bool:
-    """Lock an intake that receives files, so that it is neither checked nor deleted before the transaction ends.
-
-    An intake that was refused is receiving again.
-
-    Returns:
-        False if there is no such intake, or its files do not change any more.
-    """
+    """Lock an intake that receives files, also one that was refused, until the transaction ends; return False if its files are fixed."""
     return connection.execute(intakes.update().where(
         intakes.c.id == identifier, intakes.c.project == project, intakes.c.folder.is_(None), intakes.c.state.in_((RECEIVING, REFUSED)),
     ).values(state=RECEIVING, problem=None)).rowcount == 1
@@ -82,11 +76,7 @@ def refuse(database: Database, identifier: str, problem: str) -> None:
 
 
 def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
-    """Delete an intake and its uploads.
-
-    Returns:
-        Identifiers of the uploads that were not complete; None: there is no such intake.
-    """
+    """Delete an intake and its uploads; return the uploads that were not complete, or None if there is no such intake."""
     # locks the row, so that no upload begins meanwhile
     connection.execute(intakes.update().where(intakes.c.id == identifier).values(name=intakes.c.name))
     parts = list(connection.execute(sa.select(uploads.c.id).where(uploads.c.intake == identifier, uploads.c.done.is_(False))).scalars())

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from service import __version__
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import JOB, new_id
-from service.requests.views.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
+from service.requests.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
 from service.server.database.engine import Database, lock_project, storable
 from service.server.database.tables import intakes, job_inputs, job_log, jobs, newest_first
 
@@ -59,19 +59,9 @@ class StageProgress(NamedTuple):
 
 def insert(connection: sa.Connection, *, project: str, key: str | None, request: JobRequest, chunk_frames: int,
            inputs: Iterable[str], trace: str | None = None, finished: str | None = None) -> str:
-    """Insert a new job in the caller's transaction.
+    """Insert a new job, which reads `inputs`, in the caller's transaction, and return its identifier.
 
-    Args:
-        connection: of the transaction.
-        project, key: to which the job belongs.
-        request: of the user.
-        chunk_frames: frames of one step.
-        inputs: identifiers of the captures, environments and jobs that it reads.
-        trace: traceparent of the HTTP request, so that the spans of the job's steps belong to its trace.
-        finished: identifier of a job whose results exist already: it is inserted as one that has succeeded; None: it is queued.
-
-    Returns:
-        The identifier of the job.
+    `finished` is the identifier of a job whose results exist already: it is inserted as one that has succeeded.
     """
     identifier, now = finished or new_id(JOB), time.time()
     ended = {} if finished is None else {"started_at": now, "finished_at": now}
@@ -136,10 +126,7 @@ def frames(database: Database) -> int:
 
 
 def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[str]:
-    """Return the identifiers of the jobs that read a capture, an environment or a job; with `active`, of those that have not ended.
-
-    Checks are left out: the state of the intake tells whether it is being checked.
-    """
+    """Return the jobs, checks apart, that read a capture, an environment or a job; with `active`, those that have not ended."""
     query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(
         job_inputs.c.input == input_id, jobs.c.request["kind"].as_string() != "check")
     return list(connection.execute(query.where(jobs.c.state.in_(ACTIVE)) if active else query).scalars())
@@ -170,21 +157,11 @@ def correct_reached(database: Database, claim: Claim, frames: int) -> bool:
 
 def advance(database: Database, claim: Claim, progress: StageProgress, *, frames: int | None = None, repeating: bool | None = None,
             begun: Sequence[str] | None = None, entered: bool = False) -> bool:
-    """Record the progress of a running job; return False if the worker no longer has it.
+    """Record the progress of a running job, as users see it, without patience; return False if the worker no longer has it.
 
-    More frames than the attempt ever had, and a stage that the step never came to, set `lost` to 0, as a finished step does: a job that
-    makes progress does not kill its workers.
-
-    Args:
-        claim: of the worker.
-        progress: of the stage under way, as users see it.
-        frames: frames that the job has, where users see more; None: those of `progress`.
-        repeating: whether an earlier worker went on from this stage to a further one; None: as recorded.
-        begun: names of the stages that the step has come to, where one is new; None: as recorded.
-        entered: whether the log gets an entry for the stage.
-
-    Raises:
-        DBAPIError: the database does not answer; it is not asked again.
+    More frames than the attempt ever had, and a stage that the step never came to (`begun`), set `lost` to 0, as a finished step does: a
+    job that makes progress does not kill its workers. `repeating` says whether an earlier worker went on from this stage to a further one,
+    `entered` whether the log gets an entry for the stage.
     """
     values: dict[str, Any] = progress._asdict()
     if progress.stage == FRAMES:
@@ -200,11 +177,7 @@ def advance(database: Database, claim: Claim, progress: StageProgress, *, frames
 
 
 def finish_step(database: Database, claim: Claim, steps: Sequence[str], result_bytes: int | None = None) -> bool:
-    """Record the names of all finished steps, and the size of all results unless it is None.
-
-    Returns:
-        False if the worker no longer has the job.
-    """
+    """Record all finished steps, and the size of all results unless it is None; return False if the worker no longer has the job."""
     size: dict[str, Any] = {} if result_bytes is None else {"result_bytes": result_bytes}
     return _change(database, claim, finished_steps=list(steps), **size, **NOTHING_LOST)
 
@@ -220,10 +193,7 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
     """Record that a worker died while it had a job: the job is queued again, or fails if it has lost more than `limit`.
 
     A worker that died in a stage that an earlier worker came through was hardly killed by the job. So it does not count, unless there are
-    REPEATED times `limit` of them.
-
-    Returns:
-        The new state of the job; None if it had ended.
+    REPEATED times `limit` of them. Return the new state of the job; None if it had ended.
     """
     active = [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE)]
     row = connection.execute(sa.select(jobs).where(*active).with_for_update()).one_or_none()
@@ -266,11 +236,7 @@ def cancel(connection: sa.Connection, job: str) -> bool:
 
 
 def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
-    """Queue a job again that has ended in `state`.
-
-    Returns:
-        The number of the new attempt; None if the job is in another state.
-    """
+    """Queue a job again that has ended in `state`; return the number of its new attempt, or None if it is in another state."""
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == state).values(
         state=QUEUED, attempt=jobs.c.attempt + 1, revision=jobs.c.revision + 1, updated_at=time.time(), finished_at=None,
         error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
@@ -281,11 +247,7 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
 
 
 def set_priority(connection: sa.Connection, job: str, priority: int) -> int | None:
-    """Change the priority of a queued job.
-
-    Returns:
-        The number of its attempt, whose place in the queue is to change; None if the job is not queued.
-    """
+    """Change the priority of a queued job; return its attempt, whose place in the queue is to change, or None if it is not queued."""
     return connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state == QUEUED).values(
         priority=priority, updated_at=time.time(), revision=jobs.c.revision + 1).returning(jobs.c.attempt)).scalar()
 

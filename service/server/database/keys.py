@@ -45,11 +45,7 @@ class Caller(NamedTuple):
 
 
 def create(database: Database, wanted: NewKey) -> str:
-    """Create a key.
-
-    Returns:
-        The key as its user sends it; it cannot be shown again.
-    """
+    """Create a key, and return it as its user sends it; it cannot be shown again."""
     return database.transact(lambda connection: insert(connection, wanted))
 
 
@@ -70,7 +66,7 @@ def find(database: Database, presented: str) -> Caller | None:
         return None
     now = time.time()
     if row["used_at"] is None or abs(now - row["used_at"]) > USED_S:
-        database.transact(lambda connection: connection.execute(keys.update().where(keys.c.id == identifier).values(used_at=now)))
+        database.execute(keys.update().where(keys.c.id == identifier).values(used_at=now))
     return Caller(row["project"], Scope(row["scope"]), identifier, row["expires_at"])
 
 
@@ -85,11 +81,7 @@ def revoke(database: Database, identifier: str) -> bool:
 
 
 def withdraw(connection: sa.Connection, identifier: str) -> str | None:
-    """Revoke a key in the caller's transaction.
-
-    Returns:
-        The project of the key; None: there is no such key, or it was revoked before.
-    """
+    """Revoke a key in the caller's transaction; return its project, or None if there is no such key or it was revoked before."""
     return connection.execute(keys.update().where(keys.c.id == identifier, keys.c.revoked_at.is_(None)).values(
         revoked_at=time.time()).returning(keys.c.project)).scalar()
 

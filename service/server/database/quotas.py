@@ -10,7 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from service.errors import RequestError
-from service.requests.views.states import ACTIVE, READY
+from service.requests.states import ACTIVE, READY
 from service.server.base.settings import Settings
 from service.server.database.engine import lock_project
 from service.server.database.tables import intakes, jobs, uploads
@@ -22,19 +22,12 @@ class QuotaExceeded(RequestError):
     """The project has as much as it may; the message names the quota."""
 
     def __init__(self, quota: str, project: str, limit: int, used: int, more: int) -> None:
-        """Args: quota: name of the setting. limit, used, more: allowed, present, and asked for."""
         super().__init__(f"quota {quota}: the project {project} has {used} of {limit} {UNITS[quota]}, and this needs {more} more")
         self.quota = quota
 
 
 def require(connection: sa.Connection, settings: Settings, quota: str, project: str, more: int) -> None:
-    """Check a quota before something is added in the caller's transaction; other requests of the project wait for its end.
-
-    `more` is what will be added, in the unit of the quota, which is BYTES, CAPTURES, JOBS or PIXELS.
-
-    Raises:
-        QuotaExceeded: the project would have more than it may.
-    """
+    """Check a quota before `more` of its unit is added in the caller's transaction; other requests of the project wait for its end."""
     limit = settings.quota_of(project, quota)
     if limit is None:
         return
@@ -60,12 +53,12 @@ def _bytes(connection: sa.Connection, project: str) -> int:
 
 
 def _captures(connection: sa.Connection, project: str) -> int:
-    return int(connection.execute(sa.select(sa.func.count()).where(intakes.c.project == project)).scalar_one())
+    return connection.execute(sa.select(sa.func.count()).where(intakes.c.project == project)).scalar_one()
 
 
 def _jobs(connection: sa.Connection, project: str) -> int:
-    return int(connection.execute(sa.select(sa.func.count()).where(
-        jobs.c.project == project, jobs.c.state.in_(ACTIVE), jobs.c.request["kind"].as_string() != "check")).scalar_one())
+    theirs = jobs.c.project == project, jobs.c.state.in_(ACTIVE), jobs.c.request["kind"].as_string() != "check"
+    return connection.execute(sa.select(sa.func.count()).where(*theirs)).scalar_one()
 
 
 def _pixels(connection: sa.Connection, project: str) -> int:

@@ -26,11 +26,7 @@ UPGRADE_LOCK = 0x72656C6974
 
 
 def upgrade(database: Database) -> None:
-    """Make the tables if there are none, or change those of an older program.
-
-    Raises:
-        DatabaseError: the tables are those of a newer program, or older than relit 0.1.0.
-    """
+    """Make the tables if there are none, or change those of an older program."""
     with database.engine.begin() as connection:
         if database.is_sqlite:
             connection.execute(sa.text("BEGIN IMMEDIATE"))
@@ -58,11 +54,7 @@ def is_current(database: Database) -> bool:
 
 
 def require_current(database: Database) -> None:
-    """Check that the tables are those of this program; nothing is changed.
-
-    Raises:
-        DatabaseError: there are no tables, or they are those of an older or newer program.
-    """
+    """Raise DatabaseError if the tables are not those of this program; nothing is changed."""
     with database.engine.connect() as connection:
         if not _has_tables(connection):
             raise DatabaseError("the database has no tables of relit: relit serve makes them")

@@ -24,11 +24,7 @@ class PathTaken(Exception):
 
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int, sha256: str | None) -> None:
-    """Insert an upload without bytes; the caller has locked the intake.
-
-    Raises:
-        PathTaken: another file has the path.
-    """
+    """Insert an upload without bytes; the caller has locked the intake."""
     _require_free(connection, intake, path)
     connection.execute(uploads.insert().values(
         id=identifier, project=project, intake=intake, path=path, folded=folded(path), length=length, received=0, sha256=sha256,
@@ -67,35 +63,25 @@ def listing(database: Database, intake: str, *, limit: int, after: str | None = 
 def take(database: Database, identifier: str, writer: str, *, now: float, until: float) -> bool:
     """Let a writer change an upload until a time (seconds since 1970); return False if another has it, or it was deleted."""
     free = uploads.c.writer.is_(None) | (uploads.c.writer_until < now)
-    return database.transact(lambda connection: connection.execute(uploads.update().where(uploads.c.id == identifier, free).values(
-        writer=writer, writer_until=until))).rowcount == 1
+    return database.execute(uploads.update().where(uploads.c.id == identifier, free).values(writer=writer, writer_until=until)) == 1
 
 
 def renew(database: Database, writers: Collection[str], until: float) -> None:
     """Let writers change their uploads until a later time."""
-    database.transact(lambda connection: connection.execute(uploads.update().where(uploads.c.writer.in_(writers)).values(
-        writer_until=until)))
+    database.execute(uploads.update().where(uploads.c.writer.in_(writers)).values(writer_until=until))
 
 
 def release(database: Database, identifier: str, writer: str) -> None:
     """Let others change an upload that this writer has."""
-    database.transact(lambda connection: connection.execute(uploads.update().where(
-        uploads.c.id == identifier, uploads.c.writer == writer).values(writer=None, writer_until=None)))
+    mine = uploads.c.id == identifier, uploads.c.writer == writer
+    database.execute(uploads.update().where(*mine).values(writer=None, writer_until=None))
 
 
 def advance(database: Database, identifier: str, received: int, *, writer: str | None = None,
             pieces: Sequence[tuple[str, int]] | None = None) -> bool:
-    """Record the number of bytes that are safe.
+    """Record the number of bytes that are safe; return False if the upload was deleted, or the `writer`, if given, has it no longer.
 
-    Args:
-        database: of the service.
-        identifier: of the upload.
-        received: the number of bytes.
-        writer: who must have the upload; None: anybody may change it.
-        pieces: names and lengths of the objects that hold the bytes; None: they are not in objects.
-
-    Returns:
-        False if the upload was deleted, or another writer has it.
+    `pieces` are names and lengths of the objects that hold the bytes; None: they are not in objects.
     """
     values: dict[str, Any] = {"received": received} | ({} if pieces is None else {"pieces": [list(piece) for piece in pieces]})
     return _change(database, identifier, writer, values)
@@ -123,8 +109,8 @@ def unfinished_of(database: Database, identifiers: Collection[str]) -> set[str]:
 
 def drop_untouched(database: Database, identifier: str, before: float) -> bool:
     """Delete the row of an upload unless it was continued since a time; return whether it was deleted."""
-    return database.transact(lambda connection: connection.execute(uploads.delete().where(
-        uploads.c.id == identifier, uploads.c.done.is_(False), uploads.c.touched_at < before))).rowcount == 1
+    old = uploads.c.id == identifier, uploads.c.done.is_(False), uploads.c.touched_at < before
+    return database.execute(uploads.delete().where(*old)) == 1
 
 
 def _require_free(connection: sa.Connection, intake: str, path: str) -> None:
@@ -148,5 +134,4 @@ def _require_free(connection: sa.Connection, intake: str, path: str) -> None:
 
 def _change(database: Database, identifier: str, writer: str | None, values: Mapping[str, Any]) -> bool:
     mine = [uploads.c.id == identifier] + ([] if writer is None else [uploads.c.writer == writer])
-    return database.transact(lambda connection: connection.execute(uploads.update().where(*mine).values(
-        touched_at=time.time(), **values))).rowcount == 1
+    return database.execute(uploads.update().where(*mine).values(touched_at=time.time(), **values)) == 1

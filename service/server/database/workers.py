@@ -15,19 +15,17 @@ SILENT_S = 30.0
 def insert(database: Database, worker: str, *, host: str, pid: int, device: str) -> None:
     """Insert a worker that has started."""
     now = time.time()
-    database.transact(lambda connection: connection.execute(workers.insert().values(
-        id=worker, host=host, pid=pid, device=device, started_at=now, seen_at=now, state=READY)))
+    database.execute(workers.insert().values(id=worker, host=host, pid=pid, device=device, started_at=now, seen_at=now, state=READY))
 
 
 def record_alive(database: Database, worker: str, state: str = READY) -> None:
     """Record that a worker is alive, and its state."""
-    database.transact(lambda connection: connection.execute(workers.update().where(workers.c.id == worker).values(
-        seen_at=time.time(), state=state)))
+    database.execute(workers.update().where(workers.c.id == worker).values(seen_at=time.time(), state=state))
 
 
 def remove(database: Database, worker: str) -> None:
     """Delete a worker that has ended or was found dead."""
-    database.transact(lambda connection: connection.execute(workers.delete().where(workers.c.id == worker)))
+    database.execute(workers.delete().where(workers.c.id == worker))
 
 
 def seen_lately(database: Database) -> list[sa.RowMapping]:

@@ -40,11 +40,7 @@ class WorkerContext(NamedTuple):
     """The settings of the service, for its quotas and `min_free_bytes`; None: neither is looked at."""
 
     def require_space(self) -> None:
-        """Check that `min_free_bytes` are left in the data folder.
-
-        Raises:
-            RequestError: less is left.
-        """
+        """Raise RequestError if less than `min_free_bytes` are left in the data folder."""
         if self.settings is not None and shutil.disk_usage(self.settings.data).free < self.settings.min_free_bytes:
             raise RequestError("the service has no space left for this job (min_free_bytes): retry it when there is")
 

@@ -18,7 +18,6 @@ class HelpProgress:
     """A Progress that ends the help when the job is not running any more or this worker is asked to end; nothing is recorded."""
 
     def __init__(self, context: WorkerContext, job: Job, *, alive: Callable[[], None], ending: Callable[[], bool]) -> None:
-        """Create the progress of a help."""
         self._context, self._job, self._alive, self._ending = context, job, alive, ending
         self._look_at = 0.0
 
@@ -27,11 +26,7 @@ class HelpProgress:
         self.advance(0)
 
     def advance(self, done: int) -> None:
-        """Look whether the help is still wanted, at most every EVERY_S.
-
-        Raises:
-            Stopped: it is not.
-        """
+        """Look whether the help is still wanted, at most every EVERY_S; raise Stopped if it is not."""
         self._alive()
         now = time.monotonic()
         if now < self._look_at:

@@ -1,28 +1,20 @@
-"""Jobs of one step: each calls a product with the files of the captures, environments and jobs that its request names."""
+"""Jobs of one step: each calls a product with the files of the captures, environments and jobs that its request names.
+
+Those that calibrate write manifests and reports among the results, and leave the captures as they are.
+"""
 
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from service.reporting.provenance import name_place
-from service.requests.base.base import JobRequest
+from service.requests import calibrate, calibration_jobs, jobs
+from service.requests.base.base import JobRequest, Options
 from service.requests.basis import BasisKind
-from service.requests.jobs import (
-    BasisJob,
-    ExportJob,
-    GaugeBoardJob,
-    InspectBoardJob,
-    JoinJob,
-    PatternsJob,
-    ScanJob,
-    SeparateJob,
-    ShadeJob,
-    ViewJob,
-)
-from service.server.jobs.calibrating import CALIBRATIONS
-from service.server.jobs.places import StepFiles
+from service.server.jobs.places import StepFiles, file_within
 from service.server.storage import layout
+from stage.capture.manifest import FILE_NAME
 from stage.capture.sequence import read_sequence
 from stage.files import write_text
 
@@ -31,38 +23,34 @@ BASIS = "basis"
 REGIONS_FILE = "regions.json"
 """Name of the file with the regions of a job, which lies beside what they were judged in."""
 STUDY_FILE = "study.json"
+TOF_FILE = "tof.json"
+"""Name of the calibration of a time-of-flight camera."""
 
 
-def export(request: ExportJob, files: StepFiles) -> None:
+def export(request: jobs.ExportJob, files: StepFiles) -> None:
     """Make an asset of solved maps or a depth."""
     from service.export.export import export as make_asset
     from service.requests.export import ExportRequest
 
-    make_asset(ExportRequest(maps=files.maps(request.maps), out=files.out / f"{layout.ASSET}.{request.format}",
-                             rig=None if request.rig is None else files.intake(request.rig),
-                             environment=files.environment_image(request.environment), **dict(request.options)), files.progress)
+    make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress)
 
 
-def _join(request: JoinJob, files: StepFiles) -> None:
+def _join(request: jobs.JoinJob, files: StepFiles) -> None:
     from service.joining.join import join
     from service.requests.solve import JoinRequest
 
-    join(JoinRequest(maps=files.maps(request.maps), depth=files.maps(request.depth), out=files.out, device=files.device), files.progress)
+    join(files.request(JoinRequest, request, out=files.out), files.progress)
 
 
-def _shade(request: ShadeJob, files: StepFiles) -> None:
+def _shade(request: jobs.ShadeJob, files: StepFiles) -> None:
     from service.relight.shade import shade
     from service.requests.shade import ShadeRequest
 
-    capture = request.capture
-    shade(ShadeRequest(maps=files.maps(request.maps), out=files.out / layout.PICTURE,
-                       environment=files.environment_image(request.environment),
-                       capture=None if capture is None else files.intake(capture), device=files.device,
-                       cache=None if capture is None else files.cache(capture), **dict(request.options)), files.progress)
+    shade(files.request(ShadeRequest, request, out=files.out / layout.PICTURE), files.progress)
 
 
-def _view(request: ViewJob, files: StepFiles) -> None:
-    from service.requests.view import ViewRequest
+def _view(request: jobs.ViewJob, files: StepFiles) -> None:
+    from service.requests.captures import ViewRequest
     from service.viewing.view_files import view
 
     capture, cache = files.intake(request.capture, request.step), files.cache(request.capture)
@@ -70,10 +58,10 @@ def _view(request: ViewJob, files: StepFiles) -> None:
     if request.step is not None:
         capture = read_sequence(capture).step(request.step, capture).folder
         cache, maps = cache / capture.name, None if maps is None else maps / capture.name
-    view(ViewRequest(capture=capture, maps=maps, out=files.out, device=files.device, cache=cache, **dict(request.options)), files.progress)
+    view(files.request(ViewRequest, request, capture=capture, maps=maps, out=files.out, cache=cache), files.progress)
 
 
-def _basis(request: BasisJob, files: StepFiles) -> None:
+def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
     from service.basis.basis import SUFFIXES, make_basis
     from service.requests.basis import BasisRequest
 
@@ -83,22 +71,21 @@ def _basis(request: BasisJob, files: StepFiles) -> None:
                             device=files.device, cache=files.cache(request.capture), **options), files.progress)
 
 
-def _separate(request: SeparateJob, files: StepFiles) -> None:
+def _separate(request: jobs.SeparateJob, files: StepFiles) -> None:
     from service.depth.separate import separate
     from service.requests.depth import SeparateRequest
 
-    separate(SeparateRequest(capture=files.intake(request.capture), out=files.out, device=files.device,
-                             cache=files.cache(request.capture), **dict(request.options)), files.progress)
+    separate(files.request(SeparateRequest, request, out=files.out), files.progress)
 
 
-def _scan(request: ScanJob, files: StepFiles) -> None:
+def _scan(request: jobs.ScanJob, files: StepFiles) -> None:
     from service.depth.scan import scan
     from service.requests.depth import ScanRequest
 
-    scan(ScanRequest(scan=files.intake(request.capture), out=files.out, device=files.device, **dict(request.options)), files.progress)
+    scan(files.request(ScanRequest, request, scan=files.intake(request.capture), out=files.out), files.progress)
 
 
-def _patterns(request: PatternsJob, files: StepFiles) -> None:
+def _patterns(request: jobs.PatternsJob, files: StepFiles) -> None:
     from service.depth.patterns.projection import make_patterns
     from service.requests.patterns import PatternsRequest
 
@@ -106,7 +93,7 @@ def _patterns(request: PatternsJob, files: StepFiles) -> None:
     make_patterns(PatternsRequest(out=files.out, **options), files.progress)
 
 
-def _inspect_board(request: InspectBoardJob, files: StepFiles) -> None:
+def _inspect_board(request: jobs.InspectBoardJob, files: StepFiles) -> None:
     from service.boards.inspect_board import inspect_board
     from service.requests.inspect_board import InspectBoardRequest
 
@@ -114,12 +101,11 @@ def _inspect_board(request: InspectBoardJob, files: StepFiles) -> None:
     if request.regions is not None:
         regions = files.out / REGIONS_FILE
         write_text(regions, request.regions.model_dump_json(by_alias=True, indent=2) + "\n")
-    inspect_board(InspectBoardRequest(board=files.intake(request.capture), out=files.out,
-                                      golden=None if request.golden is None else files.maps(request.golden), regions=regions,
-                                      device=files.device, cache=files.cache(request.capture), **dict(request.options)), files.progress)
+    inspect_board(files.request(InspectBoardRequest, request, board=files.intake(request.capture), out=files.out, regions=regions),
+                  files.progress)
 
 
-def _gauge_board(request: GaugeBoardJob, files: StepFiles) -> None:
+def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
     from service.boards.gauge_board import gauge_board
     from service.requests.inspect_board import GaugeBoardRequest
 
@@ -132,10 +118,56 @@ def _gauge_board(request: GaugeBoardJob, files: StepFiles) -> None:
         gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress)
 
 
+def _calibrate(request: JobRequest, files: StepFiles) -> None:
+    """Calibrate the lights or the images of one capture."""
+    from service.calibrate import images, intensity, lights, response, white_balance
+
+    products: dict[type[JobRequest], tuple[Callable[..., object], type[Options]]] = {
+        calibration_jobs.MirrorBallJob: (lights.mirror_ball, calibrate.MirrorBallRequest),
+        calibration_jobs.LightPositionsJob: (lights.light_positions, calibrate.LightPositionsRequest),
+        calibration_jobs.GreyBallJob: (lights.grey_ball, calibrate.GreyBallRequest),
+        calibration_jobs.IntensityJob: (intensity.intensity, calibrate.IntensityRequest),
+        calibration_jobs.DarkJob: (images.dark, calibrate.DarkRequest),
+        calibration_jobs.FlatFieldJob: (images.flat_field, calibrate.FlatFieldRequest),
+        calibration_jobs.SaturationJob: (images.saturation, calibrate.SaturationRequest),
+        calibration_jobs.WhiteBalanceJob: (white_balance.white_balance, calibrate.WhiteBalanceRequest),
+        calibration_jobs.ResponseJob: (response.response, calibrate.ResponseRequest)}
+    product, model = products[type(request)]
+    given = {"write": True} if model is calibrate.SaturationRequest else {}
+    product(files.request(model, request, out=files.out / FILE_NAME, **given), files.progress)
+
+
+def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.StereoCalibrationJob | calibration_jobs.LaserPlanesJob,
+                   files: StepFiles) -> None:
+    """Calibrate a rig, and write a manifest for each of its captures."""
+    from service.calibrate import laser_planes, procam, stereo
+
+    captures = [request.capture] if isinstance(request, calibration_jobs.StereoCalibrationJob) else request.captures
+    paths = [files.out / f"{capture}.{FILE_NAME}" for capture in (*captures, *request.apply_to)]
+    if isinstance(request, calibration_jobs.ProcamJob):
+        procam.procam(files.request(calibrate.ProcamRequest, request), files.progress, manifest_paths=paths)
+    elif isinstance(request, calibration_jobs.StereoCalibrationJob):
+        stereo.stereo(files.request(calibrate.StereoRequest, request), files.progress, manifest_paths=paths)
+    else:
+        laser_planes.laser_planes(files.request(calibrate.LaserPlanesRequest, request), files.progress, manifest_paths=paths)
+
+
+def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles) -> None:
+    from service.calibrate.tof import calibrate_tof
+    from service.relight.time_steps import time_steps
+
+    folder = files.intake(request.capture)
+    sweep = file_within(folder, request.sweep, "sweep")
+    calibrate_tof(calibrate.TofCalibrationRequest(sweep=sweep, out=files.out / TOF_FILE, device=files.device), files.progress,
+                  allowed=time_steps(folder))
+
+
 MEASURE = "measure"
+RIGS = (calibration_jobs.ProcamJob, calibration_jobs.StereoCalibrationJob, calibration_jobs.LaserPlanesJob)
 ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] = {
-    ExportJob: ("export", export), JoinJob: ("join", _join), ShadeJob: ("shade", _shade), ViewJob: ("view", _view),
-    InspectBoardJob: ("inspect", _inspect_board), GaugeBoardJob: ("gauge", _gauge_board),
-    BasisJob: (MEASURE, _basis), SeparateJob: (MEASURE, _separate), ScanJob: (MEASURE, _scan), PatternsJob: (MEASURE, _patterns),
-    **{kind: (MEASURE, calibrate) for kind, calibrate in CALIBRATIONS.items()}}
+    **dict.fromkeys(get_args(calibration_jobs.AnyCalibration), (MEASURE, _calibrate)),
+    **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
+    jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _join), jobs.ShadeJob: ("shade", _shade), jobs.ViewJob: ("view", _view),
+    jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.BasisJob: (MEASURE, _basis),
+    jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan), jobs.PatternsJob: (MEASURE, _patterns)}
 """The name of the step of each of these kinds of jobs, and the function that does it."""

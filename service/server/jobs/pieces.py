@@ -9,7 +9,7 @@ both do it, and store the same. The files are deleted when the job ends, and wha
 import secrets
 
 from service.errors import DivergedError
-from service.requests.views.states import RUNNING
+from service.requests.states import RUNNING
 from service.server.base.log import logger
 from service.server.database import jobs, workers
 from service.server.jobs.context import Job, WorkerContext
@@ -30,7 +30,6 @@ class JobPieces:
     """The pieces of one job, for one worker."""
 
     def __init__(self, context: WorkerContext, job: Job) -> None:
-        """Args: context: of this worker. job: that it has or helps with."""
         self._context, self._job, self._prefix = context, job, layout.shared(job.project, job.id)
         self._invited = 0
 
@@ -43,12 +42,7 @@ class JobPieces:
             return None
 
     def write(self, name: str, content: bytes) -> None:
-        """Store something under a name, whole or not at all.
-
-        Raises:
-            Stopped: the job has ended; nothing is left.
-            StorageError: the storage cannot be written.
-        """
+        """Store something under a name, whole or not at all; raise Stopped, and leave nothing, if the job has ended."""
         file = self._context.storage.workspace(self._prefix) / f".{secrets.token_hex(8)}"
         try:
             with replacing(file) as temporary:
@@ -91,12 +85,7 @@ class JobPieces:
         return min(len(others), pieces - 1) - self._invited
 
     def require_same_kind(self) -> None:
-        """Make sure that what this worker makes is the same to the last bit as what the worker that has the job makes.
-
-        Raises:
-            DivergedError: it is not.
-            Stopped: the worker that has the job has not asked.
-        """
+        """Make sure that this worker makes the same to the last bit as the worker that has the job; raise Stopped if that has not asked."""
         kind = self.read(KIND)
         if kind is None:
             raise Stopped  # no help with steps is asked for

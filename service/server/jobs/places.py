@@ -2,18 +2,23 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
-from service.requests.base.identifiers import CAPTURE
+from service.requests.base.base import JobRequest, Options
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.database import intakes
 from service.server.jobs.context import Job, WorkerContext
 from service.server.storage import layout
 from stage import inputs
 from stage.capture.sequence import SEQUENCE_FILE, read_sequence
 from stage.files import resolved
+
+R = TypeVar("R", bound=Options)
+NAMES = ("images", "masks", "dark_images")
+"""Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers."""
 
 
 class StepFiles(NamedTuple):
@@ -32,6 +37,27 @@ class StepFiles(NamedTuple):
         """Return the folder of the image stack of a capture."""
         return self.context.cache / capture
 
+    def request(self, model: type[R], job: JobRequest, **given: Any) -> R:
+        """Return the request of a product: values `given`, options of a job, and folders and files for its identifiers and names."""
+        values = {**dict(getattr(job, "options", ())), **given}
+        for name in type(job).model_fields:
+            if name in model.model_fields and name not in JobRequest.model_fields and name not in values:
+                value = getattr(job, name)
+                values[name] = files_within(values["capture"], value, name) if name in NAMES else self._place(value)
+        capture = next(iter(getattr(job, "captures", ())), getattr(job, "capture", None))
+        ours = {"device": self.device, "cache": None if capture is None else self.cache(capture)}
+        return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
+
+    def _place(self, identified: Any) -> Any:
+        """Return the place of what an identifier names, those of several, or None for none."""
+        if identified is None:
+            return None
+        if isinstance(identified, tuple):
+            return tuple(map(self._place, identified))
+        if identified.startswith(ENVIRONMENT):
+            return self.environment_image(identified)
+        return self.intake(identified) if identified.startswith(CAPTURE) else self.maps(identified)
+
     @property
     def out(self) -> Path:
         """Folder into which the results of the job are written."""
@@ -46,12 +72,7 @@ class StepFiles(NamedTuple):
         return folder
 
     def intake(self, identifier: str, number: int | None = None) -> Path:
-        """Return the folder of a capture or environment of the job's project; a registered one is checked again, as it may have changed.
-
-        Args:
-            identifier: of the intake.
-            number: of the only time step of a sequence whose images are read, from 1; None: all are.
-        """
+        """Return the folder of a capture or environment; a registered one, or its time step `number`, is checked again as it may change."""
         from service.captures.admit import admit_environment, recheck_capture
 
         folder, root = self.intake_place(identifier)
@@ -61,15 +82,8 @@ class StepFiles(NamedTuple):
             admit_environment(folder, max_pixels=self.context.max_pixels)
         return folder
 
-    def intakes(self, identifiers: Iterable[str]) -> tuple[Path, ...]:
-        """Return the folders of several captures."""
-        return tuple(map(self.intake, identifiers))
-
     def intake_place(self, identifier: str) -> tuple[Path, Path | None]:
-        """Return the folder (or the file of an environment) of an intake of the job's project, and the root of a registered one.
-
-        The files of a registered one are opened beneath its folder until the step ends, whatever becomes links meanwhile.
-        """
+        """Return the folder of a capture (file of an environment) and the root of a registered one, opened beneath it until a step ends."""
         project, context = self.job.project, self.context
         row = intakes.find(context.database, identifier, project)
         if row is None:
@@ -84,19 +98,15 @@ class StepFiles(NamedTuple):
         context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
         return _named(folder, identifier), root
 
-    def environment_image(self, identifier: str | None) -> Path | None:
-        """Return the image of an environment, or None where there is none."""
+    def environment_image(self, identifier: str) -> Path:
+        """Return the image of an environment."""
         from service.captures.admit import environment_file
 
-        return None if identifier is None else environment_file(self.intake(identifier))
+        return environment_file(self.intake(identifier))
 
 
 def file_within(capture: Path, name: str, field: str) -> Path:
-    """Return the path of a file in the folder of a capture, beside those that the manifest names.
-
-    Raises:
-        RequestError: the name leads out of the folder, or there is no such file.
-    """
+    """Return the path of a file in the folder of a capture, which must not lead out of it, beside those that the manifest names."""
     place = None if "\0" in name else resolved(capture / name)
     if place is None or not place.is_relative_to(capture.resolve()):
         raise RequestError(f"{field}: {name!r} leads out of the capture's folder")
@@ -111,16 +121,7 @@ def files_within(capture: Path, names: Iterable[str], field: str) -> tuple[Path,
 
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:
-    """Return a sentence for users of the service, without the folders of the server, whose places are not theirs to know.
-
-    A registered capture is named by its identifier, and the file of an environment by its name. Any other file is named below the data
-    folder or the root.
-
-    Args:
-        text: the sentence, of an error.
-        job: identifier of the job that it is about.
-        context: of the worker.
-    """
+    """Return the sentence of a job's error with identifiers and names in place of folders of the server, which are not users' to know."""
     names = {f"{context.cache.parent}/": ""}
     for row in intakes.read_by(context.database, job):
         names |= {f"{root}/": "" for root in context.roots_of(row["project"])}

@@ -22,24 +22,14 @@ class Stopped(Exception):
 
 
 class JobProgress:
-    """A Progress of one step, which stops the step if the worker no longer has the job.
-
-    While the database does not answer, the step continues and nothing is recorded.
-    """
+    """A Progress of one step, which stops if the worker no longer has the job; while the database does not answer, it continues."""
 
     def __init__(self, database: Database, claim: Claim, *, alive: Callable[[], None], frame_offset: int = 0,
                  frame_count: int | None = None, begun: Sequence[str] = (), reached: int | None = None, shown: int = 0) -> None:
-        """Create the progress of a step.
+        """Create the progress of a step, after `frame_offset` frames of a job of `frame_count`; None: it makes no frames.
 
-        Args:
-            database: of the service.
-            claim: of the worker.
-            alive: called at every sign of progress.
-            frame_offset: frames of the steps before this one.
-            frame_count: frames of the whole job; None: it makes no frames.
-            begun: names of the stages that the step came to with workers that died.
-            reached: frames that the job has had, if workers died since: one more is recorded at once; None: in its turn.
-            shown: frames that the job has had in any case: no fewer are shown while a worker that took over looks at them again.
+        `begun` are the stages that the step came to with workers that died; `reached` are the frames that the job has had, if workers died
+        since: one more is recorded at once. No fewer than `shown` are told while a worker that took over looks at them again.
         """
         self._database, self._claim = database, claim
         self._alive, self._frame_offset, self._frame_count, self._shown = alive, frame_offset, frame_count, shown
@@ -51,7 +41,7 @@ class JobProgress:
         self._begun, self._new_stage, self._repeating = list(begun), False, bool(begun)
         self._reached = reached
         self._logged: str | None = None
-        self.guard: Callable[[], None] = _nothing
+        self.guard: Callable[[], None] = lambda: None
         """Called before each record of the progress; what it raises ends the step."""
 
     def begin(self, kind: str) -> None:
@@ -80,11 +70,7 @@ class JobProgress:
         self.advance(0)
 
     def advance(self, done: int) -> None:
-        """Record the progress, at most every EVERY_S.
-
-        Raises:
-            Stopped: the job was cancelled, or another worker has it.
-        """
+        """Record the progress, at most every EVERY_S; raise Stopped if the job was cancelled or another worker has it."""
         self._alive()
         with self._lock:
             if self._stopped:
@@ -113,7 +99,3 @@ class JobProgress:
                 self._record_at = time.monotonic() + UNANSWERED_S
             if self._stopped:
                 raise Stopped
-
-
-def _nothing() -> None:
-    pass

@@ -17,7 +17,6 @@ from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
-from service.server.jobs.queue_order import set_order
 
 WORK, CHECKS = "work", "checks"
 """The queues: jobs that need a device, and quick checks of captures and environments."""
@@ -29,14 +28,12 @@ VERSION = "1"
 SERIALIZER = DBOSPortableJSONSerializer()
 HIGHEST = 101
 """DBOS starts the lowest priority first and counts from 1; a request's highest priority, 100, goes first."""
+SCHEMAS = {"sqlite": None, "postgresql": "dbos"}
+"""The schema of the tables of DBOS, by the kind of database; SQLite has no schemas."""
 
 
 def prepare(settings: Settings, database: Database) -> None:
-    """Make the data folder, and the tables of the service and of the queue, if they do not exist.
-
-    Raises:
-        DatabaseError: the tables are those of another version.
-    """
+    """Make the data folder, and the tables of the service and of the queue, if they do not exist."""
     settings.data.mkdir(parents=True, exist_ok=True)
     upgrade(database)
     DBOS.migrate(settings.sqlalchemy_url)
@@ -62,7 +59,6 @@ class JobQueue:
     """Submits, cancels and returns jobs."""
 
     def __init__(self, database: Database) -> None:
-        """Args: database: of the service, prepared."""
         self._database = database
         self._client = DBOSClient(system_database_engine=database.engine, serializer=SERIALIZER, lazy=True, retry_connection_errors=False)
 
@@ -77,13 +73,14 @@ class JobQueue:
     def enqueue(self, connection: sa.Connection, job: str, attempt: int, request: JobRequest, priority: int, project: str) -> None:
         """Queue an attempt of a job in the caller's transaction: behind the project's jobs of higher priority, and not behind others'."""
         self._client.enqueue_in_transaction(connection, {
-            "workflow_name": WORKFLOW, "queue_name": _queue(isinstance(request, CheckJob)), "workflow_id": workflow_id(job, attempt),
-            "app_version": VERSION, "priority": HIGHEST - priority, "queue_partition_key": project}, job, attempt)
-        set_order(connection, workflow_id(job, attempt), created_at=int(time.time() * 1000))
+            "workflow_name": WORKFLOW, "queue_name": CHECKS if isinstance(request, CheckJob) else WORK,
+            "workflow_id": workflow_id(job, attempt), "app_version": VERSION, "priority": HIGHEST - priority,
+            "queue_partition_key": project}, job, attempt)
+        _set_order(connection, workflow_id(job, attempt), created_at=int(time.time() * 1000))
 
     def set_priority(self, connection: sa.Connection, job: str, attempt: int, priority: int) -> None:
         """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays."""
-        set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
+        _set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
 
     def cancel(self, job: str, attempt: int) -> None:
         """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
@@ -131,7 +128,7 @@ class JobQueue:
         job, _ = job_and_attempt(workflow)
         row = jobs.find(self._database, job)
         if row is not None:
-            self._client.resume_workflow(workflow, queue_name=_queue(row["request"]["kind"] == "check"))
+            self._client.resume_workflow(workflow, queue_name=CHECKS if row["request"]["kind"] == "check" else WORK)
 
     def forget(self, job: str) -> None:
         """Delete the workflows of all attempts of a job, and of the workers that helped."""
@@ -139,5 +136,13 @@ class JobQueue:
         self._client.delete_workflows([status.workflow_id for status in found])
 
 
-def _queue(is_check: bool) -> str:
-    return CHECKS if is_check else WORK
+def _set_order(connection: sa.Connection, workflow: str, **values: int) -> None:
+    """Set the priority of a queued workflow, of which the lowest goes first, or `created_at`, in milliseconds since 1970.
+
+    DBOS 3.4 sets the priority of a workflow only when it is queued, a new attempt would lose the place among equals, and with SQLite it
+    orders the jobs of one second and one priority by their random names. So this writes the two columns by which DBOS orders its queues;
+    `test_workers_take_jobs_by_priority_and_time_and_projects_take_turns` fails if a later version orders them otherwise.
+    """
+    workflows = sa.table("workflow_status", sa.column("workflow_uuid", sa.Text), *map(sa.column, values),
+                         schema=SCHEMAS[connection.dialect.name])
+    connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(**values))

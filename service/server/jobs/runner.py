@@ -18,7 +18,7 @@ from service import __version__
 from service.errors import USER_ERRORS, DivergedError, sentence
 from service.reporting.provenance import places_named
 from service.requests.jobs import CheckJob
-from service.requests.views.states import ENDED, FAILED, SUCCEEDED
+from service.requests.states import ENDED, FAILED, SUCCEEDED
 from service.server.base import telemetry
 from service.server.base.log import logger
 from service.server.database import intakes, jobs
@@ -48,14 +48,7 @@ class JobRunner:
     """Run the jobs that the queues give to a worker."""
 
     def __init__(self, context: WorkerContext, worker: str, *, alive: Callable[[float], None]) -> None:
-        """Create a runner.
-
-        Args:
-            context: what the steps need.
-            worker: name of the worker.
-            alive: called at every sign of progress. Its argument is the time, in monotonic seconds, since which the step that has been
-                silent longest has given no sign; 0 when no step runs.
-        """
+        """Create a runner; `alive` gets the oldest of the last signs of the running steps, or 0 without a step, at every sign."""
         self._context, self._worker, self._alive = context, worker, alive
         self._draining = threading.Event()
         self._changed = threading.Condition()

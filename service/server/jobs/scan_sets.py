@@ -6,9 +6,11 @@ Their scan sets name the depths of other jobs by the identifiers of these, which
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
 from service.requests.jobs import FuseJob, RegisterJob
 from service.server.jobs.context import Job, JobStep, WorkerContext
@@ -22,27 +24,20 @@ if TYPE_CHECKING:
 
 def step_of(job: Job, request: RegisterJob | FuseJob, context: WorkerContext) -> JobStep:
     """Return the step of a job."""
-    def lead(files: StepFiles) -> None:
+    def do(progress: Progress, *, leads: bool) -> None:
         from service.scans.pieces import SharedPieces
 
         pieces = JobPieces(context, job)
-        _do(request, files, SharedPieces(pieces, leads=True, invite=pieces.invite))
-        pieces.remove()
+        files = StepFiles(job, context, progress)
+        sharing = SharedPieces(pieces, leads=True, invite=pieces.invite) if leads else SharedPieces(pieces, leads=False)
+        if isinstance(request, RegisterJob):
+            _register(request, files, sharing)
+        else:
+            _fuse(request, files, sharing)
+        if leads:
+            pieces.remove()
 
-    def help_lead(files: StepFiles) -> None:
-        from service.scans.pieces import SharedPieces
-
-        _do(request, files, SharedPieces(JobPieces(context, job), leads=False))
-
-    return JobStep(request.kind, lambda progress: lead(StepFiles(job, context, progress)),
-                   help=lambda progress: help_lead(StepFiles(job, context, progress)))
-
-
-def _do(request: RegisterJob | FuseJob, files: StepFiles, sharing: "SharedPieces") -> None:
-    if isinstance(request, RegisterJob):
-        _register(request, files, sharing)
-    else:
-        _fuse(request, files, sharing)
+    return JobStep(request.kind, partial(do, leads=True), help=partial(do, leads=False))
 
 
 def _register(request: RegisterJob, files: StepFiles, sharing: "SharedPieces") -> None:
@@ -54,7 +49,7 @@ def _register(request: RegisterJob, files: StepFiles, sharing: "SharedPieces") -
     scans = ScanSet(schema="relit.scan-set/1", name=request.name or files.job.id, scans=tuple(
         ScanEntry(name=depth, path=depth, maps=solve) for depth, solve in zip(request.depths, maps, strict=True)))
     with _in_folder(scans, files, files.job.id) as folder:
-        wanted = RegisterRequest(scan_set=folder, out=files.out, **dict(request.options))
+        wanted = files.request(RegisterRequest, request, scan_set=folder, out=files.out)
         if not sharing.leads:
             help_register(wanted, files.progress, sharing)
             return
@@ -72,7 +67,7 @@ def _fuse(request: FuseJob, files: StepFiles, sharing: "SharedPieces") -> None:
 
     _, scans = read_scan_set(files.maps(request.registered) / SCAN_SET_FILE)
     with _in_folder(scans, files, request.registered) as folder:
-        wanted = FuseRequest(scan_set=folder, out=files.out, device=files.device, **dict(request.options))
+        wanted = files.request(FuseRequest, request, scan_set=folder, out=files.out)
         if sharing.leads:
             fuse(wanted, files.progress, sharing)
         else:

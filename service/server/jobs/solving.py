@@ -106,9 +106,7 @@ def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tupl
 def _solve_request(request: SolveJob, number: int | None, files: StepFiles) -> "SolveRequest":
     from service.requests.solve import SolveRequest
 
-    ball = None if request.reference_ball is None else files.intake(request.reference_ball)
-    return SolveRequest(capture=files.intake(request.capture, number), out=files.out, reference_ball=ball, device=files.device,
-                        cache=files.cache(request.capture), **dict(request.options), **dict(request.sequence))
+    return files.request(SolveRequest, request, capture=files.intake(request.capture, number), out=files.out, **dict(request.sequence))
 
 
 def _depth_request(request: DepthJob, number: int | None, files: StepFiles) -> "DepthRequest":
@@ -116,7 +114,5 @@ def _depth_request(request: DepthJob, number: int | None, files: StepFiles) -> "
 
     capture = files.intake(request.capture, number)
     calibration = None if request.tof_calibration is None else file_within(capture, request.tof_calibration, "tof_calibration")
-    options = dict(request.options) | {"tof": TofOptions(calibration=calibration, **dict(request.options.tof))}
-    beside = None if request.beside is None else files.intake(request.beside)
-    return DepthRequest(capture=capture, beside=beside, out=files.out, device=files.device, cache=files.cache(request.capture), **options,
-                        **dict(request.sequence))
+    tof = TofOptions(calibration=calibration, **dict(request.options.tof))
+    return files.request(DepthRequest, request, capture=capture, out=files.out, tof=tof, **dict(request.sequence))

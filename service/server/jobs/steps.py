@@ -6,17 +6,8 @@ from pathlib import Path
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
+from service.requests import jobs
 from service.requests.base.identifiers import CAPTURE
-from service.requests.jobs import (
-    CheckJob,
-    DepthJob,
-    ExportJob,
-    FuseJob,
-    PipelineJob,
-    RegisterJob,
-    RelightJob,
-    SolveJob,
-)
 from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
 from service.server.jobs import scan_sets, solving
@@ -39,7 +30,7 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     def closing(run: Callable[[Progress], None]) -> Callable[[Progress], None]:
         def step(progress: Progress) -> None:
             with held:
-                if not isinstance(job.request, CheckJob):  # which does not decode, and may run beside another step
+                if not isinstance(job.request, jobs.CheckJob):  # which does not decode, and may run beside another step
                     decoders = Decoders(context.max_pixels)
                     held.callback(decoders.close)
                     held.enter_context(images.decoded_by(decoders))
@@ -53,27 +44,27 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
 
 def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     request = job.request
-    if isinstance(request, CheckJob):
+    if isinstance(request, jobs.CheckJob):
         return [JobStep("check", lambda progress: _check(request, StepFiles(job, context, progress)))]
-    if isinstance(request, SolveJob | DepthJob):
+    if isinstance(request, jobs.SolveJob | jobs.DepthJob):
         return solving.steps(job, request, context)
-    if isinstance(request, RegisterJob | FuseJob):
+    if isinstance(request, jobs.RegisterJob | jobs.FuseJob):
         return [scan_sets.step_of(job, request, context)]
-    if isinstance(request, RelightJob):
+    if isinstance(request, jobs.RelightJob):
         return _frames(job, request, context)
-    if not isinstance(request, PipelineJob):
+    if not isinstance(request, jobs.PipelineJob):
         name, do = ONE_STEP[type(request)]
         return [JobStep(name, lambda progress: do(request, StepFiles(job, context, progress)))]
-    solve = SolveJob(kind="solve", capture=request.capture, options=request.solve, sequence=request.sequence)
-    asset = ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
-    relight = RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
-                         maps=job.id if request.guided else None, options=request.relight)
+    solve = jobs.SolveJob(kind="solve", capture=request.capture, options=request.solve, sequence=request.sequence)
+    asset = jobs.ExportJob(kind="export", maps=job.id, format=request.format, options=request.export)
+    relight = jobs.RelightJob(kind="relight", capture=request.capture, environment=request.environment, keys=request.keys,
+                              maps=job.id if request.guided else None, options=request.relight)
     return [*solving.steps(job, solve, context),
             JobStep("export", lambda progress: export(asset, StepFiles(job, context, progress))),
             *(_frames(job, relight, context) if request.environment is not None or request.keys is not None else [])]
 
 
-def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobStep]:
+def _frames(job: Job, request: jobs.RelightJob, context: WorkerContext) -> list[JobStep]:
     numbers = frame_numbers(request.options.frames, 1)
     chunks = [numbers[at : at + job.chunk_frames] for at in range(0, len(numbers), job.chunk_frames)]
 
@@ -88,7 +79,7 @@ def _frames(job: Job, request: RelightJob, context: WorkerContext) -> list[JobSt
     return [step(chunk) for chunk in chunks]
 
 
-def _check(request: CheckJob, files: StepFiles) -> None:
+def _check(request: jobs.CheckJob, files: StepFiles) -> None:
     from service.captures.check_process import check_in_process
 
     context, project = files.context, files.job.project
@@ -102,7 +93,7 @@ def _check(request: CheckJob, files: StepFiles) -> None:
         connection, settings, quotas.PIXELS, project, more))
 
 
-def _relight(request: RelightJob, chunk: list[int], files: StepFiles) -> None:
+def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> None:
     from service.relight.relight import relight
     from service.requests.relight import RelightRequest
     from stage.files import write_text
@@ -110,10 +101,7 @@ def _relight(request: RelightJob, chunk: list[int], files: StepFiles) -> None:
     out = files.out
     if request.keys is not None:
         write_text(out / KEYS_FILE, request.keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
-    wanted = RelightRequest(capture=files.intake(request.capture), environment=files.environment_image(request.environment),
-                            keys=None if request.keys is None else out / KEYS_FILE, out=str(out / layout.FRAMES),
-                            maps=None if request.maps is None else files.maps(request.maps), device=files.device,
-                            cache=files.cache(request.capture), **dict(request.options))
+    wanted = files.request(RelightRequest, request, keys=None if request.keys is None else out / KEYS_FILE, out=str(out / layout.FRAMES))
     for part in _parts(chunk, out) if files.job.is_resumed else [chunk]:
         relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress)
 

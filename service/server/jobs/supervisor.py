@@ -79,7 +79,6 @@ class Supervisor:
     """Starts and watches one worker process for each device."""
 
     def __init__(self, settings: Settings, devices: list[str]) -> None:
-        """Args: settings: of the service. devices: one worker is started on each."""
         self._settings = settings
         self._spawn = multiprocessing.get_context("spawn")  # a forked process cannot use CUDA
         self._slots = [_Slot(device) for device in devices]

@@ -9,7 +9,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
-from service.requests.views.states import QUEUED
+from service.requests.states import QUEUED
 from service.server.base.log import logger
 from service.server.database import jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
@@ -30,17 +30,10 @@ class Takeover:
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
                  running: Callable[[], frozenset[str]], beat: Callable[[], None], lock_lost: Callable[[], None]) -> None:
-        """Create the thread; `start` starts it.
+        """Create the thread of the worker that holds `lock`; `start` starts it.
 
-        Args:
-            database, queue: of the service.
-            lock: of this worker, held.
-            worker: name of this worker.
-            every_s: seconds between two rounds.
-            max_lost: workers that a job may lose without progress.
-            running: returns the workflows that run in this process.
-            beat: called every round.
-            lock_lost: called when another process has this worker's lock for good.
+        Every `every_s` seconds it calls `beat`. `running` returns the workflows that run in this process, `max_lost` is the number of
+        workers that a job may lose without progress, and `lock_lost` is called when another process has this worker's lock for good.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
         self._every_s, self._max_lost = every_s, max_lost

@@ -42,7 +42,6 @@ class FileWorkerLock:
     """Locks on the files of a folder."""
 
     def __init__(self, folder: Path, worker: str) -> None:
-        """Args: folder: of the locks. worker: name of this worker."""
         self._folder, self._worker = folder, worker
         self._file: int | None = None
 
@@ -87,7 +86,6 @@ class AdvisoryWorkerLock:
     """Advisory locks of one PostgreSQL session."""
 
     def __init__(self, database: Database, worker: str) -> None:
-        """Args: database: of the service. worker: name of this worker."""
         self._engine, self._worker = database.engine, worker
         self._session: sa.Connection | None = None
 

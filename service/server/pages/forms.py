@@ -136,9 +136,5 @@ def _bare(kind: Any) -> Any:
 
 
 def _limits(limit: Any) -> list[tuple[str, float]]:
-    found = []
-    for name, place in (("ge", "low"), ("gt", "low"), ("le", "high"), ("lt", "high")):
-        value = getattr(limit, name, None)
-        if isinstance(limit, Ge | Gt | Le | Lt) and value is not None:
-            found.append((place, float(value)))
-    return found
+    names = {"ge": "low", "gt": "low", "le": "high", "lt": "high"} if isinstance(limit, Ge | Gt | Le | Lt) else {}
+    return [(place, float(value)) for name, place in names.items() if (value := getattr(limit, name, None)) is not None]

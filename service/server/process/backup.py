@@ -26,7 +26,7 @@ import sqlalchemy as sa
 
 from service import __version__
 from service.errors import RequestError
-from service.requests.views.states import ACTIVE
+from service.requests.states import ACTIVE
 from service.server.base.settings import Settings
 from service.server.database import tables
 from service.server.database.engine import Database, connect, usable
@@ -68,17 +68,7 @@ class _Contents(NamedTuple):
 
 
 def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Backup:
-    """Copy the database and the files of a service, which may run meanwhile.
-
-    Args:
-        settings: of the service.
-        out: folder that does not exist or is empty.
-        copy_objects: whether to copy the objects of `storage_url` too, in place of naming them.
-
-    Raises:
-        RequestError: there is no service, the folder is not empty, or the database cannot be copied; nothing is changed in the service.
-        StorageError: the folder cannot be written.
-    """
+    """Copy a service, which may run meanwhile, to a new folder; objects of `storage_url` are named unless `copy_objects` is set."""
     if settings.is_sqlite and not settings.sqlite_file.exists():
         raise RequestError(f"data {settings.data}: there is no service in this folder")
     if out.resolve().is_relative_to(settings.data):
@@ -124,18 +114,7 @@ def backup(settings: Settings, out: Path, *, copy_objects: bool = False) -> Back
 
 
 def restore(settings: Settings, folder: Path, *, accept_differences: bool = False) -> Backup:
-    """Make a service from a backup; workers take over the jobs that ran when it was made.
-
-    Args:
-        settings: of the new service, whose data folder is empty and whose database has no tables.
-        folder: the backup.
-        accept_differences: whether objects of the store may be missing, or differ from those that the backup names.
-
-    Raises:
-        RequestError: the backup is not whole or damaged, the store lacks objects of it, or there is a service already; nothing is changed
-            then.
-        StorageError: the data folder cannot be written, or the store not be read or written.
-    """
+    """Make a service from a backup, in an empty data folder and database; `accept_differences`: the store may hold other objects."""
     files, stored = _contents(folder)
     kind = SQLITE if settings.is_sqlite else DUMP
     if kind not in files:
@@ -203,14 +182,11 @@ def _restore_objects(settings: Settings, folder: Path, files: dict[str, dict[str
 
 def _copy_sqlite(source: Path, target: Path) -> None:
     """Copy a database by SQLite's own means, which see one moment of it."""
-    reading, writing = sqlite3.connect(f"file:{source}?mode=ro", uri=True), sqlite3.connect(target)
-    try:
-        reading.backup(writing)
-    except sqlite3.Error as error:
-        raise RequestError(f"data {source.parent}: the database in it cannot be copied ({error})") from None
-    finally:
-        reading.close()
-        writing.close()
+    with closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True)) as reading, closing(sqlite3.connect(target)) as writing:
+        try:
+            reading.backup(writing)
+        except sqlite3.Error as error:
+            raise RequestError(f"data {source.parent}: the database in it cannot be copied ({error})") from None
     target.chmod(0o600)
 
 

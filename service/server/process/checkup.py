@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from sqlalchemy.exc import DBAPIError
 
-from service.requests.views.states import ACTIVE, ENDED
+from service.requests.states import ACTIVE, ENDED
 from service.server.base.settings import Settings, unknown_variables
 from service.server.database import jobs, keys, workers
 from service.server.database.engine import Database, DatabaseError, connect

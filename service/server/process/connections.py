@@ -68,7 +68,6 @@ class Connections:
     """The open connections of this process. Everything runs in the event loop."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
-        """Args: limits: from `limits_of`."""
         self._limits = limits
         self._count = 0
         self._of_address: Counter[str] = Counter()
@@ -123,7 +122,6 @@ class GuardedConnection(H11Protocol):
     """A connection of a client: HTTP/1.1 as uvicorn speaks it, within bounds."""
 
     def __init__(self, connections: Connections, **of_uvicorn: Any) -> None:
-        """Args: connections: of the process. of_uvicorn: config, server_state and app_state."""
         super().__init__(**of_uvicorn)
         self._all = connections
         self._entered = False

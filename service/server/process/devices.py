@@ -16,11 +16,7 @@ CPU = "cpu"
 
 
 def of_workers(settings: "Settings") -> list[str]:
-    """Return the device of each worker that `relit serve` starts: those of the settings, else every CUDA device, else the CPU.
-
-    Raises:
-        DeviceError: a device is not on this machine.
-    """
+    """Return the device of each worker that `relit serve` starts: those of the settings, else every CUDA device, else the CPU."""
     from service.server.base.settings import NO_WORKER
 
     if settings.devices == (NO_WORKER,):
@@ -31,11 +27,7 @@ def of_workers(settings: "Settings") -> list[str]:
 
 
 def resolve(device: str | None) -> str:
-    """Return the name of a device of this machine; None: of the best.
-
-    Raises:
-        DeviceError: the device is not on this machine.
-    """
+    """Return the name of a device of this machine; None: of the best. Raise DeviceError if it is not on this machine."""
     return device if device == CPU else _elsewhere(_resolve, device)
 
 

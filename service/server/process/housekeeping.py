@@ -16,8 +16,8 @@ import sqlalchemy as sa
 from service.server.base.log import logger
 from service.server.base.settings import Settings
 from service.server.database import audit, idempotency, intakes, jobs, workers
-from service.server.database.clock import ClockWatch
 from service.server.database.engine import UNANSWERED, Database, message_of
+from service.server.database.tables import clock as clock_table
 from service.server.jobs.queue import JobQueue
 from service.server.jobs.worker_lock import FileWorkerLock
 from service.server.storage import layout
@@ -35,6 +35,12 @@ UNFINISHED_S = DAY_S
 FORGET_S = HOUR_S
 """Seconds after which a worker that has not been seen is forgotten. Two rounds in a row must find it so: after the database was unreachable
 for as long, its workers are seen again between the two rounds."""
+WAIT_S = 86_400.0
+"""Seconds after a jump for which nothing is removed for its age: an operator reads the log and sets the clock meanwhile."""
+STEP_S = 3600.0
+"""Seconds by which a clock may be set forth or back without being a jump."""
+DOWNTIME_S = 86_400.0
+"""Seconds for which the service may be away without its clock being doubted: how long it was really away, nobody knows."""
 
 
 class Housekeeper:
@@ -42,13 +48,7 @@ class Housekeeper:
 
     def __init__(self, settings: Settings, database: Database, storage: Storage, queue: JobQueue, *,
                  clock: Callable[[], float] = time.time, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """Create the thread; `start` starts it.
-
-        Args:
-            settings, database, storage, queue: of the service.
-            clock: returns seconds since 1970.
-            monotonic: returns seconds that do not jump when the clock is set.
-        """
+        """Create the thread; `start` starts it. `clock` is in seconds since 1970, `monotonic` does not jump when the clock is set."""
         self._settings, self._database, self._storage, self._queue, self._clock = settings, database, storage, queue, clock
         self._watch = ClockWatch(database, now=clock, monotonic=monotonic)
         self._parts = open_upload_parts(settings, database, storage)
@@ -114,8 +114,7 @@ class Housekeeper:
             logger.info("job removed", job=row["id"], project=row["project"])
 
     def _uploads(self) -> None:
-        removed = self._parts.expire(self._clock() - self._settings.upload_hours * HOUR_S)
-        if removed:
+        if removed := self._parts.expire(self._clock() - self._settings.upload_hours * HOUR_S):
             logger.info("uploads removed", count=removed)
 
     def _tokens(self) -> None:
@@ -123,8 +122,7 @@ class Housekeeper:
 
     def _audit(self) -> None:
         now = self._clock()
-        removed = audit.prune(self._database, before=now - self._settings.audit_days * DAY_S, now=now)
-        if removed:
+        if removed := audit.prune(self._database, before=now - self._settings.audit_days * DAY_S, now=now):
             logger.info("lines of the audit log removed", count=removed)
 
     def _workers(self) -> None:
@@ -188,3 +186,35 @@ def _clear(folder: Path) -> None:
     else:
         drop_folder(folder)
     logger.info("stack cache removed", capture=folder.name)
+
+
+class ClockWatch:
+    """Looks at the clock now and then, and tells whether ages by it count.
+
+    A clock that jumps years ahead would make every job old at once. So the time at each look is recorded, and compared at the next look
+    with the time that has really passed; after a jump, ages count again only when the clock has gone on steadily for WAIT_S.
+    """
+
+    def __init__(self, database: Database, *, now: Callable[[], float], monotonic: Callable[[], float]) -> None:
+        self._database, self._now, self._monotonic = database, now, monotonic
+        self._looked: float | None = None
+
+    def steady(self) -> bool:
+        """Record the time, and return whether the clock has gone on without a jump for WAIT_S."""
+        now, monotonic = self._now(), self._monotonic()
+        row = self._database.row(sa.select(clock_table))
+        passed = 0.0 if self._looked is None else monotonic - self._looked
+        waits_s = 0.0 if row is None else max(0.0, row["waits_s"] - passed)
+        if row is not None:
+            jump = now - row["seen_at"] - passed
+            if not -STEP_S <= jump <= (DOWNTIME_S if self._looked is None else STEP_S):
+                logger.error("the clock jumped: for a day nothing is removed for its age", jump_s=round(jump))
+                waits_s = WAIT_S
+        self._database.transact(lambda connection: _record(connection, now, waits_s))
+        self._looked = monotonic
+        return waits_s == 0.0
+
+
+def _record(connection: sa.Connection, now: float, waits_s: float) -> None:
+    if connection.execute(clock_table.update().values(seen_at=now, waits_s=waits_s)).rowcount == 0:
+        connection.execute(clock_table.insert().values(id=1, seen_at=now, waits_s=waits_s))

@@ -12,7 +12,7 @@ from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
 from service.requests.jobs import CheckJob, PipelineJob, ViewJob
 from service.requests.relight import RelightOptions
-from service.requests.views.states import REFUSED, SUCCEEDED
+from service.requests.states import REFUSED, SUCCEEDED
 from service.server.database import intakes, jobs
 from service.server.database.engine import Database
 from service.server.database.keys import DEFAULT_PROJECT
@@ -36,13 +36,7 @@ class SampleResults(NamedTuple):
 
 
 def show_sample(address: str, database: Database, queue: JobQueue, storage: Storage, sample: Path, made: SampleResults | None) -> None:
-    """Register the sample and its environment, add results that were made of it, and print what to try.
-
-    Args:
-        address, database, queue, storage: of the service.
-        sample: folder of the capture, with environment.exr.
-        made: results, which are added unless the service has some already; None: nothing is added.
-    """
+    """Register the sample and its environment.exr, add results that were made of it unless there are some, and print what to try."""
     capture = _registered(database, queue, CAPTURE, sample)
     sky = _registered(database, queue, ENVIRONMENT, sample / "environment.exr")
     pipeline = PipelineJob(kind="pipeline", capture=capture, environment=sky, relight=OPTIONS)

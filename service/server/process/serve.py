@@ -24,16 +24,7 @@ from service.server.base.settings import Settings
 from service.server.database.engine import Database, open_database
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
-from service.server.process import devices
-from service.server.process.connections import (
-    AT_ONCE,
-    BACKLOG,
-    ConnectionLimits,
-    Connections,
-    GuardedConnection,
-    limits_of,
-    raise_descriptors,
-)
+from service.server.process import connections, devices
 from service.server.process.housekeeping import Housekeeper
 from service.server.process.processes import configure, hear_signals
 from service.server.storage.objects import Storage, open_storage
@@ -46,20 +37,11 @@ go as it happens, and take 60 KB each."""
 
 
 def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None) -> None:
-    """Serve until SIGTERM or SIGINT; then let steps and requests end.
-
-    Args:
-        settings: of the service.
-        before_answering: called before the service answers, with its address, its database, its queue and its storage.
-
-    Raises:
-        RequestError: the address, the data folder or the database cannot be used.
-        DeviceError: a device is not on this machine.
-    """
+    """Serve until SIGTERM or SIGINT, then let steps and requests end; `before_answering` gets the address and the parts of the service."""
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
     configure(settings)
-    limits = limits_of(settings, raise_descriptors())
+    limits = connections.limits_of(settings, connections.raise_descriptors())
     listening = _listen(settings)
     database = open_database(settings, prepare)
     supervisor = Supervisor(settings, devices.of_workers(settings))
@@ -106,26 +88,26 @@ class _Server(uvicorn.Server):
         to_thread.current_default_thread_limiter().total_tokens = THREADS
         await super().startup(sockets)
         for listening in sockets or ():
-            listening.listen(BACKLOG)  # asyncio has made it AT_ONCE, which it uses for both
+            listening.listen(connections.BACKLOG)  # asyncio has made it connections.AT_ONCE, which it uses for both
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
 
 
-def http_server(app: Any, settings: Settings, limits: ConnectionLimits) -> uvicorn.Server:
+def http_server(app: Any, settings: Settings, limits: connections.ConnectionLimits) -> uvicorn.Server:
     """Return the HTTP server around an ASGI app, without signal handlers."""
-    connection = partial(GuardedConnection, Connections(limits))
+    connection = partial(connections.GuardedConnection, connections.Connections(limits))
     return _Server(uvicorn.Config(
         app, http=cast(type[asyncio.Protocol], connection), ws="none", log_config=None, access_log=False, server_header=False,
-        timeout_graceful_shutdown=CLOSE_S, backlog=AT_ONCE, proxy_headers=bool(settings.trusted_proxies),
+        timeout_graceful_shutdown=CLOSE_S, backlog=connections.AT_ONCE, proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies)))
 
 
 def _listen(settings: Settings) -> socket.socket:
     try:
         family, *_, address = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=BACKLOG)
+        listening = socket.create_server((str(address[0]), settings.port), family=family, backlog=connections.BACKLOG)
         # connections inherit it: without it the body of an answer waits 40 ms for the client to acknowledge the headers
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return listening

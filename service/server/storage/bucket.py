@@ -48,33 +48,26 @@ class Bucket:
     """The objects below a URL."""
 
     def __init__(self, url: str) -> None:
-        """Create the bucket; the store is not asked anything.
-
-        Args:
-            url: s3://bucket/prefix or file:///folder.
-
-        Raises:
-            RequestError: the URL is of another kind, or obstore is not installed.
-        """
+        """Create the bucket s3://bucket/prefix or file:///folder; the store is not asked anything."""
         self.url = url.rstrip("/")
         self._store = _store(url, retries=RETRIES, retry_s=RETRY_S, request_s=REQUEST_S)
         self._probe = _store(url, retries=PROBE_RETRIES, retry_s=PROBE_S, request_s=PROBE_S)
+        import obstore  # which _store has found
+
+        self._api: Any = obstore
 
     def below(self, prefix: str) -> list[Object]:
         """Return all objects whose path begins with the prefix and a /."""
-        import obstore
-
         with self._told("list", prefix):
-            return _persist(lambda: [_object(meta) for batch in obstore.list(self._store, prefix=f"{prefix}/") for meta in batch])
+            return _persist(lambda: [_object(meta) for batch in self._api.list(self._store, prefix=f"{prefix}/") for meta in batch])
 
     def find(self, path: str) -> Object | None:
         """Return one object; None: there is none."""
-        import obstore
         from obstore.exceptions import GenericError
 
         with self._told("look at", path):
             try:
-                return _object(_persist(lambda: obstore.head(self._store, path)))
+                return _object(_persist(lambda: self._api.head(self._store, path)))
             except FileNotFoundError:
                 return None
             except GenericError as error:
@@ -83,16 +76,7 @@ class Bucket:
                 raise
 
     def fetch(self, found: Object, target: Path, moved: Callable[[], None]) -> None:
-        """Copy an object into a file.
-
-        Args:
-            found: the object.
-            target: the file, which is overwritten.
-            moved: called after every piece; an exception of it ends the copy.
-
-        Raises:
-            StorageError: the object cannot be read, or was replaced meanwhile.
-        """
+        """Copy an object, unless it was replaced meanwhile, into a file; `moved` is called after every piece and may raise to end it."""
 
         with storage("write", target), open(target, "wb") as file:
             for begin in range(0, found.size, PIECE_BYTES):
@@ -105,14 +89,10 @@ class Bucket:
                 moved()
 
     def _piece(self, found: Object, begin: int, end: int) -> Any:
-        import obstore
-
-        return obstore.get(self._store, found.path, options={"if_match": found.version, "range": (begin, end)}).bytes()
+        return self._api.get(self._store, found.path, options={"if_match": found.version, "range": (begin, end)}).bytes()
 
     def send(self, file: Path, path: str, moved: Callable[[], None]) -> Object:
         """Copy a file into an object, which appears complete or not at all; `moved` is that of `fetch`."""
-        import obstore
-
         with storage("read", file), open(file, "rb") as source:
             size = os.fstat(source.fileno()).st_size
             part = max(PART_BYTES, -(-size // MOST_PARTS))
@@ -120,10 +100,10 @@ class Bucket:
             def put() -> None:
                 source.seek(0)
                 if size <= part:
-                    obstore.put(self._store, path, source.read(), use_multipart=False)
+                    self._api.put(self._store, path, source.read(), use_multipart=False)
                     moved()
                 else:
-                    obstore.put(self._store, path, _parts(source, part, moved), chunk_size=part, max_concurrency=PARTS_AT_ONCE)
+                    self._api.put(self._store, path, _parts(source, part, moved), chunk_size=part, max_concurrency=PARTS_AT_ONCE)
 
             with self._told("send", path):
                 _persist(put)
@@ -134,29 +114,29 @@ class Bucket:
 
     def mark(self, path: str) -> None:
         """Write an empty object."""
-        import obstore
-
         with self._told("write", path):
-            _persist(lambda: obstore.put(self._store, path, b"", use_multipart=False))
+            _persist(lambda: self._api.put(self._store, path, b"", use_multipart=False))
 
     def delete(self, paths: list[str]) -> None:
         """Delete objects; some may be gone already."""
-
         for begin in range(0, len(paths), DELETED_AT_ONCE):
             with self._told("delete", paths[begin]):
-                _persist(partial(_delete_all, self._store, paths[begin : begin + DELETED_AT_ONCE]))
+                _persist(partial(self._delete_all, paths[begin : begin + DELETED_AT_ONCE]))
+
+    def _delete_all(self, paths: list[str]) -> None:
+        try:
+            self._api.delete(self._store, paths)
+        except FileNotFoundError:  # of a store of files, which stops at a missing one: one at a time then
+            for path in paths:
+                with suppress(FileNotFoundError):
+                    self._api.delete(self._store, path)
 
     def check(self, path: str) -> None:
-        """Write and delete an object, with few retries.
-
-        Raises:
-            StorageError: the store refuses or does not answer.
-        """
-        import obstore
-
+        """Write and delete an object, with few retries."""
         with self._told("write", path):
-            obstore.put(self._probe, path, b"relit", use_multipart=False)
-            _delete(self._probe, path)
+            self._api.put(self._probe, path, b"relit", use_multipart=False)
+            with suppress(FileNotFoundError):
+                self._api.delete(self._probe, path)
 
     @contextmanager
     def _told(self, action: str, path: str) -> Iterator[None]:
@@ -221,23 +201,6 @@ def _persist(action: Callable[[], T]) -> T:
             if BROKEN not in str(error) or time.monotonic() > until:
                 raise
         time.sleep(AGAIN_S)
-
-
-def _delete_all(store: Any, paths: list[str]) -> None:
-    import obstore
-
-    try:
-        obstore.delete(store, paths)
-    except FileNotFoundError:  # of a store of files, which stops at a missing one: one at a time then
-        for path in paths:
-            _delete(store, path)
-
-
-def _delete(store: Any, path: str) -> None:
-    import obstore
-
-    with suppress(FileNotFoundError):
-        obstore.delete(store, path)
 
 
 def _reason(error: Exception) -> str:

@@ -41,14 +41,10 @@ class FolderStorage:
     """A storage whose prefixes are folders of the data folder."""
 
     def __init__(self, root: Path) -> None:
-        """Args: root: the data folder."""
         self._root = root
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """Return a folder of this machine with files of a prefix, for reading; here nothing has to be fetched.
-
-        `names` are the files that are needed, if they exist, None all files; `progress` is told of those that are fetched.
-        """
+        """Return a folder of this machine with files of a prefix, or those `names` of them that exist, for reading; none are fetched."""
         return self._root / prefix
 
     def workspace(self, prefix: str) -> Path:
@@ -59,11 +55,7 @@ class FolderStorage:
         return folder
 
     def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
-        """Make the files in the workspace part of the storage: here they are in place, and the folder is flushed.
-
-        `progress` is told of files that are sent. `alone` says that no other worker writes there, so that temporary files are those of a
-        killed one, and are deleted.
-        """
+        """Make the files in the workspace part of the storage: here the folder is flushed; `alone`: temporary files are garbage."""
         folder = self._root / prefix
         if folder.is_dir():
             if alone:
@@ -72,11 +64,7 @@ class FolderStorage:
                 _sync(folder)
 
     def put(self, file: Path, prefix: str, name: str) -> None:
-        """Rename the file into place.
-
-        Raises:
-            StorageError: the folder cannot be written.
-        """
+        """Rename the file into place."""
         target = self._root / prefix / name
         with storage("write", target):
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -35,17 +35,12 @@ class ObjectStorage:
     """A storage whose files are the objects of a bucket."""
 
     def __init__(self, bucket: Bucket, scratch: Scratch) -> None:
-        """Args: bucket: with the objects. scratch: their copies on this machine."""
         self._bucket, self._scratch = bucket, scratch
         self._checking = threading.Lock()
         self._checked_at = -CHECK_S
 
     def local(self, prefix: str, names: Collection[str] | None = None, progress: Progress | None = None) -> Path:
-        """Return a folder with copies; a copy of the same version is not fetched again.
-
-        Raises:
-            StorageError: the store cannot be read, or a copy not be written.
-        """
+        """Return a folder with copies; a copy of the same version is not fetched again."""
         objects = self._objects(prefix)
         with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
             if names is None:
@@ -60,11 +55,7 @@ class ObjectStorage:
         return self._scratch.files(prefix)
 
     def publish(self, prefix: str, progress: Progress | None = None, *, alone: bool = True) -> None:
-        """Send the files that are new or have changed; `alone` is that of Storage.
-
-        Raises:
-            StorageError: a file cannot be sent; those that were sent are complete.
-        """
+        """Send the files that are new or have changed, each complete or not at all; `alone` is that of Storage."""
         with self._scratch.entry(prefix, _sign_of_life(progress)) as entry:
             if alone:
                 sweep(entry.files)
@@ -76,11 +67,7 @@ class ObjectStorage:
             _transfer("upload", new, send, entry, progress)
 
     def put(self, file: Path, prefix: str, name: str) -> None:
-        """Send a file, and delete it on this machine.
-
-        Raises:
-            StorageError: the file cannot be sent.
-        """
+        """Send a file, and delete it on this machine."""
         self._bucket.send(file, f"{prefix}/{name}", lambda: None)
         file.unlink()
 
@@ -166,11 +153,7 @@ Storage = FolderStorage | ObjectStorage
 
 
 def open_storage(settings: Settings) -> Storage:
-    """Open the storage that the settings name; nothing is written into it.
-
-    Raises:
-        RequestError: storage_url cannot be used.
-    """
+    """Open the storage that the settings name; nothing is written into it."""
     if settings.storage_url is None:
         return FolderStorage(settings.data)
     return ObjectStorage(Bucket(settings.storage_url), Scratch(settings.data / SCRATCH, settings.scratch_bytes))
@@ -182,10 +165,7 @@ class _Ended(Exception):
 
 def _transfer(stage: str, items: Sequence[T], move: Callable[[T, Callable[[], None]], tuple[str, str]], entry: Entry,
               progress: Progress | None) -> None:
-    """Transfer files, several at one time; the first error ends all transfers, as does an exception of `progress`.
-
-    `move` transfers one item, calls its second argument after every piece, and returns the name and the version.
-    """
+    """Transfer files by `move`, several at one time; the first error ends all transfers, as does an exception of `progress`."""
     if not items:
         return
     if progress is not None:

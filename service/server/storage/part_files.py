@@ -23,19 +23,13 @@ class PartFile:
     """An open part file, locked until it is closed. Its methods may be called from any thread, one at a time."""
 
     def __init__(self, path: Path, descriptor: int) -> None:
-        """Args: path: of the file. descriptor: open and locked, from `open`."""
         self.path = path
         self._descriptor: int | None = descriptor
         self._lock = threading.Lock()  # so that nobody writes to a descriptor that was closed meanwhile
 
     @classmethod
     def open(cls, folder: Path, upload: str) -> Self:
-        """Open and lock the part file of an upload; it is made if there is none.
-
-        Raises:
-            PartFileLocked: another request has locked it.
-            StorageError: the folder cannot be written.
-        """
+        """Open and lock the part file of an upload; it is made if there is none. PartFileLocked: another request has locked it."""
         path = _path(folder, upload)
         with storage("write", path):
             folder.mkdir(parents=True, exist_ok=True)
@@ -64,11 +58,7 @@ class PartFile:
             os.lseek(self._open(), size, os.SEEK_SET)
 
     def append(self, pieces: Sequence[bytes]) -> None:
-        """Append bytes.
-
-        Raises:
-            StorageError: there is no space left, or the disk fails.
-        """
+        """Append bytes."""
         left = sum(map(len, pieces))
         with self._lock, storage("write", self.path):
             while left:

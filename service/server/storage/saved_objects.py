@@ -26,15 +26,7 @@ class Differences(NamedTuple):
 
 
 def present(bucket: Bucket, *, pieces: bool) -> dict[str, Object]:
-    """Return the objects of captures and results by path, without those that are being deleted.
-
-    Args:
-        bucket: of the service.
-        pieces: whether to return the pieces of incomplete uploads too, which change all the time.
-
-    Raises:
-        StorageError: the store cannot be read.
-    """
+    """Return the objects of captures, results and, with `pieces`, incomplete uploads by path, without those that are being deleted."""
     removed = tuple(f"{found.path.removeprefix(f'{REMOVED}/')}/" for found in bucket.below(REMOVED))
     found = [*bucket.below(PROJECTS), *(bucket.below(layout.PIECES) if pieces else ())]
     return {each.path: each for each in found
@@ -42,11 +34,7 @@ def present(bucket: Bucket, *, pieces: bool) -> dict[str, Object]:
 
 
 def save(bucket: Bucket, folder: Path) -> dict[str, Object]:
-    """Copy the objects into a folder, and return those that were copied; one that is deleted meanwhile is left out.
-
-    Raises:
-        StorageError: an object cannot be fetched, or the folder not be written.
-    """
+    """Copy the objects into a folder, and return those that were copied; one that is deleted meanwhile is left out."""
     def fetch(found: Object) -> Object | None:
         target = folder / found.path
         with storage("write", target):
@@ -73,22 +61,14 @@ def save(bucket: Bucket, folder: Path) -> dict[str, Object]:
 
 
 def compare(bucket: Bucket, wanted: Mapping[str, tuple[int, str]]) -> Differences:
-    """Compare the objects of the store with those of a backup, each with its size and ETag.
-
-    Raises:
-        StorageError: the store cannot be read.
-    """
+    """Compare the objects of the store with those of a backup, each with its size and ETag."""
     found = present(bucket, pieces=True)
     return Differences([path for path in wanted if path not in found],
                        [path for path, entry in wanted.items() if path in found and (found[path].size, found[path].version) != entry])
 
 
 def send(bucket: Bucket, folder: Path, paths: list[str]) -> None:
-    """Send copies into the store.
-
-    Raises:
-        StorageError: an object cannot be sent.
-    """
+    """Send copies into the store."""
     with ThreadPoolExecutor(TRANSFERS, thread_name_prefix="relit-restore") as pool:
         for _ in pool.map(lambda path: bucket.send(folder / path, path, lambda: None), paths):
             pass

@@ -29,7 +29,6 @@ class Entry:
     """The copies of one prefix, while its lock is held."""
 
     def __init__(self, folder: Path) -> None:
-        """Args: folder: of the prefix."""
         self.files = folder / FILES
         self._path = folder / RECORD
         self._saved_at = time.monotonic()
@@ -66,7 +65,6 @@ class Scratch:
     """The copies of objects on this machine."""
 
     def __init__(self, root: Path, limit_bytes: int) -> None:
-        """Args: root: folder of the copies. limit_bytes: size of the prefixes that are not in use at most."""
         self._root, self._limit_bytes = root, limit_bytes
 
     def files(self, prefix: str) -> Path:

@@ -39,16 +39,10 @@ class FolderParts:
     """True if bytes can be counted before a request has ended."""
 
     def __init__(self, folder: Path, database: Database) -> None:
-        """Args: folder: of the part files. database: of the service."""
         self._folder, self._database = folder, database
 
     def open(self, upload: Row) -> PartFile:
-        """Open and lock the part file of an upload, which is made if there is none.
-
-        Raises:
-            PartFileLocked: another request has locked it.
-            StorageError: it cannot be written.
-        """
+        """Open and lock the part file of an upload, as `PartFile.open` does."""
         return PartFile.open(self._folder, upload["id"])
 
     def save(self, part: PartFile, upload: str, at: int) -> bool:
@@ -136,7 +130,6 @@ class StoredParts:
     saves_while_writing = False
 
     def __init__(self, folder: Path, database: Database, storage: Storage) -> None:
-        """Args: folder: for the files of requests, of this machine. database, storage: of the service."""
         self._folder, self._database, self._storage = folder, database, storage
         self._lock = threading.Lock()
         self._writers = set[str]()
@@ -210,11 +203,7 @@ class StoredParts:
         return removed
 
     def fetched(self, upload: Row) -> list[Path]:
-        """Return copies of the pieces of an upload, in order.
-
-        Raises:
-            StorageError: a piece cannot be fetched.
-        """
+        """Return copies of the pieces of an upload, in order."""
         names = [name for name, _ in upload["pieces"]]
         folder = self._storage.local(layout.pieces(upload["id"]), names)
         return [folder / name for name in names]

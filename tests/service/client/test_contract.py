@@ -12,10 +12,11 @@ from pydantic import TypeAdapter
 
 from service.client import Client
 from service.client.errors import Fault
+from service.requests import answers as shared_answers
+from service.requests.answers import View
 from service.requests.jobs import ExportJob, RelightJob, SolveJob, UserJob
 from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
-from service.requests.views import View, intakes, jobs
 from tests.scenes.captures import write_capture
 from tests.service.client.conftest import SKY, Between
 
@@ -152,11 +153,11 @@ def test_what_the_client_sends_is_documented_and_what_it_reads_is_promised(serve
 
 
 def test_the_shared_views_are_the_answers_of_the_document(document):
-    """Every answer in JSON is a view of service.requests.views, with the same fields, or a problem; so the client can read all of them."""
+    """Every answer in JSON is a model of service.requests.answers, with the same fields, or a problem; so the client can read all."""
     answers = {content["schema"]["$ref"].rpartition("/")[2] for path in document["paths"].values() for operation in path.values()
                for status, response in operation["responses"].items() if status.startswith("2")
                for kind, content in response.get("content", {}).items() if kind == "application/json" and "$ref" in content["schema"]}
-    shared = {model.__name__: model for module in (jobs, intakes) for model in vars(module).values()
+    shared = {model.__name__: model for model in vars(shared_answers).values()
               if isinstance(model, type) and issubclass(model, View) and model is not View}
     assert answers - shared.keys() == {"Health"}
     assert answers >= {"JobView", "JobPage", "IntakeView", "IntakePage", "ResultPage", "FileView", "FilePage"}

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from service.depth.depth import depth
+from service.requests.captures import ViewRequest
 from service.requests.depth import DepthRequest
-from service.requests.view import ViewRequest
 from service.viewing.view_files import view
 from tests.reference.view import View
 from tests.scenes.glossy import dome, write_dome, write_maps

@@ -26,7 +26,7 @@ class Shown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> Shown:
-    from service.requests.view import ViewRequest
+    from service.requests.captures import ViewRequest
     from service.viewing.view_files import view
 
     folder = tmp_path_factory.mktemp("view")

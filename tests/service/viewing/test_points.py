@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.depth.depth import depth
+from service.requests.captures import ViewRequest
 from service.requests.depth import DepthRequest
-from service.requests.view import ViewRequest
 from service.viewing import points
 from service.viewing.view_files import view
 from stage.formats.ply import read_ply

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from service.relight.relight import relight
+from service.requests.captures import ViewRequest
 from service.requests.relight import RelightRequest
-from service.requests.view import ViewRequest
 from service.viewing import relighting
 from service.viewing.view_files import view
 from stage.formats import exr

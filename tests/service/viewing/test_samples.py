@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.reporting.provenance import HASHING
-from service.requests.view import ViewRequest
+from service.requests.captures import ViewRequest
 from service.viewing import samples
 from service.viewing.view_files import view
 from stage.capture.camera import Camera

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 import pytest
 
 import service.viewing.view_files as viewing
-from service.requests.view import ViewRequest
+from service.requests.captures import ViewRequest
 from stage.results.maps import SurfaceMaps
 from tests.reference.view import View
 from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scene, write_capture, write_exr, write_image, write_manifest

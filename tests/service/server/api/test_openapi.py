@@ -15,11 +15,10 @@ import pytest
 from pydantic import BaseModel, TypeAdapter
 
 from service import __version__
+from service.requests.answers import IntakeView, JobView, ResultView
 from service.requests.base.identifiers import pattern
 from service.requests.depth import DepthRequest
 from service.requests.jobs import UserJob
-from service.requests.views.intakes import IntakeView
-from service.requests.views.jobs import JobView, ResultView
 from service.server.api.app import create_app
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority

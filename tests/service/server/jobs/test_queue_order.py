@@ -1,6 +1,6 @@
 """In which order jobs are done: projects take turns, and those of one project go by priority and by time.
 
-These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.queue_order writes.
+These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.queue writes.
 """
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id

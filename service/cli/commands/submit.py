@@ -10,8 +10,7 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.progress import ProgressBar
-from service.cli.request_commands import Given, command
-from service.cli.service.service_options import (
+from service.cli.remote import (
     CancelOption,
     KeyOption,
     ResultsOption,
@@ -21,9 +20,9 @@ from service.cli.service.service_options import (
     make_folder,
     wait_for,
 )
-from service.requests.base.address import DEFAULT_SERVER
+from service.cli.request_commands import Given, command
 from service.requests.base.base import JobRequest
-from service.requests.base.identifiers import ALPHABET, CAPTURE, ENVIRONMENT, LENGTH, pattern
+from service.requests.base.identifiers import ALPHABET, CAPTURE, DEFAULT_SERVER, ENVIRONMENT, LENGTH, pattern
 from service.requests.base.options import Option, help_text, is_document, options_of
 from service.requests.jobs import JOBS
 from service.requests.light.frame_range import frame_numbers

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from service.cli.groups import make_group
-from service.cli.service.service_options import CancelOption, KeyOption, ResultsOption, ServerOption, connected, download, wait_for
-from service.requests.base.address import DEFAULT_SERVER
+from service.cli.remote import CancelOption, KeyOption, ResultsOption, ServerOption, connected, download, wait_for
+from service.requests.base.identifiers import DEFAULT_SERVER
 
 if TYPE_CHECKING:
     from service.client import Client
-    from service.requests.views.jobs import JobView
+    from service.requests.answers import JobView
 
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help="Identifier of the job: job_….", show_default=False)]
 OutOption = Annotated[Path | None, typer.Option(

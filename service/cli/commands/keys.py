@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from service.cli.commands.server import ConfigOption, DataOption, settings_of
 from service.cli.groups import make_group
 from service.cli.printing import print_table
 from service.cli.request_commands import command
-from service.cli.service.server import ConfigOption, DataOption, settings_of
 from service.requests.keys import NewKey
 
 if TYPE_CHECKING:

@@ -27,11 +27,7 @@ CancelOption = Annotated[bool, typer.Option(
 
 @contextmanager
 def connected(server: str, key: str | None) -> "Iterator[Client]":
-    """Yield a client whose errors become one sentence and exit code 2.
-
-    Raises:
-        RequestError: the service says no, or does not answer.
-    """
+    """Yield a client whose errors become one sentence and exit code 2."""
     from service.client import Client, ClientError
     from service.errors import RequestError
 
@@ -43,11 +39,7 @@ def connected(server: str, key: str | None) -> "Iterator[Client]":
 
 
 def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrupt: bool) -> None:
-    """Wait until a job has ended, and fetch what it made into the folder `out`, if there is one.
-
-    Raises:
-        typer.Exit: with code 1: it did not succeed.
-    """
+    """Wait until a job has ended, and fetch what it made into the folder `out`, if there is one; exit with code 1 if it did not succeed."""
     from service.cli.progress import ProgressBar
     from service.client import JobEnded
 
@@ -71,11 +63,7 @@ def wait_for(client: "Client", job: str, *, out: Path | None, cancel_on_interrup
 
 
 def make_folder(out: Path) -> None:
-    """Make the folder for what a job makes.
-
-    Raises:
-        FileError: it cannot be made.
-    """
+    """Make the folder for what a job makes."""
     from service.client.local_files import file_errors
 
     with file_errors(out, "make"):

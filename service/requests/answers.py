@@ -1,0 +1,137 @@
+"""The models of the answers of the service, views for short, shared by the API and its client."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.requests.base.identifiers import JobId, UploadId
+from service.requests.jobs import AnyJob
+from service.requests.states import IntakeState, JobState
+
+Time = Annotated[datetime, Field(description="UTC.")]
+
+
+class View(BaseModel):
+    """Base of every answer; the docstring of a field is its description in the OpenAPI document."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
+class ProgressView(View):
+    """The progress of a running job."""
+
+    stage: str
+    """ingest, normals, frames …"""
+    done: int
+    total: int
+    rate: float | None
+    """Units of `done` per second, since the stage began."""
+    remaining_s: float | None
+    """Seconds until this stage ends, at that rate."""
+
+
+class JobView(View):
+    """A job."""
+
+    id: JobId
+    state: JobState
+    attempt: int
+    """1, and one more each time the job is retried or resumed."""
+    revision: int
+    """Grows with every change."""
+    priority: int
+    request: AnyJob
+    created_at: Time
+    started_at: Time | None
+    finished_at: Time | None
+    progress: ProgressView | None
+    error: str | None
+    """The reason why the job failed, in one sentence."""
+
+
+class LogEntry(View):
+    """Something that happened to a job."""
+
+    at: Time
+    attempt: int
+    text: str
+
+
+class JobLog(View):
+    """The events of a job, the oldest first; of a long log, the first thousand entries."""
+
+    entries: list[LogEntry]
+
+
+class JobPage(View):
+    """Jobs, the newest first."""
+
+    jobs: list[JobView]
+    next: JobId | None
+    """Give it as `before` for the page after this one; null: this is the last page."""
+
+
+class ResultView(View):
+    """A file that a job has made."""
+
+    name: str
+    """Path below the job's results, with / between folders."""
+    size: int
+    """Bytes."""
+    modified_at: Time
+    url: str
+    """Path of its download on this server."""
+
+
+class ResultPage(View):
+    """Files that a job has made, by name."""
+
+    results: list[ResultView]
+    next: str | None
+    """Give it as `after` for the page after this one; null: this is the last page."""
+
+
+class IntakeView(View):
+    """A capture or an environment."""
+
+    id: str
+    name: str
+    state: IntakeState
+    """receiving: takes files; checking: is being looked at; ready: jobs may use it; refused: `problem` says why."""
+    registered: bool
+    """True if it lies in a folder of the server, and was not uploaded."""
+    problem: str | None
+    facts: dict[str, Any] | None
+    """The findings of the check: captures, frames, resolution …"""
+    created_at: Time
+
+
+class IntakePage(View):
+    """Captures or environments, the newest first."""
+
+    items: list[IntakeView]
+    next: str | None
+    """Give it as `before` for the page after this one; null: this is the last page."""
+
+
+class FileView(View):
+    """A file of a capture or environment."""
+
+    upload: UploadId
+    """Its bytes are sent to, and it is deleted at, /v1/uploads/ and this."""
+    path: str
+    length: int
+    received: int
+    """Bytes that are safe."""
+    done: bool
+    sha256: str | None
+    """As the client said it; where the file is done, also as it was found."""
+
+
+class FilePage(View):
+    """Files, in the order of their paths; upper and lower case count as the same."""
+
+    files: list[FileView]
+    next: str | None
+    """Give it as `after` for the page after this one; null: this is the last page."""
