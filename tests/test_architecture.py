@@ -1,8 +1,10 @@
 """The layers of the packages, read from the imports of every module."""
 
 import ast
+import re
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -267,6 +269,49 @@ def test_what_watches_workers_starts_without_what_they_need(process, heavy):
     code = f"import sys, {process}; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def loaded_names(path: Path) -> set[str]:
+    """Return what the statements of a module bind when it is loaded."""
+    found, left = set(), list(tree_of(path).body)
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.alias):
+            found.add(node.asname or top(node.name))
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif not isinstance(node, ast.Lambda):
+            left += ast.iter_child_nodes(node)
+    return found
+
+
+def test_every_import_of_our_own_names_what_is_there():
+    """Also those of tests and benchmarks that few runs load, and of programs in strings."""
+    own = (*ROOTS, "tests", "benchmarks", "samples")
+    homes = "|".join(own)
+    files = {module_name(path): path for home in own for path in sorted((HOME / home).rglob("*.py"))}
+    texts = {name: path.read_text(encoding="utf-8").replace(r"\n", "\n") for name, path in files.items()}
+    modules = {name.rsplit(".", parts)[0] for name in files for parts in range(name.count(".") + 1)} | files.keys()
+
+    @cache
+    def there(module: str, name: str) -> bool:
+        if f"{module}.{name}" in modules or module not in files:
+            return f"{module}.{name}" in modules
+        plain = re.search(rf"^(?:(?:async )?def |class )?{name}\b", texts[module], re.MULTILINE)  # few files need to be parsed
+        return plain is not None or name in loaded_names(files[module])
+
+    missing = []
+    for name, text in texts.items():
+        for found in re.findall(rf"\b(?:from (?:{homes})\b[\w.]* import (?:\([^)]*\)|[\w ,]+)|import (?:{homes})\b[\w. ,]*)", text):
+            with suppress(SyntaxError):  # a sentence
+                node, = ast.parse(found).body
+                if isinstance(node, ast.ImportFrom):
+                    missing += [f"{name}: {node.module}.{one.name}" for one in node.names if not there(str(node.module), one.name)]
+                elif isinstance(node, ast.Import):
+                    missing += [f"{name}: {one.name}" for one in node.names if top(one.name) in own and one.name not in modules]
+    assert missing == []
 
 
 def test_references_judge_without_what_they_judge():

@@ -9,10 +9,10 @@ direction.
 import numpy as np
 
 
-def lattice(count: int) -> np.ndarray:
-    """[count, 3] unit, even over the sphere."""
+def lattice(count: int, largest_degrees: float = 180.0) -> np.ndarray:
+    """[count, 3] unit, even over the sphere, or over the cap about +z."""
     i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
+    z = 1 - (1 - np.cos(np.radians(largest_degrees))) * i / count
     turn = np.pi * (1 + 5**0.5) * i
     ring = np.sqrt(1 - z * z)
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)

@@ -116,8 +116,3 @@ def kary_digits(readings, white, black, expected):
     part = (readings - black) / (white - black)
     distance = ((part[:, None] - expected[None, :, :, None]) ** 2 * (white - black) ** 2).sum(axis=2)
     return distance.argmin(axis=1)
-
-
-def ratio(up, down, black, extent):
-    """Place by up / (up + down)."""
-    return extent * (up - black) / (up + down - 2 * black)

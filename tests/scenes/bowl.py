@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.reference.sampling import lattice
 from tests.scenes.captures import write_exr, write_image, write_manifest
 
 ALBEDO = np.array([0.8, 0.64, 0.48])
@@ -42,15 +43,7 @@ def bowl(size: int) -> Bowl:
                                "surface_z_m": float(points[..., 2][mask].mean())})
 
 
-def spread(count: int, widest_degrees: float) -> np.ndarray:
-    """[count, 3] directions spread evenly over a cap about +z."""
-    index = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(widest_degrees))) * index / count
-    turn = np.pi * (1 + 5**0.5) * index
-    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=-1)
-
-
-WALL = spread(4000, HALF_DEGREES) * [1, 1, -1]
+WALL = lattice(4000, HALF_DEGREES) * [1, 1, -1]
 """[places, 3] spread evenly over the bowl, for means."""
 
 
@@ -77,7 +70,7 @@ def under_lamp(points: np.ndarray, lamp: np.ndarray, intensity: float) -> np.nda
 def write_near(folder: Path, scene: Bowl, count: int, radii: float) -> Path:
     """A capture under point lights on a cap around the bowl's centre."""
     images, lights = [], []
-    for lamp in radii * spread(count, 75.0):
+    for lamp in radii * lattice(count, 75.0):
         images.append(with_bounces(under_lamp(scene.points, lamp, radii**2), under_lamp(WALL, lamp, radii**2).mean()))
         lights.append({"type": "point", "position_m": lamp.tolist(), "intensity": [radii**2] * 3})
     return write(folder, scene, images, lights)

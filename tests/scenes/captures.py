@@ -60,6 +60,12 @@ def write_exr(path: Path, pixels: np.ndarray, dtype: type[np.floating] = np.floa
     return path
 
 
+def rgb(path: Path, layer: str = "") -> np.ndarray:
+    """Read [rows, cols, 3] of an EXR file, or of its layer "name."."""
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    return np.stack([channels[layer + name].pixels.astype(np.float64) for name in "RGB"], axis=-1)
+
+
 def write_image(path: Path, pixels: np.ndarray, **attributes: Any) -> Path:
     """Write [rows, cols] or [rows, cols, channels] with OpenImageIO and its attributes; the array's type is the file's."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@ shadows that each casts on itself in closed form."""
 
 import numpy as np
 
+from tests.reference.sampling import lattice
 from tests.scenes.captures import Scene, render
 
 TILT = np.array([[1.0, 0.35, 0.2], [0.35, 1.5, -0.25], [0.2, -0.25, 1.2]])
@@ -13,12 +14,7 @@ NOISE = 0.003
 
 def lights(count: int, largest_degrees: float = 60.0) -> np.ndarray:
     """[count, 3] unit directions spread over the cap about the view axis, in no order."""
-    number = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(largest_degrees))) * number / count
-    turn = np.pi * (1 + 5**0.5) * number
-    ring = np.sqrt(1 - z * z)
-    found = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
-    return found[np.random.default_rng(7).permutation(count)]
+    return lattice(count, largest_degrees)[np.random.default_rng(7).permutation(count)]
 
 
 def ellipsoid(size: int = 72, count: int = 16, *, hollow: bool = False, largest_degrees: float = 60.0) -> Scene:

@@ -33,6 +33,10 @@ class Dome(NamedTuple):
         x, y = np.meshgrid(across, -across)
         return np.stack([x, y, self.height], axis=-1)
 
+    def off(self, ours: np.ndarray, truth: np.ndarray) -> float:
+        """RMS of the difference of two images over the surface, relative to that of the second."""
+        return np.sqrt(((ours - truth)[self.mask] ** 2).mean() / (truth[self.mask] ** 2).mean())
+
 
 def dome(size: int = 24) -> Dome:
     """A spherical cap of 50 degrees."""

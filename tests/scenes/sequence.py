@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tests.reference.sampling import lattice
 from tests.scenes.captures import write_exr, write_manifest
 
 SIZE = 64
@@ -23,15 +24,6 @@ class Moment(NamedTuple):
     height: np.ndarray  # [rows, cols] metres, up to a constant
     albedo: np.ndarray  # [rows, cols, 3]
     moving: np.ndarray  # [rows, cols] bool: the small dome, wherever it is
-
-
-def directions(count: int = LIGHTS) -> np.ndarray:
-    """[count, 3] unit directions within 50° of the view."""
-    index = np.arange(count) + 0.5
-    z = 1 - (1 - np.cos(np.radians(50))) * index / count
-    turn = np.pi * (1 + 5**0.5) * index
-    ring = np.sqrt(1 - z**2)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
 
 
 def moment(place: float | None, *, other: bool = False, size: int = SIZE) -> Moment:
@@ -66,7 +58,7 @@ def write_step(folder: Path, scene: Moment, *, seed: int, noise: float = 0.01, b
     """Write the capture of a step, with noise of this part of the brightest value; its lights are this much brighter than they say."""
     random, frames = np.random.default_rng(seed), []
     size = len(scene.normal)
-    for index, direction in enumerate(directions()):
+    for index, direction in enumerate(lattice(LIGHTS, 50)):
         image = np.broadcast_to(brightness, LIGHTS)[index] * scene.albedo * np.maximum(scene.normal @ direction, 0)[..., None]
         image = image + noise * random.normal(size=image.shape) * np.sqrt(image + 0.02) + PEDESTAL
         write_exr(folder / f"{index:02d}.exr", image)

@@ -1,7 +1,6 @@
 """The program, run inside the test's process."""
 
 import sys
-from collections.abc import Callable
 from typing import NamedTuple
 
 import pytest
@@ -22,26 +21,44 @@ class Outcome(NamedTuple):
     err: str
 
 
-@pytest.fixture
-def relit(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    """Run `relit ARGS`; what C libraries write on the terminal is caught too.
+class Program:
+    """Runs `relit ARGS`; what C libraries write on the terminal is caught too.
 
     Every run that succeeds is held to its progress: each stage comes to its total. Only what a service does is seen now and then.
     """
 
-    def run(*arguments: object) -> Outcome:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch, self._capfd = monkeypatch, capfd
+
+    def __call__(self, *arguments: object) -> Outcome:
         recording = Recording()
-        monkeypatch.setattr(ProgressBar, "stage", lambda _, name, total: recording.stage(name, total))
-        monkeypatch.setattr(ProgressBar, "advance", lambda _, done: recording.advance(done))
-        monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
-        capfd.readouterr()
+        self._monkeypatch.setattr(ProgressBar, "stage", lambda _, name, total: recording.stage(name, total))
+        self._monkeypatch.setattr(ProgressBar, "advance", lambda _, done: recording.advance(done))
+        self._monkeypatch.setattr(sys, "argv", ["relit", *map(str, arguments)])
+        self._capfd.readouterr()
         with pytest.raises(SystemExit) as ended:
             main()
-        out, err = capfd.readouterr()
+        out, err = self._capfd.readouterr()
         assert ended.value.code or arguments[0] in ("submit", "jobs") or not recording.faults
         return Outcome(int(ended.value.code or 0), out, err)
 
-    return run
+    def done(self, *arguments: object) -> Outcome:
+        """Run what has to succeed without a word of complaint."""
+        outcome = self(*arguments)
+        assert (outcome.code, outcome.err) == (0, "")
+        return outcome
+
+    def refused(self, *arguments: object) -> str:
+        """Return the one sentence that refuses the user's input."""
+        outcome = self(*arguments)
+        assert outcome.code == 2 and outcome.err.startswith("relit: ") and outcome.err.count("\n") == 1, outcome
+        return outcome.err
+
+
+@pytest.fixture
+def relit(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Program:
+    """The program."""
+    return Program(monkeypatch, capfd)
 
 
 @pytest.fixture(scope="session")

@@ -41,15 +41,6 @@ def test_only_what_can_be_made_again_does_not_wait_for_the_disk(tmp_path, monkey
     assert (tmp_path / "a.txt").read_text() == "whole" and len(waited) == flush
 
 
-def test_permissions_follow_the_umask(tmp_path):
-    before = os.umask(0o027)
-    try:
-        write_text(tmp_path / "a.txt", "x")
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == 0o640
-
-
 def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     target = tmp_path / "file" / "below.txt"

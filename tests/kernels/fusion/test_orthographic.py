@@ -5,6 +5,7 @@ import pytest
 
 from kernels.fusion.views import RangeImage
 from tests.kernels.fusion.scene import fuse, range_image
+from tests.kernels.fusion.test_fusion import sphere
 from tests.scenes.statue import place, shoot, shoot_parallel
 
 SIDE, PIXEL, VOXEL = 96, 2.5e-3, 2.5e-3
@@ -39,10 +40,6 @@ def test_a_tilted_plane_is_exact(device):
 
 
 RADIUS, SIGMA = 0.1, 5e-4
-
-
-def sphere(points):
-    return np.linalg.norm(points, axis=-1) - RADIUS
 
 
 def parallel_shots(count: int):

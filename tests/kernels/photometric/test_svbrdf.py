@@ -12,9 +12,8 @@ from kernels.photometric.material.material import fit_material
 from kernels.photometric.model.candidates import rings
 from kernels.photometric.model.samples import gather, to_host
 from kernels.photometric.search.diffuse_shape import choose_diffuse
-from kernels.photometric.search.hypotheses import Diffuse, RingOptions, search_normals
+from kernels.photometric.search.hypotheses import Diffuse, search_normals
 from kernels.photometric.search.normal_search import find_normals
-from kernels.photometric.search.survey import CLOSE
 from kernels.photometric.svbrdf import average_normals, nearby_shapes, solve_svbrdf
 from tests.kernels.scenes import GREY, bits, cap, store
 from tests.reference import hypotheses
@@ -256,17 +255,6 @@ def test_whole_solve_scales_and_never_gives_nan(device):
     np.testing.assert_allclose(np.median(half.diffuse_albedo[good] / once.diffuse_albedo[good]), 0.5, rtol=0.02)
 
 
-def test_confidence_falls_with_noise(device):
-    normal = tilted(100)
-    radiance = render(normal, alpha=0.25)
-    rng = np.random.default_rng(2)
-    means = []
-    for noise in (0.0, 0.05, 0.2):
-        noisy = np.maximum(radiance * (1 + noise * rng.normal(size=radiance.shape)), 0)
-        means.append(solve_svbrdf(sample(noisy, device)[0], normal, shape=Diffuse()).confidence.mean())
-    assert means[0] > means[1] > means[2]
-
-
 def test_average_of_normals():
     """Equal costs give the mean direction; a shape that costs far more has no say."""
     a, b = np.array([[0.0, 0.0, 1.0]]), twin.unit(np.array([[0.1, 0.0, 1.0]]))
@@ -295,17 +283,6 @@ def test_nearby_shapes_are_lobes():
     assert nearby_shapes(Diffuse(slope=-0.1)) == [Diffuse(slope=-0.2), Diffuse(slope=0.0)]
     assert sorted(shape.rough for shape in nearby_shapes(Diffuse(rough=0.1))) == [0.1, 0.1, 0.25]
     assert len(nearby_shapes(Diffuse(rough=0.5))) == 4
-
-
-@pytest.mark.long
-def test_more_rounds_are_an_option(device):
-    """Options reach the kernel: one round of re-weighting is worse on shadows than five."""
-    normal = tilted(100)
-    radiance = render(normal, alpha=0.25) * (np.random.default_rng(5).random((48, 100)) > 0.3)
-    samples, _ = sample(radiance, device)
-    found = [search_normals(samples, normal, shape=Diffuse(), options=RingOptions(reweightings=r), wide=CLOSE.rings) for r in (1, 5)]
-    few, many = (degrees(search.normal, normal) for search in found)
-    assert few.mean() > many.mean()
 
 
 @pytest.mark.parametrize(("rough", "slope"), [(None, 0.0), (0.4, -0.1)])

@@ -63,15 +63,6 @@ def test_digits_are_those_of_the_twin_on_noise(colour, reflected, device):
     np.testing.assert_allclose(coordinate[certain], number[certain] + 0.5, atol=1e-4)
 
 
-def test_reflected_ternary_stays_within_one_column(device):
-    patterns = kary_patterns(WIDTH, "column", base=3)
-    u = places(50000, WIDTH)
-    coordinate, _, _, status = decode(view(patterns, u, WIDTH, noise=NOISE, blur=0.6), patterns, device)
-    ok = status == Status.OK
-    assert ok.mean() > 0.97
-    assert (np.abs(coordinate - u)[ok] <= 1).mean() >= 0.997
-
-
 @pytest.mark.parametrize("options", [{}, {"reflected": False}, {"reflected": False, "colors": palette(3)}])
 def test_edges_are_right(options, device):
     """A pixel half on either side mixes two levels in one digit of a reflected code, and in all that a carry turns in a plain one."""

@@ -80,15 +80,6 @@ def test_sigma_is_that_of_the_error(steps, gain, device):
     assert ((coordinate - u)[ok] / sigma[ok]).std() == pytest.approx(1, abs=0.1)
 
 
-def test_three_periods_reach_a_seventieth_of_a_pixel_without_a_wrong_wrap(device):
-    patterns = (*phase_patterns("column", (16, 18, 21), 4), *uniform_patterns())
-    u = places(50000, WIDTH)
-    coordinate, _, _, status = decode(view(patterns, u, WIDTH, noise=NoiseModel(0.002, 5e-5)), patterns, device)
-    ok = status == Status.OK
-    assert ok.mean() > 0.999 and np.abs(coordinate - u)[ok].max() < 0.5
-    assert np.median(np.abs(coordinate - u)[ok]) <= 0.014
-
-
 @pytest.mark.parametrize("periods", [
     (17, 19, 23.5), (1024,), pytest.param((1000, 100, 12), marks=pytest.mark.long), pytest.param((40, 41.7), marks=pytest.mark.long)])
 def test_any_set_of_periods_is_the_most_likely_place(periods, device):

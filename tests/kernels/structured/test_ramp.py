@@ -8,7 +8,6 @@ from kernels.status import Status
 from kernels.structured.pattern_frames import NoiseModel, saturated_bits, upload
 from kernels.structured.ramp import decode_ramp
 from stage.patterns.ramp import ramp_patterns
-from tests.reference import structured as reference
 from tests.scenes.patterns import NOISE, frames_of, places, result, view
 
 WIDTH = 1280
@@ -28,14 +27,6 @@ def test_ratio_in_closed_form(given, pixels, device):
     np.testing.assert_allclose(amplitude, albedo / 2, rtol=1e-5)
 
 
-def test_the_twin_on_noise(device):
-    u = places(2000, WIDTH)
-    stack = view(PATTERNS, u, WIDTH, noise=NOISE)
-    coordinate, *_, status = result(decode_ramp(frames_of(stack, device), up=UP, down=DOWN, black=BLACK, extent=WIDTH, noise=NOISE), 2000)
-    ok = status == Status.OK
-    np.testing.assert_allclose(coordinate[ok], reference.ratio(stack[UP], stack[DOWN], stack[BLACK], WIDTH)[ok], atol=3e-3)
-
-
 @pytest.mark.parametrize("given", [{"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}, {"down": DOWN, "white": WHITE}])
 @pytest.mark.parametrize("gain", [0.0, 1e-3])
 def test_sigma_is_that_of_the_error(given, gain, device):
@@ -46,15 +37,6 @@ def test_sigma_is_that_of_the_error(given, gain, device):
     ok = status == Status.OK
     assert ok.mean() > 0.999
     assert ((coordinate - u)[ok] / sigma[ok]).std() == pytest.approx(1, abs=0.1)
-
-
-def test_low_noise_reaches_seven_tenths_of_a_column(device):
-    noise = NoiseModel(0.0005, 0)
-    u = places(20000, WIDTH)
-    stack = view(PATTERNS, u, WIDTH, noise=noise)
-    decoded = decode_ramp(frames_of(stack, device), up=UP, down=DOWN, black=BLACK, extent=WIDTH, noise=noise)
-    coordinate, _, _, status = result(decoded, 20000)
-    assert np.median(np.abs(coordinate - u)[status == Status.OK]) <= 0.7
 
 
 @pytest.mark.parametrize("given", [{"up": UP, "down": DOWN}, {"up": UP, "white": WHITE}, {"down": DOWN, "white": WHITE}])

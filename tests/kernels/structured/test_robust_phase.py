@@ -65,13 +65,6 @@ def test_sigma_is_that_of_the_error(gain, device):
         assert z[np.abs(z) < 8].std() == pytest.approx(1, abs=0.1) and (np.abs(z) > 8).mean() < 1e-3
 
 
-def test_micro_has_no_wrong_wrap(device):
-    u = places(50000, WIDTH)
-    coordinate, _, _, status = micro(view(MICRO, u, WIDTH, noise=NoiseModel(0.003, 1e-5)), device, noise=NoiseModel(0.003, 1e-5))
-    ok = status == Status.OK
-    assert ok.mean() > 0.95 and np.abs(coordinate - u)[ok].max() < 1
-
-
 def test_robust_codes_at_least_halve_the_error_of_a_long_period(device):
     """A quarter of the light comes over another surface; fine patterns arrive there as an even grey."""
     u = places(20000, WIDTH)

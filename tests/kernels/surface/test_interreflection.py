@@ -71,7 +71,7 @@ def plates_at_right_angles(width: float, length: float) -> float:
     return (2 * w * np.arctan(1 / w) - np.sqrt(both) * np.arctan(1 / np.sqrt(both)) + logarithm / 4) / (np.pi * w)
 
 
-@pytest.mark.parametrize("side", [20, 40])
+@pytest.mark.parametrize("side", [20, pytest.param(40, marks=pytest.mark.long)])
 def test_a_groove_has_its_closed_form(device, side):
     """The faces' mean row sum is the form factor between them. Patches at the seam are as far apart as they are large, which costs
     some of their exchange: an error that falls with the size of the patches, 12 % and 6 % of the whole here."""

@@ -6,7 +6,7 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.shadows.shadowing import exclude_shadows
-from kernels.surface.shadows import MARGIN_PIXELS, MARGIN_SLOPE, NO_REACH, Projection, extent_of, in_shadow_within
+from kernels.surface.shadows import NO_REACH, Projection, extent_of, in_shadow_within
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
 
 STEP_AT, STEP_HEIGHT = 40, 10.0
@@ -33,27 +33,6 @@ def orthographic(per_unit: float, side: int) -> Projection:
     return Projection(False, wp.vec2(per_unit, per_unit), wp.vec2(side / 2, side / 2))
 
 
-@pytest.mark.parametrize("elevation", [20.0, 35.0, 60.0])
-@pytest.mark.parametrize("unit", [1.0, 0.001])
-def test_a_step_throws_a_shadow_of_its_length(device, elevation, unit):
-    """A step of height h lit from its side at elevation e: h / tan e of the floor is dark, whatever the unit.
-
-    Tolerance: one pixel of sampling, half a pixel of the interpolated wall, and what the margins shorten it by.
-    """
-    side = 64
-    height = np.zeros((side, side), np.float32)
-    height[:, STEP_AT:] = STEP_HEIGHT * unit  # the wall faces left; light from the right
-    tangent = np.tan(np.radians(elevation))
-    dark = shadows(height, np.ones_like(height), (1.0, 0.0, tangent), orthographic(1 / unit, side), device)
-    length = dark[side // 2, :STEP_AT].sum()
-    expected = STEP_HEIGHT / tangent
-    shortened = (MARGIN_PIXELS + MARGIN_SLOPE * expected) / tangent
-    assert expected - shortened - 1.6 <= length <= expected + 0.6
-    assert not dark[:, STEP_AT:].any()  # the top of the step is free
-    lit_from_left = shadows(height, np.ones_like(height), (-1.0, 0.0, tangent), orthographic(1 / unit, side), device)
-    assert not lit_from_left.any()
-
-
 def test_up_is_up(device):
     """Rows count down and y up: light from +y is thrown over by what lies higher in the picture."""
     height = np.zeros((40, 40), np.float32)
@@ -72,27 +51,6 @@ def test_a_convex_ball_shadows_nothing(device):
     dark = shadows(height, inside, toward, orthographic(1.0, 60), device)
     lit = normal @ (toward / np.linalg.norm(toward)) > 0.05
     assert not dark[inside & lit].any()
-
-
-def test_perspective_agrees_with_the_same_scene_seen_from_far(device):
-    """A step on a plane at distance d with focal length d: as d grows the picture is the orthographic one."""
-    side, far = 64, 2000.0
-    height = np.full((side, side), -far, np.float32)
-    height[:, STEP_AT:] += STEP_HEIGHT
-    toward = (1.0, 0.1, 0.7)
-    flat = shadows(height + far, np.ones_like(height), toward, orthographic(1.0, side), device)
-    seen = shadows(height, np.ones_like(height), toward, Projection(True, wp.vec2(far, far), wp.vec2(side / 2, side / 2)), device)
-    assert (flat != seen).mean() < 0.02  # a pixel along the shadow's edge
-    assert seen[:, :STEP_AT].sum() > 200
-
-
-def test_nothing_outside_the_mask_throws_a_shadow(device):
-    height = np.zeros((40, 40), np.float32)
-    height[:, 25:] = 50.0
-    mask = np.zeros((40, 40), bool)
-    mask[:, :24] = True
-    assert not shadows(height, mask, (1.0, 0.0, 0.3), orthographic(1.0, 40), device).any()
-    assert not shadows(height, mask, (0.0, 0.0, 1.0), orthographic(1.0, 40), device).any()
 
 
 def test_shadowed_readings_leave_the_samples(device):

@@ -36,8 +36,7 @@ def change(study: Path, edit) -> None:
 
 def test_the_variances_come_back(relit, tmp_path):
     """270 degrees of freedom give the repeatability to 4 %; three operators give their σ of 0.3 µm to a factor, 30 parts theirs to 13 %."""
-    outcome = relit("gauge-board", write_study(tmp_path), "--out", tmp_path / "out")
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("gauge-board", write_study(tmp_path), "--out", tmp_path / "out")
     study = json.loads((tmp_path / "out" / "report.json").read_text())["study"]
     assert (study["parts"], study["operators"], study["trials"]) == (30, 3, 4)
     assert study["repeatability_m"] == pytest.approx(5e-7, rel=0.13)  # 3 σ
@@ -70,13 +69,11 @@ def test_regions_that_a_run_did_not_measure_are_named(relit, tmp_path):
 def test_what_is_no_study_is_one_sentence(relit, tmp_path, edit, words):
     study = write_study(tmp_path)
     change(study, edit)
-    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
-    assert outcome.code == 2 and words in outcome.err and outcome.err.count("\n") == 1, outcome.err
+    assert words in relit.refused("gauge-board", study, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_report_without_regions_is_named(relit, tmp_path):
     study = write_study(tmp_path)
     (tmp_path / "run_0_0_0" / "report.json").write_text("{}")
-    outcome = relit("gauge-board", study, "--out", tmp_path / "out")
-    assert outcome.code == 2 and "run_0_0_0/report.json: is no report of relit inspect-board" in outcome.err
+    assert "run_0_0_0/report.json: is no report of relit inspect-board" in relit.refused("gauge-board", study, "--out", tmp_path / "out")

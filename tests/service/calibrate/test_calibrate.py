@@ -79,8 +79,7 @@ def test_mirror_ball_writes_directions_and_keeps_the_rest(relit, tmp_path):
     write_exr(folder / "off.exr", np.zeros((HEIGHT, WIDTH, 3)))
     frames = json.loads((folder / "capture.json").read_text())["frames"]
     edit_manifest(folder, frames=off + frames, saturation=5.0, color_space="lin_ap1_scene")
-    outcome = relit("calibrate", "mirror-ball", folder, "--ball", CIRCLE)
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("calibrate", "mirror-ball", folder, "--ball", CIRCLE)
     lines = outcome.out.splitlines()
     assert lines[0] == f"capture  {folder}/capture.json" and lines[1] == f"report   {folder}/calibration.json"
     assert lines[2] == "lights   5 measured"
@@ -106,8 +105,7 @@ def test_the_ball_is_calibrated_once_and_the_object_swapped_in(relit, tmp_path):
         write_exr(other / f"{index:03d}.exr", np.ones((HEIGHT, WIDTH, 3)))
     before = (ball / "capture.json").read_bytes()
     mask = mask_of(tmp_path / "ball.png", render(lambertian(DIRECTIONS[0]), **GEOMETRY)[1])
-    outcome = relit("calibrate", "mirror-ball", ball, "--ball-mask", mask, "--apply-to", other)
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("calibrate", "mirror-ball", ball, "--ball-mask", mask, "--apply-to", other)
     assert (ball / "capture.json").read_bytes() == before and not (ball / "calibration.json").exists()
     lights = lights_of(other)
     assert angles_degrees(np.array([light.direction for light in lights]), DIRECTIONS).max() < 0.2
@@ -149,9 +147,8 @@ def test_two_balls_place_near_lights(relit, tmp_path):
     folder = write(tmp_path / "balls", images)
     near = {"type": "point", "position_m": [0, 0, 1], "intensity": [3, 4, 5], "axis": [0, 0, -1], "anisotropy": 1}
     edit_frame(folder, 1, light=near)
-    outcome = relit("calibrate", "light-positions", folder, "--ball-mask", masks[0], "--ball-mask", masks[1],
-                    "--ball-z-m", "0.01", "--ball-radius-m", "0.035")
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("calibrate", "light-positions", folder, "--ball-mask", masks[0], "--ball-mask", masks[1],
+               "--ball-z-m", "0.01", "--ball-radius-m", "0.035")
     lights = lights_of(folder, PointLight)
     np.testing.assert_allclose([light.position_m for light in lights], positions, atol=0.005)
     assert lights[1].intensity == (3, 4, 5) and lights[1].anisotropy == 1  # what was known of a near light stays
@@ -211,8 +208,7 @@ def test_intensity_from_the_object_itself(relit, tmp_path):
     folder = write_capture(tmp_path / "cap", scene)
     for index, direction in enumerate(scene.directions.tolist()):
         edit_frame(folder, index, light={"type": "distant", "direction": direction, "irradiance": [1, 1, 1]})
-    outcome = relit("calibrate", "intensity", folder)
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("calibrate", "intensity", folder)
     found = np.array([light.irradiance for light in lights_of(folder)])
     np.testing.assert_allclose(found, scene.irradiance / scene.irradiance.mean(axis=0), rtol=1e-5)  # float32 images
     assert report_of(folder, "intensity")["measured"] == 6

@@ -1,4 +1,4 @@
-"""relit info looks at the encoding, the brightness and the order of the lights, as tests/service/solve/test_diagnosis.py does."""
+"""relit info looks at the encoding, the brightness and the order of the lights, as tests/service/solve/lights/test_diagnosis.py does."""
 
 import numpy as np
 import pytest

@@ -111,7 +111,7 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
 
 
 def test_images_without_lights_are_solved_as_unknown_and_refused_as_known(relit, tmp_path):
-    """What `--lights unknown` makes of them is judged in tests/service/solve/test_unknown_lights.py."""
+    """What `--lights unknown` makes of them is judged in tests/service/solve/lights/test_unknown_lights.py."""
     scene = make_scene(24, 12)
     for number, image in enumerate(scene.images):
         write_exr(tmp_path / f"IMG_{number}.exr", image)

@@ -1,6 +1,7 @@
 """relit depth on projected patterns: from images on disk to depth.exr and points.ply, with a known truth."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,6 @@ import pytest
 from stage.formats import exr
 from stage.formats.ply import read_ply
 from stage.results.depth_maps import DepthMaps
-from tests.reference import projector as reference
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, files_in, write_image
 from tests.scenes.depth import (
     AMBIENT,
@@ -18,7 +18,6 @@ from tests.scenes.depth import (
     PROJECTOR,
     gray_patterns,
     make_scene,
-    manifest,
     phase_patterns,
     write_patterns,
 )
@@ -30,8 +29,7 @@ COLUMN_PX = 0.065
 
 
 def solve(relit, folder, *arguments):
-    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("depth", folder, "--out", folder / "out", *arguments)
     assert "depth.exr" in outcome.out and "points.ply" in outcome.out
     return DepthMaps.read(folder / "out" / "depth.exr"), json.loads((folder / "out" / "report.json").read_text())
 
@@ -122,14 +120,6 @@ def test_every_code(relit, tmp_path, patterns, name, worst_px):
     assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= worst_px
 
 
-def test_the_projectors_response_is_taken_off_a_ramp(relit, tmp_path):
-    write_patterns(tmp_path, SCENE, [{"code": "ramp", "axis": "column", "direction": "up"}, *BLACK_WHITE], gamma=2.2)
-    data = json.loads((tmp_path / "capture.json").read_text())
-    edit_manifest(tmp_path, projector={**data["projector"], "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
-    maps, _ = solve(relit, tmp_path)
-    assert np.median(np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]) < 0.02
-
-
 @pytest.mark.parametrize(("patterns", "name", "worst_px"), [
     ([*phase_patterns("column", 16), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
     ([*phase_patterns("column", 16, 3), *gray_patterns("column", stripe=4, inverse=False)], "phase numbered by gray", 0.02),
@@ -156,8 +146,7 @@ def test_waves_with_an_offset(relit, tmp_path):
     for code in ("phase", "modulated"):
         edit_manifest(tmp_path, projector={"resolution": [PROJECTOR.width, PROJECTOR.height]},
                       frames=[frame for frame in data["frames"] if frame["pattern"]["code"] == code])
-        outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
-        assert (outcome.code, outcome.err) == (0, "")
+        relit.done("depth", tmp_path, "--out", tmp_path / "out")
         channels, _ = exr.read(tmp_path / "out" / "depth.exr")
         mask = channels["mask.Y"] > 0.5
         assert mask[LIT].mean() > 0.9
@@ -165,14 +154,19 @@ def test_waves_with_an_offset(relit, tmp_path):
     assert max(found) < 0.05  # 16 bits; an offset that is not heeded is 5.6 and 45 columns
 
 
-def test_a_bent_wave_still_tells_white_and_black(relit, tmp_path):
+@pytest.mark.parametrize(("patterns", "most_px"), [
+    ([*phase_patterns("row", 96), *gray_patterns("column", inverse=False)], 1.0),
+    ([{"code": "ramp", "axis": "column", "direction": "up"}, *BLACK_WHITE], 0.2),
+], ids=["gray, white and black from phases", "ramp"])
+def test_the_projectors_response_is_heeded(relit, tmp_path, patterns, most_px):
     """Light = level^2.2: the mean of the wave lies at .36 of white, and the threshold of the bits half way all the same."""
-    write_patterns(tmp_path, SCENE, [*phase_patterns("row", 96), *gray_patterns("column", inverse=False)], gamma=2.2)
+    write_patterns(tmp_path, SCENE, patterns, gamma=2.2)
     data = json.loads((tmp_path / "capture.json").read_text())
     edit_manifest(tmp_path, projector={**data["projector"], "response": (np.linspace(0, 1, 256) ** 2.2).tolist()})
     maps, _ = solve(relit, tmp_path)
     assert maps.mask[LIT].mean() > 0.93
-    assert np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask].max() <= 1.0
+    off_px = np.abs(maps.projector_u - SCENE.uv[..., 0])[maps.mask]
+    assert off_px.max() <= most_px and np.median(off_px) < 0.5
 
 
 @pytest.mark.parametrize(("patterns", "words"), [
@@ -180,8 +174,9 @@ def test_a_bent_wave_still_tells_white_and_black(relit, tmp_path):
     (kary(4, 4, 1, levels=[0, 0.33, 0.67, 1]), "column kary code needs a white and a black frame"),
     (gray_patterns("column", inverse=False), "neither inverses nor a white and a black frame"),
     (phase_patterns("column", 16), "repeat after"),
+    ([*gray_patterns("column")[2:], *BLACK_WHITE], "column gray code of 7 bits has no frame of bit 6"),
 ])
-def test_missing_references_are_named(relit, tmp_path, patterns, words):
+def test_missing_frames_are_named(relit, tmp_path, patterns, words):
     write_patterns(tmp_path, SCENE, patterns)
     fails(relit, tmp_path, words)
 
@@ -197,12 +192,8 @@ def test_points_have_place_colour_and_normal(relit, tmp_path):
     linear = np.clip(linear / np.percentile(linear.max(axis=-1), 99), 0, 1)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     assert np.abs(cloud.colours - 255 * encoded).max() < 1.5
-    assert read_ply_without_normals(relit, tmp_path)
-
-
-def read_ply_without_normals(relit, folder) -> bool:
-    solve(relit, folder)
-    return read_ply(folder / "out" / "points.ply").normals is None
+    solve(relit, tmp_path)
+    assert read_ply(tmp_path / "out" / "points.ply").normals is None
 
 
 def test_the_mask_and_the_range_of_depths_hold(relit, tmp_path):
@@ -233,54 +224,24 @@ def test_bands_change_nothing(relit, tmp_path, monkeypatch, patterns):
     assert (whole.depth == parts.depth).all() and (whole.status == parts.status).all()
 
 
-def test_two_runs_write_the_same_bytes(relit, tmp_path):
-    write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
-    solve(relit, tmp_path)
-    first = [(tmp_path / "out" / name).read_bytes() for name in ("depth.exr", "points.ply")]
-    solve(relit, tmp_path)
-    assert first == [(tmp_path / "out" / name).read_bytes() for name in ("depth.exr", "points.ply")]
-
-
-def millimetres(pose):
-    return np.block([[pose[:3, :3], 1000 * pose[:3, 3:]], [np.array([[0, 0, 0, 1]])]])
-
-
-def turned(pose):
-    away = pose.copy()
-    away[:3, 0] *= -1
-    away[:3, 2] *= -1
-    return away
-
-
-@pytest.mark.parametrize(("change", "words"), [
-    ({"projector": "millimetres"}, "give the translation in metres"),
-    ({"projector": "turned"}, "the projector lights nothing that the camera sees"),
-    ({"projector": "nowhere"}, "without a baseline there is no depth"),
-    ({"far": 0.5}, "no pixel has a depth .*out_of_range"),
-])
-def test_impossible_devices_are_named(relit, tmp_path, change, words):
+@pytest.mark.parametrize(("pose", "options", "words"), [
+    (POSE * np.array([[1, 1, 1, 1000]] * 3 + [[1, 1, 1, 1]]), (), "give the translation in metres"),
+    (POSE * [-1, 1, -1, 1], (), "the projector lights nothing that the camera sees"),
+    (np.eye(4), (), "without a baseline there is no depth"),
+    (POSE, ("--far-m", 0.5), "no pixel has a depth .*out_of_range"),
+], ids=["millimetres", "turned", "nowhere", "near"])
+def test_impossible_devices_are_named(relit, tmp_path, pose, options, words):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE])
     data = json.loads((tmp_path / "capture.json").read_text())
-    poses = {"millimetres": millimetres(POSE), "turned": turned(POSE), "nowhere": np.eye(4)}
-    if isinstance(change.get("projector"), str):
-        change = {"projector": {**data["projector"], "camera_from_projector": poses[change["projector"]].tolist()}}
-    arguments = ("--far-m", change["far"]) if "far" in change else ()
-    edit_manifest(tmp_path, **{key: value for key, value in change.items() if key != "far"})
-    fails(relit, tmp_path, words, *arguments)
+    edit_manifest(tmp_path, projector={**data["projector"], "camera_from_projector": pose.tolist()})
+    fails(relit, tmp_path, words, *options)
 
 
 def fails(relit, folder, words, *arguments):
-    import re
-
     outcome = relit("depth", folder, "--out", folder / "out", *arguments)
     assert outcome.code == 2 and len(outcome.err.splitlines()) == 1
     assert re.search(words, outcome.err), outcome.err
     assert files_in(folder / "out") == set()
-
-
-def test_incomplete_codes_are_named(relit, tmp_path):
-    write_patterns(tmp_path, SCENE, [*gray_patterns("column")[2:], *BLACK_WHITE])
-    fails(relit, tmp_path, "column gray code of 7 bits has no frame of bit 6")
 
 
 def test_two_frames_of_one_pattern_are_named(relit, tmp_path):
@@ -301,20 +262,6 @@ def test_images_of_another_size_are_named(relit, tmp_path):
 def test_black_images_are_said(relit, tmp_path):
     write_patterns(tmp_path, SCENE, [*gray_patterns("column"), *BLACK_WHITE], level=0.0)
     fails(relit, tmp_path, "no pixel has a depth .*shadowed.*not seen")
-
-
-def test_columns_from_above_are_said(relit, tmp_path):
-    pose = reference.look_at((0.0, 0.3, 0.0), (0.0, 0.0, -1.4))
-    scene = make_scene(pose=pose)
-    patterns = [*phase_patterns("column", 16), *phase_patterns("column", 144)]
-    write_patterns(tmp_path, scene, patterns)
-    data = json.loads((tmp_path / "capture.json").read_text())
-    edit_manifest(tmp_path, projector={**data["projector"], "camera_from_projector": pose.tolist()})
-    write = manifest([], pose)["projector"]
-    assert write["camera_from_projector"] == pose.tolist()
-    outcome = relit("depth", tmp_path, "--out", tmp_path / "out")
-    report = json.loads((tmp_path / "out" / "report.json").read_text()) if outcome.code == 0 else None
-    assert report is None or report["pixels"]["ill_posed"] > 0
 
 
 def test_frames_of_another_kind(relit, tmp_path):

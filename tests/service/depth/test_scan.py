@@ -124,11 +124,6 @@ def test_las_holds_the_points_of_the_scan(tmp_path):
     assert np.median(np.abs(np.sort(near) - view.distance[0])) < 0.02
 
 
-def test_las_is_left_out_where_it_is_not_asked_for(tmp_path):
-    result = scan(ScanRequest(scan=write(tmp_path, ring()), out=tmp_path / "out", device="cpu"))
-    assert result.las_path is None and not (tmp_path / "out" / "points.las").exists()
-
-
 def test_las_without_laspy_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(RequestError, match=r"pip install 'relit\[las\]'"):
@@ -147,5 +142,3 @@ def test_the_command_prints_where_everything_is(tmp_path):
     command[4] = str(tmp_path / "no")
     missing = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert missing.returncode == 2 and "holds no scan.json" in missing.stderr
-
-

@@ -12,7 +12,6 @@ from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.results.depth_normals import depth_normals
 from tests.scenes.captures import edit_manifest, files_in, write_exr, write_image, write_manifest
-from tests.service.recording import Recording
 
 RIG = Path(__file__).parents[3] / "samples" / "rig"
 ROWS, COLS = 12, 20
@@ -53,8 +52,7 @@ def write(folder: Path, patterns: list[dict], *, leak: float = 0.0, ambient: flo
 
 def solve(relit, folder: Path, *arguments):
     """Direct, global, status and the report of a run."""
-    outcome = relit("separate", folder, "--out", folder / "out", "--device", "cpu", *arguments)
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("separate", folder, "--out", folder / "out", "--device", "cpu", *arguments)
     channels, metadata = exr.read(folder / "out" / "separation.exr")
     direct, indirect = (np.stack([channels[f"{name}.{c}"] for c in "RGB"], axis=-1) for name in ("direct", "global"))
     return direct, indirect, channels, metadata, json.loads((folder / "out" / "report.json").read_text())
@@ -148,12 +146,11 @@ def test_bands_do_not_show(relit, tmp_path, monkeypatch):
 
 
 def fails(relit, folder: Path, words: str, *arguments):
-    outcome = relit("separate", folder, "--out", folder / "out", *arguments)
-    assert outcome.code == 2 and len(outcome.err.splitlines()) == 1 and words in outcome.err, outcome.err
+    assert words in relit.refused("separate", folder, "--out", folder / "out", *arguments)
     assert files_in(folder / "out") == set()
 
 
-@pytest.mark.parametrize("patterns, options, words", [
+@pytest.mark.parametrize("patterns, given, words", [
     ([WHITE, BLACK], [], "frames: no period of a phase pattern has three shifts or"),
     ([*phases()[:2], BLACK], [], "frames: no period of a phase pattern has three shifts or"),
     (phases(256), [], "frames: the shortest period is 256 px, which light between"),
@@ -161,28 +158,13 @@ def fails(relit, folder: Path, words: str, *arguments):
     ([*phases(), BLACK], ["--black-level", 0.1], "--black-level 0.1: the capture has a black frame"),
     (phases(), ["--black-level", 1], "--black-level"),
     ([*phases(), phases()[0]], [], "frames 0 and 4 show one pattern"),
+    ([*phases(), BLACK, WHITE], {"gamma": 2.2}, "of the white frame: the patterns must be linear in light"),
+    ([*phases(), WHITE], {"ambient": 0.2}, "ambient light needs a black or an off frame"),
+    ([*phases(), BLACK], {"saturation": 0.01}, f"no pixel is separated ({ROWS * COLS} saturated)"),
 ])
-def test_what_cannot_be_separated_is_one_sentence(relit, tmp_path, patterns, options, words):
-    fails(relit, write(tmp_path, patterns), words, *options)
-
-
-def test_a_projector_that_is_not_linear_is_found_by_the_white_frame(relit, tmp_path):
-    fails(relit, write(tmp_path, [*phases(), BLACK, WHITE], gamma=2.2), "of the white frame: the patterns must be linear in light")
-
-
-def test_ambient_light_without_a_frame_of_it_is_found_too(relit, tmp_path):
-    fails(relit, write(tmp_path, [*phases(), WHITE], ambient=0.2), "ambient light needs a black or an off frame")
-
-
-def test_saturated_captures_are_said(relit, tmp_path):
-    fails(relit, write(tmp_path, [*phases(), BLACK], saturation=0.01), f"no pixel is separated ({ROWS * COLS} saturated)")
-
-
-def test_progress_reaches_its_totals(tmp_path):
-    told = Recording()
-    separate(SeparateRequest(capture=write(tmp_path, [*phases(), BLACK]), out=tmp_path / "out", device="cpu"), told)
-    assert not told.faults
-    assert [(stage.name, stage.total) for stage in told.stages] == [("open", 1), ("frames", 5), ("separate", ROWS), ("write", 1)]
+def test_what_cannot_be_separated_is_one_sentence(relit, tmp_path, patterns, given, words):
+    options, scene = (given, {}) if isinstance(given, list) else ([], given)
+    fails(relit, write(tmp_path, patterns, **scene), words, *options)
 
 
 @pytest.fixture(scope="module")

@@ -110,8 +110,6 @@ def test_another_place_of_the_camera_is_refused(relit, tmp_path):
 def test_inputs_are_not_replaced_and_must_be_there(relit, tmp_path):
     solved, depth, *_ = write(tmp_path)
     before = (solved / "maps.exr").read_bytes()
-    outcome = relit("join", solved, depth, "--out", solved)
-    assert outcome.code == 2 and "would replace" in outcome.err
+    assert "would replace" in relit.refused("join", solved, depth, "--out", solved)
     assert (solved / "maps.exr").read_bytes() == before
-    outcome = relit("join", solved, tmp_path / "nothing", "--out", tmp_path / "joined")
-    assert outcome.code == 2 and "run `relit depth` first" in outcome.err
+    assert "run `relit depth` first" in relit.refused("join", solved, tmp_path / "nothing", "--out", tmp_path / "joined")

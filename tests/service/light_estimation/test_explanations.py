@@ -1,4 +1,4 @@
-"""What explains images better than their manifest; tests/service/solve/test_diagnosis.py tries the whole way from a capture."""
+"""What explains images better than their manifest; tests/service/solve/lights/test_diagnosis.py tries the whole way from a capture."""
 
 import numpy as np
 import pytest

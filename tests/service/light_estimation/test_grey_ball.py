@@ -77,14 +77,6 @@ def test_noise_saturation_and_highlights():
     np.testing.assert_allclose(fit_brightness(clipped, saturated, distant(direction), view).scale, true, rtol=2e-3)
 
 
-def test_brightness_scales_with_the_light():
-    view, geometry = exact("orthographic")
-    direction = unit(0.1, 0.5, 1)
-    image = box(seen(lambertian(direction), geometry), view)
-    one, three = (fit_brightness(factor * image, None, distant(direction), view).scale for factor in (1, 3))
-    np.testing.assert_allclose(three, 3 * one, rtol=1e-9)
-
-
 def test_balls_that_show_nothing():
     view, geometry = exact("orthographic")
     image = box(seen(lambertian(unit(0, 0, 1)), geometry), view)

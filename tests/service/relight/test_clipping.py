@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from stage.formats import exr
-from tests.scenes.captures import write_exr, write_image
+from tests.scenes.captures import rgb, write_exr, write_image
 from tests.scenes.glossy import dome, write_dome, write_maps
-from tests.service.relight.test_guided import rgb
 
 SURFACE = dome()
 EVEN = np.full((16, 32, 3), 0.3)
@@ -37,13 +36,8 @@ def capture(tmp_path):
 
 
 def relight(relit, folder, out, *options):
-    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", out / "f.#.exr", *options)
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", out / "f.#.exr", *options)
     return rgb(out / "f.1.exr"), outcome.out
-
-
-def off(ours, truth):
-    return np.sqrt(((ours - truth)[SURFACE.mask] ** 2).mean() / (truth[SURFACE.mask] ** 2).mean())
 
 
 def test_bracketed_frames_give_the_frame_without_clipping(relit, capture):
@@ -54,7 +48,7 @@ def test_bracketed_frames_give_the_frame_without_clipping(relit, capture):
     clip(capture / "cap", 0.15, exposures=(4.0, 1.0, 0.25))
     for name, expected, options in (("b", truth, ()), ("c", guided, ("--maps", guide))):
         frame, out = relight(relit, capture, capture / name, *options)
-        assert off(frame, expected) < 2e-3 and "warning" not in out
+        assert SURFACE.off(frame, expected) < 2e-3 and "warning" not in out
 
 
 def test_what_is_clipped_at_every_exposure_is_said(relit, capture):
@@ -84,7 +78,7 @@ def test_a_model_that_is_brighter_fills_clipped_readings_in(relit, capture):
     clip(capture / "cap", 0.25)
     plain, _ = relight(relit, capture, capture / "b", "--weights", "smooth")
     guided, out = relight(relit, capture, capture / "c", "--maps", write_maps(capture / "maps", SURFACE))
-    assert off(guided, truth) < 0.4 * off(plain, truth)
+    assert SURFACE.off(guided, truth) < 0.4 * SURFACE.off(plain, truth)
     assert "taken from the model of --maps" in out
 
 
@@ -110,7 +104,7 @@ def test_basis_of_brackets_holds_whole_readings(relit, capture):
     layers = np.stack([[channels[f"basis.{k:03d}.{c}"] for k in range(matrix.shape[1])] for c in "RGB"]).astype(float)
     brightest = np.einsum("ck,ckyx->yxc", matrix[:, :, 0], layers)
     image = rgb(capture / "cap" / "000.exr")
-    assert off(brightest, image) < 0.01 or image.max() < 0.01
+    assert SURFACE.off(brightest, image) < 0.01 or image.max() < 0.01
 
 
 def test_solving_brackets_is_solving_whole_frames(relit, capture):

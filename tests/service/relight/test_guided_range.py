@@ -9,9 +9,8 @@ from kernels.relight.directions.direction_grid import direction_grid
 from kernels.relight.model.responses import respond
 from stage.capture.camera import Camera
 from tests.kernels.scenes import cap
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import rgb, write_exr
 from tests.scenes.glossy import PIXEL_M, dome, lat_long, reflect, write_dome, write_maps
-from tests.service.relight.test_guided import rgb
 
 SURFACE = dome()
 SUN = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
@@ -50,15 +49,9 @@ def scene(request, tmp_path_factory):
 
 def relight(relit, folder, out, *options, sky="sky.exr"):
     """The frames by their numbers; options with --frames."""
-    outcome = relit("relight", folder / "cap", "--environment", folder / sky, "--maps", folder / "maps", "--out", out / "f.##.exr",
-                    *options)
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("relight", folder / "cap", "--environment", folder / sky, "--maps", folder / "maps", "--out", out / "f.##.exr",
+               *options)
     return {int(path.name[2:4]): rgb(path) for path in out.iterdir()}
-
-
-def off(ours, truth):
-    inside = SURFACE.mask
-    return np.sqrt(((ours - truth)[inside] ** 2).mean() / (truth[inside] ** 2).mean())
 
 
 def keys(folder, **content):
@@ -79,7 +72,7 @@ def test_frames_are_those_made_alone(relit, scene, tmp_path):
     assert len(together) == FRAMES
     for number in (1, 3, FRAMES):
         alone, = relight(relit, scene, tmp_path / str(number), "--frames", str(number), *options).values()
-        assert off(together[number], alone) < 0.002
+        assert SURFACE.off(together[number], alone) < 0.002
         assert abs(together[number].sum() / alone.sum() - 1) < 0.002
         assert not np.array_equal(together[number], alone)  # they are made in two ways
 
@@ -88,7 +81,7 @@ def test_the_specular_layer_is_that_of_a_frame_alone(relit, scene, tmp_path):
     relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", "--aov", "diffuse,specular")
     relight(relit, scene, tmp_path / "b", "--frames", "1", "--aov", "diffuse,specular")
     together, alone = (rgb(tmp_path / out / "f.01.exr", "specular.") for out in "ab")
-    assert off(together, alone) < 0.002 and alone[SURFACE.mask].min() > 0
+    assert SURFACE.off(together, alone) < 0.002 and alone[SURFACE.mask].min() > 0
 
 
 def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
@@ -96,7 +89,7 @@ def test_a_whole_turn_is_no_turn(relit, scene, tmp_path):
     options = keys(tmp_path, environment=[{"frame": 1, "turn_degrees": 0}, {"frame": FRAMES, "turn_degrees": 360}])
     frames = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}", *options)
     np.testing.assert_allclose(frames[FRAMES], frames[1], rtol=HALF, atol=1e-5)
-    assert off(frames[3], frames[1]) > 0.1
+    assert SURFACE.off(frames[3], frames[1]) > 0.1
 
 
 def test_a_turn_is_a_picture_that_is_moved(relit, scene, tmp_path):
@@ -105,8 +98,8 @@ def test_a_turn_is_a_picture_that_is_moved(relit, scene, tmp_path):
     spun = relight(relit, scene, tmp_path / "a", *spin)
     moved = relight(relit, scene, tmp_path / "b", *spin, sky="rolled.exr")
     for number in (1, 2, 6):
-        assert off(moved[number], spun[number + 2]) < 0.0005
-        assert off(moved[number], spun[number]) > 0.1
+        assert SURFACE.off(moved[number], spun[number + 2]) < 0.0005
+        assert SURFACE.off(moved[number], spun[number]) > 0.1
 
 
 def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
@@ -118,7 +111,7 @@ def test_it_is_as_near_to_the_truth_as_a_frame_alone(relit, scene, tmp_path):
         truth += np.einsum("rctk,tk->rck", reflect(SURFACE.normal[:, :, None], directions[row]), sky[row] * solid_angle[row])
     together = relight(relit, scene, tmp_path / "a", "--frames", f"1-{FRAMES}")
     alone = relight(relit, scene, tmp_path / "b", "--frames", "1")
-    assert off(together[1], truth) < 1.02 * off(alone[1], truth)
+    assert SURFACE.off(together[1], truth) < 1.02 * SURFACE.off(alone[1], truth)
 
 
 def test_pixels_are_lit_alike_in_whatever_portions(relit, scene, tmp_path, monkeypatch):
@@ -159,4 +152,4 @@ def test_small_lights_of_few_frames_at_a_time_light_alike(relit, scene, tmp_path
     monkeypatch.setattr("service.relight.model_range.HORIZON_FRAMES", 2)
     apart = relight(relit, scene, tmp_path / "b", "--frames", f"1-{FRAMES}", "--spin-degrees", "20")
     for number in together:
-        assert off(apart[number], together[number]) < 0.002
+        assert SURFACE.off(apart[number], together[number]) < 0.002

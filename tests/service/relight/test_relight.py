@@ -9,7 +9,7 @@ import pytest
 
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
-from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.captures import files_in, make_scene, rgb, write_capture, write_exr
 
 SCENE = make_scene(size=16, lights=7)
 
@@ -26,9 +26,8 @@ def constant_capture(folder):
 def test_relight_under_an_even_sky_sums_to_the_sphere(relit, tmp_path):
     constant_capture(tmp_path / "cap")
     write_exr(tmp_path / "even.exr", np.ones((16, 32, 3)) * (1, 0.5, 2))
-    outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "even.exr", "--out", tmp_path / "f" / "a.###.exr",
-                    "--frames", "8-10", "--spin-degrees", "90")
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("relight", tmp_path / "cap", "--environment", tmp_path / "even.exr", "--out", tmp_path / "f" / "a.###.exr",
+                         "--frames", "8-10", "--spin-degrees", "90")
     frames, matte, warning = outcome.out.splitlines()  # the lights are all in front, the sky is not
     assert matte.startswith("matte    none: the background is lit")
     assert frames == f"frames   {tmp_path}/f/a.008.exr … a.010.exr" and "comes from directions more than" in warning
@@ -71,14 +70,8 @@ def test_one_light_is_enough_to_relight(relit, tmp_path):
 def test_one_pixel_is_enough_to_relight(relit, tmp_path):
     write_capture(tmp_path / "cap", make_scene(size=1, lights=3))
     write_exr(tmp_path / "even.exr", np.ones((2, 4, 3)))
-    outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "even.exr", "--out", tmp_path / "a.#.exr")
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("relight", tmp_path / "cap", "--environment", tmp_path / "even.exr", "--out", tmp_path / "a.#.exr")
     assert exr.read(tmp_path / "a.1.exr")[0]["R"].shape == (1, 1)
-
-
-def read_rgb(path):
-    channels, _ = exr.read(path)
-    return np.stack([channels[name] for name in "RGB"], axis=-1).astype(np.float64)
 
 
 @pytest.fixture
@@ -96,7 +89,7 @@ def lit(relit, tmp_path):
 
 def test_exposure_is_a_power_of_two(lit):
     (_, plain), (_, up) = lit("plain"), lit("up", "--exposure", "-1.5")
-    assert np.allclose(read_rgb(up / "a.01.exr"), 2**-1.5 * read_rgb(plain / "a.01.exr"), rtol=1e-3)  # half rounding of both
+    assert np.allclose(rgb(up / "a.01.exr"), 2**-1.5 * rgb(plain / "a.01.exr"), rtol=1e-3)  # half rounding of both
     assert exr.read_header(up / "a.01.exr").metadata["relit:exposure_stops"] == "-1.5"
 
 
@@ -105,7 +98,7 @@ def test_acescg_frames_are_converted_and_say_so(lit):
     assert outcome.code == 0
     # Rec.709 to AP1 with the Bradford adaptation, to the five digits that ACES publishes
     matrix = np.array([[0.61310, 0.33952, 0.04738], [0.07019, 0.91635, 0.01345], [0.02062, 0.10957, 0.86981]])
-    assert np.allclose(read_rgb(aces / "a.01.exr"), read_rgb(plain / "a.01.exr") @ matrix.T, rtol=1e-3)
+    assert np.allclose(rgb(aces / "a.01.exr"), rgb(plain / "a.01.exr") @ matrix.T, rtol=1e-3)
     metadata = exr.read_header(aces / "a.01.exr").metadata
     assert metadata["colorInteropID"] == "lin_ap1_scene"
     assert np.allclose(metadata["chromaticities"], [0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767], atol=1e-5)
@@ -115,8 +108,8 @@ def test_compressions(lit):
     frames = {name: lit(name, "--compression", name)[1] / "a.01.exr" for name in ("zip", "piz", "dwaa")}
     for name, path in frames.items():
         assert exr.read_header(path).metadata["compression"] == getattr(OpenEXR, f"{name.upper()}_COMPRESSION")
-    assert np.array_equal(read_rgb(frames["zip"]), read_rgb(frames["piz"]))
-    assert np.allclose(read_rgb(frames["zip"]), read_rgb(frames["dwaa"]), rtol=0.01)  # lossy by its nature
+    assert np.array_equal(rgb(frames["zip"]), rgb(frames["piz"]))
+    assert np.allclose(rgb(frames["zip"]), rgb(frames["dwaa"]), rtol=0.01)  # lossy by its nature
 
 
 def test_weights_keep_the_energy_and_share_it_differently(lit, tmp_path):
@@ -127,32 +120,12 @@ def test_weights_keep_the_energy_and_share_it_differently(lit, tmp_path):
         write_exr(tmp_path / "cap" / f"{index:03d}.exr", np.full((16, 16, 3), 1.0 + index))
     (_, cells), (_, smooth), (outcome, kernel) = (lit(name, "--weights", name) for name in ("cells", "smooth", "kernel"))
     assert outcome.code == 0
-    assert np.array_equal(read_rgb(lit("default")[1] / "a.01.exr"), read_rgb(kernel / "a.01.exr"))
+    assert np.array_equal(rgb(lit("default")[1] / "a.01.exr"), rgb(kernel / "a.01.exr"))
     energy = 100 * np.sin(np.pi * 15.5 / 32) * (np.pi / 32) * (2 * np.pi / 64) / 2
-    whole = read_rgb(cells / "a.01.exr")[0, 0, 0] / energy
-    shared, fitted = (read_rgb(each / "a.01.exr")[0, 0, 0] / energy for each in (smooth, kernel))
+    whole = rgb(cells / "a.01.exr")[0, 0, 0] / energy
+    shared, fitted = (rgb(each / "a.01.exr")[0, 0, 0] / energy for each in (smooth, kernel))
     assert whole == pytest.approx(1, rel=1e-3)  # half; all of it on the light in front
     assert 1.05 < shared < 7 and 1.001 < fitted < shared  # the lights beside take over more slowly than linearly
-
-
-def test_layers_of_a_frame(relit, lit, tmp_path):
-    write_capture(tmp_path / "other", SCENE)
-    assert relit("solve", tmp_path / "other", "--method", "robust", "--out", tmp_path / "maps").code == 0
-    outcome, out = lit("out", "--aov", "beauty,mask,normal, confidence", "--maps", tmp_path / "maps", capture=tmp_path / "other")
-    assert (outcome.code, outcome.err) == (0, "")
-    channels, _ = exr.read(out / "a.01.exr")
-    assert set(channels) == {"R", "G", "B", "A", "mask.Y", "normal.X", "normal.Y", "normal.Z", "confidence.Y"}
-    assert {plane.dtype for plane in channels.values()} == {np.dtype(np.float16)}
-    maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
-    assert np.array_equal(channels["mask.Y"] > 0.5, maps.mask) and np.array_equal(channels["confidence.Y"], maps.confidence)
-    for axis, name in enumerate("XYZ"):
-        assert np.array_equal(channels[f"normal.{name}"], maps.normal[..., axis].astype(np.float16))
-
-
-def test_the_mask_needs_no_maps(lit):
-    _, out = lit("out", "--aov", "mask")
-    channels, _ = exr.read(out / "a.01.exr")
-    assert set(channels) == {"R", "G", "B", "A", "mask.Y"} and np.array_equal(channels["mask.Y"] == 1, SCENE.mask)
 
 
 def test_maps_that_do_not_fit(relit, lit, tmp_path):
@@ -171,17 +144,16 @@ def test_maps_that_do_not_fit(relit, lit, tmp_path):
 def test_pixels_beyond_half_are_clipped_and_counted(lit):
     outcome, out = lit("out", "--exposure", "20", "--aov", "mask")
     assert outcome.code == 0 and "clipped  256 pixels" in outcome.out
-    assert read_rgb(out / "a.01.exr").max() == 65504
+    assert rgb(out / "a.01.exr").max() == 65504
 
 
 def test_a_map_a_frame(relit, tmp_path):
     constant_capture(tmp_path / "cap")
     for number in (9, 10, 11):
         write_exr(tmp_path / f"sky.{number:03d}.exr", np.full((8, 16, 3), float(number)))
-    outcome = relit("relight", tmp_path / "cap", "--environment", tmp_path / "sky.###.exr", "--out", tmp_path / "f" / "a.####.exr",
-                    "--frames", "9-11")
-    assert (outcome.code, outcome.err) == (0, "")
-    levels = [read_rgb(tmp_path / "f" / f"a.{number:04d}.exr").mean() for number in (9, 10, 11)]
+    relit.done("relight", tmp_path / "cap", "--environment", tmp_path / "sky.###.exr", "--out", tmp_path / "f" / "a.####.exr",
+               "--frames", "9-11")
+    levels = [rgb(tmp_path / "f" / f"a.{number:04d}.exr").mean() for number in (9, 10, 11)]
     assert np.allclose(np.array(levels) / levels[0], [1, 10 / 9, 11 / 9], rtol=1e-3)  # half
 
 

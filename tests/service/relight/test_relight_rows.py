@@ -1,6 +1,5 @@
 """Frames of images too large for a chunk of whole frames: they are written some rows at a time, and are the same files."""
 
-import hashlib
 import json
 
 import numpy as np
@@ -11,16 +10,13 @@ from service.requests.light.light_keys import SCHEMA
 from stage.errors import StorageError
 from stage.formats import exr
 from tests.scenes.captures import files_in, make_scene, write_capture, write_exr, write_image
+from tests.service.relight.test_relight_only import digests
 
 SIZE = 200
 """Rows of more than one block, the last of which is neither a multiple of a chunk nor of a pack."""
 SCENE = make_scene(size=SIZE, lights=6)
 KEY = {"frame": 1, "direction": [0, 3, 1], "irradiance": [1, 1, 3], "angle_degrees": 2}
 KEYS = {"schema": SCHEMA, "lights": [{"name": "key", "keys": [KEY]}]}
-
-
-def digests(folder):
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files_in(folder)}
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from stage.stack.brackets import merge_brackets, one_frame_a_light
 from stage.stack.ingest import open_stack
 from tests.scenes.captures import edit_frame, edit_manifest, write_exr
 from tests.scenes.polarised import PEDESTAL, polarised_scene, write_polarised
+from tests.stage.stack.test_brackets import radiance
 
 SCENE = polarised_scene(size=24, lights=12)
 HALF = 2.0**-10
@@ -24,12 +25,6 @@ def separated(folder, component, leak=0.0):
     lights = distant_lights(capture)
     merged = merge_brackets(open_stack(capture), capture.sources(), lights, component=component, leak=leak)
     return one_frame_a_light(merged, lights)
-
-
-def radiance(stack):
-    """[lights, rows, cols, 3]"""
-    values = stack.band(0, stack.shape[2])[:, : stack.light_count, : stack.pixel_count].astype(float)
-    return np.moveaxis(values * stack.scale[: stack.light_count, None], 0, -1).reshape(stack.light_count, 24, 24, 3)
 
 
 @pytest.mark.parametrize("leak", [0.0, 0.02, 0.2])

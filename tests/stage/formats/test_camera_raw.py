@@ -61,17 +61,6 @@ def test_missing_colours_are_bilinear(tmp_path):
     assert np.abs(read_pixels(tmp_path / "b.dng") - plane[..., None])[1:-1, 1:-1].max() < half_a_count
 
 
-def test_values_are_linear_in_the_light(tmp_path):
-    """Two lights add up, and twice the light is twice the value: no curve, no balance, no brightening between file and value."""
-    first, second = RNG.integers(0, 6000, (2, ROWS, COLS))
-    names = {"a": first, "b": second, "sum": first + second, "double": 2 * first}
-    for name, light in names.items():
-        write_dng(tmp_path / f"{name}.dng", (LEVELS + light).astype(np.uint16))
-    a, b, both, double = (read_pixels(tmp_path / f"{name}.dng") for name in names)
-    np.testing.assert_allclose(a + b, both, atol=2 * FLOAT32)
-    np.testing.assert_allclose(2 * a, double, atol=2 * FLOAT32)
-
-
 @pytest.mark.parametrize("orientation", TURNS)
 def test_images_are_upright(tmp_path, orientation):
     mosaic = RNG.integers(600, 14900, (ROWS, COLS)).astype(np.uint16)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from stage.patterns.base import UniformPattern
 from stage.patterns.binary import BinaryPattern, XorPattern, binary_patterns, gray_of, xor_patterns
 from stage.patterns.codes import Pattern, draw
 from stage.patterns.kary import digits_of, kary_patterns, palette
@@ -23,11 +22,6 @@ def test_seven_stripes_change_ten_times_in_binary_and_six_in_gray():
     stripes_of_lecture = np.arange(1, 8)
     assert transitions(stripes_of_lecture, 3) == 10
     assert transitions(gray_of(stripes_of_lecture), 3) == 6
-
-
-def test_stripe_five_is_101():
-    patterns = [BinaryPattern(code="binary", axis="column", bit=bit, bits=3) for bit in (2, 1, 0)]
-    assert [float(pattern.level(np.array([5.5]), np.zeros(1), 8)[0]) for pattern in patterns] == [1, 0, 1]
 
 
 def test_ternary_stripes_are_01_to_21():
@@ -119,13 +113,6 @@ def test_micro_phase_shifting_takes_two_more_images_than_periods():
     patterns = micro_patterns(1280, "column", periods=5, mean_period_px=16)
     assert len(patterns) == 7
     assert all(abs(pattern.period_px / 16 - 1) <= 0.15 for pattern in patterns)
-
-
-def test_opencv_order():
-    patterns = binary_patterns(1024, "column")
-    assert len(patterns) == 22
-    assert [(p.bit, p.inverse) for p in patterns[:4]] == [(9, False), (9, True), (8, False), (8, True)]
-    assert patterns[-2:] == (UniformPattern(code="white"), UniformPattern(code="black"))
 
 
 @pytest.mark.parametrize("call, words", [

@@ -125,10 +125,3 @@ def test_a_truncated_maps_file_is_named(tmp_path):
     with pytest.raises(ImageError, match=r"maps\.exr: is truncated"):
         SurfaceMaps.read(tmp_path / "maps.exr")
     assert files_in(tmp_path) == {"maps.exr"}
-
-
-def test_two_writes_of_the_same_maps_are_the_same_file(tmp_path):
-    maps = make_maps()
-    maps.write(tmp_path / "a.exr")
-    maps.write(tmp_path / "b.exr")
-    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()

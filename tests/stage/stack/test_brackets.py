@@ -1,5 +1,7 @@
 """Frames of one light at several exposures: merged by what each gathers, without clipped readings."""
 
+from math import isqrt
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,8 @@ def bracketed(folder, exposures=EXPOSURES, noise=0.0, strengths=(1.0, 1.0, 1.0))
 def radiance(stack):
     """[frames, rows, cols, 3]"""
     values = stack.band(0, stack.shape[2])[:, : stack.light_count, : stack.pixel_count].astype(float)
-    return np.moveaxis(values * stack.scale[: stack.light_count, None], 0, -1).reshape(stack.light_count, 12, 12, 3)
+    side = isqrt(stack.pixel_count)
+    return np.moveaxis(values * stack.scale[: stack.light_count, None], 0, -1).reshape(stack.light_count, side, side, 3)
 
 
 def test_every_frame_of_a_bracket_has_the_whole_reading(tmp_path):

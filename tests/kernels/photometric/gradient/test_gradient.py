@@ -118,13 +118,6 @@ def test_contradiction_and_occlusion_lower_the_confidence(device):
     assert fit.length[2] == pytest.approx(0.9, abs=2e-3)
 
 
-def test_twice_the_radiance_is_twice_the_albedo_and_the_same_normal(device):
-    normal = cap(9, 80)
-    shading = tinted(lambert_shading(normal, PAIRS), colours(9))
-    one, two = (diffuse(band, moments(band, PAIRS)) for band in (upload(shading, device), upload(2 * shading, device)))
-    assert np.allclose(two.albedo, 2 * one.albedo) and np.allclose(two.normal, one.normal, atol=1e-6)
-
-
 @pytest.mark.parametrize("f0", [0.04, 0.6])
 @pytest.mark.parametrize(("roughness", "lean"), [
     (0.1, (0.04, 0.03)), (0.3, (0.38, 1.37)), (0.7, (9.9, 16.2)),
@@ -248,14 +241,6 @@ def test_pixels_that_cannot_be_solved_say_why(device):
     assert not specular(band, parts).any()
     by_colour = separate_by_colour(responses, TO_CAMERA, pixel_count=7, device=device)
     assert all(np.isfinite(array.numpy()).all() for array in (*by_colour.diffuse, by_colour.specular))
-
-
-def test_one_pixel_and_odd_counts(device):
-    for count in (1, 33):
-        normal = cap(count, 30)
-        band = upload(tinted(lambert_shading(normal, THREE_AND_FULL), colours(count)), device)
-        fit = diffuse(band, moments(band, THREE_AND_FULL))
-        assert fit.normal.shape == (count, 3) and (fit.status == Status.OK).all()
 
 
 def test_calls_that_do_not_fit(device):

@@ -1,16 +1,13 @@
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kernels import packs
 from kernels.errors import ArrayError
 from kernels.photometric.lambertian.lambert import solve_lambert
-from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
+from kernels.photometric.lambertian.readings import grey_readings
 from kernels.status import Status
-from tests.kernels.scenes import GREY, angle_degrees, cap, colours, rounding_bounds, shade, solve, store
+from tests.kernels.scenes import GREY, angle_degrees, cap, colours, rounding_bounds, shade, solve
 from tests.reference import photometric as reference
 
 PIXEL_COUNTS = [1, 31, 33, 4097]
@@ -141,15 +138,6 @@ def test_saturated_readings_do_not_matter(garbage, device):
         np.testing.assert_array_equal(getattr(dirty, name), values, err_msg=name)
 
 
-def test_negative_readings_are_ignored(device):
-    normal, albedo, direction, irradiance = ball(100, 20)
-    radiance = shade(normal, albedo, direction, irradiance)
-    noise = np.where(radiance > 0, radiance, -0.01)  # what a subtracted dark frame leaves
-    clean, noisy = (solve(solve_lambert, r, direction, irradiance, device) for r in (radiance, noise))
-    np.testing.assert_array_equal(noisy.normal, clean.normal)
-    np.testing.assert_array_equal(noisy.albedo, clean.albedo)
-
-
 def test_nothing_is_nan_whatever_the_input(device):
     rng = np.random.default_rng(7)
     values = np.array([np.nan, np.inf, -np.inf, -1, 0, 1e-7, 6e-5, 1, 65504])
@@ -159,44 +147,6 @@ def test_nothing_is_nan_whatever_the_input(device):
     for name, out in solved._asdict().items():
         assert np.isfinite(out).all(), name
     assert (solved.normal[solved.status != Status.OK] == 0).all()
-
-
-@pytest.mark.parametrize("pads", [0, 1, 5])
-def test_padding_lights_have_no_influence(pads, device):
-    """The same lights, with dark ones behind them that take the count over the next multiple of 8."""
-    normal, albedo, direction, irradiance = ball(33, 8)
-    stack = store(shade(normal, albedo, direction, irradiance))
-    lights = pad_lights(direction, irradiance)
-    rows = 8 * -(-pads // 8)
-    more = np.pad(stack, ((0, 0), (0, rows), (0, 0)))
-    directions = np.pad(lights.direction, ((0, rows), (0, 0)))
-    factors = np.pad(grey_factors(lights, GREY), ((0, rows), (0, 0)))
-    normals = []
-    for values, rows_of, factor in ((stack, lights.direction, grey_factors(lights, GREY)), (more, directions, factors)):
-        band = packs.upload(values, device=device)
-        normals.append(solve_lambert(band, grey_readings(band, factor), rows_of).normal.numpy())
-    np.testing.assert_array_equal(*normals)
-
-
-def test_bands_equal_the_whole(device):
-    normal, albedo, direction, irradiance = ball(1000, 12)
-    radiance = shade(normal, albedo, direction, irradiance)
-    whole = solve(solve_lambert, radiance, direction, irradiance, device)
-    bands = pairwise([0, 64, 65, 500, 1000])
-    parts = [solve(solve_lambert, radiance[:, :, a:b], direction, irradiance, device) for a, b in bands]
-    np.testing.assert_array_equal(np.concatenate([p.normal for p in parts]), whole.normal)
-    np.testing.assert_array_equal(np.concatenate([p.albedo for p in parts]), whole.albedo)
-
-
-@settings(max_examples=15, deadline=None)
-@given(scale=st.floats(0.05, 20), seed=st.integers(0, 100))
-def test_brighter_is_whiter_and_not_turned(scale, seed):
-    normal, albedo, direction, irradiance = ball(40, 16)
-    radiance = shade(normal, albedo, direction, irradiance) * np.random.default_rng(seed).normal(1, 0.05, (3, 16, 40))
-    power = 2.0 ** np.round(np.log2(scale))  # exact in half
-    one, other = (solve(solve_lambert, r, direction, irradiance, "cpu") for r in (radiance, power * radiance))
-    np.testing.assert_allclose(other.normal, one.normal, atol=3e-4)  # readings below the normal range of half
-    np.testing.assert_allclose(other.albedo, power * one.albedo, rtol=1e-3)
 
 
 def test_directions_of_another_capture_are_refused(device):

@@ -104,18 +104,6 @@ def test_turning_the_lights_turns_the_normals(turn, seed):
 
 
 @settings(max_examples=12, deadline=None)
-@given(seed=st.integers(0, 1000))
-def test_the_order_of_the_lights_does_not_matter(seed):
-    radiance, direction, irradiance = noisy(33, 30, 0.03, seed)
-    order = np.random.default_rng(seed).permutation(30)
-    one = solve(solve_robust, radiance, direction, irradiance, "cpu")
-    other = solve(solve_robust, radiance[:, order], direction[order], irradiance[order], "cpu")
-    np.testing.assert_array_equal(other.status, one.status)
-    np.testing.assert_allclose(other.normal, one.normal, atol=1e-4)  # float32 sums in another order
-    np.testing.assert_allclose(other.weights, one.weights[order], atol=1e-3)
-
-
-@settings(max_examples=12, deadline=None)
 @given(power=st.integers(-3, 6), seed=st.integers(0, 1000))
 def test_brighter_is_whiter_and_not_turned(power, seed):
     radiance, direction, irradiance = noisy(33, 30, 0.03, seed)
@@ -124,17 +112,6 @@ def test_brighter_is_whiter_and_not_turned(power, seed):
     other = solve(solve_robust, 2.0**power * radiance, direction, irradiance, "cpu")
     np.testing.assert_allclose(other.normal, one.normal, atol=1e-6)
     np.testing.assert_allclose(other.albedo, 2.0**power * one.albedo, rtol=1e-5)
-
-
-def test_confidence_falls_with_noise(device):
-    means = []
-    for noise in (0.0, 0.02, 0.1, 0.4):
-        radiance, direction, irradiance = noisy(400, 60, noise, 4, spoiled=False)
-        solved = solve(solve_robust, radiance, direction, irradiance, device)
-        sure = solved.uncertainty().confidence[solved.status == Status.OK]
-        assert ((sure >= 0) & (sure <= 1)).all()
-        means.append(sure.mean())
-    assert means == sorted(means, reverse=True) and means[0] > means[-1] + 0.1
 
 
 @pytest.mark.parametrize("lit, status", [(0, Status.DARK), (1, Status.TOO_FEW_LIGHTS), (2, Status.TOO_FEW_LIGHTS), (3, Status.OK),
@@ -153,29 +130,11 @@ def test_status_by_the_number_of_readings(lit, status, device):
             assert (values == 0).all()
 
 
-def test_few_lights_are_all_kept(device):
-    """Ranks are set aside only while eight lights stay."""
-    direction = cap(8, 40)
-    radiance = shade(np.array([[0, 0, 1.0]]), np.ones((1, 3)), direction, np.ones((8, 3)))
-    solved = solve(solve_robust, radiance, direction, np.ones((8, 3)), device)
-    np.testing.assert_allclose(solved.weights[:, 0], 1, atol=1e-3)  # Cauchy at half rounding
-
-
 def test_coplanar_lights_are_ill_posed(device):
     along = np.linspace(-1, 1, 16)
     direction = np.stack([np.sin(along), np.zeros(16), np.cos(along)], axis=1)
     solved = solve(solve_robust, np.broadcast_to(direction[None, :, 2:], (3, 16, 1)), direction, np.ones((16, 3)), device)
     assert solved.status[0] == Status.ILL_POSED and (solved.weights == 0).all()
-
-
-@pytest.mark.parametrize("garbage", [60000.0, np.inf, np.nan])
-def test_saturated_readings_do_not_matter(garbage, device):
-    radiance, direction, irradiance = noisy(100, 40, 0.03, 8)
-    saturated = np.random.default_rng(2).random((40, 100)) < 0.25
-    clean = solve(solve_robust, np.where(saturated, 0, radiance), direction, irradiance, device)
-    dirty = solve(solve_robust, np.where(saturated, garbage, radiance), direction, irradiance, device, saturated=saturated)
-    for name, values in clean._asdict().items():
-        np.testing.assert_array_equal(getattr(dirty, name), values, err_msg=name)
 
 
 def test_nothing_is_nan_whatever_the_input(device):

@@ -90,14 +90,6 @@ def test_misfit_counts_where_many_lights_average_the_noise(lights, widest, noise
     assert (ratio > 5).mean() < 0.01
 
 
-def test_without_misfit_the_same_standard_errors_would_be_far_too_small(device):
-    """What the tests above would find if the errors of neighbouring lights were taken for independent."""
-    direction = cap(96, 45)
-    solved, misfit = solved_twice(solve_lambert, plastic(NORMALS, direction), direction, 0.003, device)
-    blind = solved.uncertainty(misfit._replace(excess=0.0)).sigma
-    assert np.median(angle_degrees(solved.normal, NORMALS) / blind) > 4
-
-
 @pytest.mark.parametrize("shining", [0.1, 0.25])
 def test_rejected_highlights_and_shadows_do_not_count(shining, device):
     """What is left is exact but for its noise, and the standard error is that of fewer readings."""
@@ -124,14 +116,6 @@ def test_a_fit_that_most_readings_contradict_is_unsure(device):
     assert wrong.mean() > 0.5
     assert np.mean(found.confidence[wrong] > 0.1) < 0.01
     assert np.mean(angle_degrees(solved.normal, NORMALS)[ok] > 5 * found.sigma[ok]) < 0.01
-
-
-def test_three_lights_leave_nothing_to_check_with(device):
-    direction = cap(3, 40)
-    normal = cap(200, 30)
-    solved = solve(solve_robust, shade(normal, np.full((200, 3), 0.7), direction, np.ones((3, 3))), direction, np.ones((3, 3)), device)
-    found = solved.uncertainty()
-    assert (found.confidence < 0.3).all() and (found.sigma > 2).all()
 
 
 def test_pairs_without_a_spare_reading_say_nothing():

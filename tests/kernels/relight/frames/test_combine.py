@@ -133,17 +133,6 @@ def test_superposition(chosen, powers):
     assert (np.abs(frame - together) <= 2.0**-11 * 1.001 * together + lit.sum() * 2.0**-25 + 1e-30).all()
 
 
-@settings(max_examples=15, deadline=None)
-@given(a=st.floats(-4, 4, width=32), b=st.floats(-4, 4, width=32), seed=st.integers(0, 100))
-def test_frames_add_up_as_their_weights_do(a, b, seed):
-    stack, first, second = captured(16, 40, seed), drawn((3, 16), seed), drawn((3, 16), seed + 1)
-    band = packs.upload(stack, device="cpu")
-    both = combining.combine(band, a * first + b * second).numpy()[:, :40]
-    one, other = (combining.combine(band, w).numpy()[:, :40] for w in (first, second))
-    size = weighted_sum(stack, abs(a) * np.abs(first) + abs(b) * np.abs(second))
-    np.testing.assert_array_less(np.abs(both - (a * one + b * other)), 20 * 2.0**-23 * size + 1e-30)  # 16 sums and the mixing
-
-
 def test_no_frame_is_no_frame(device):
     band = packs.upload(captured(8, 40), device=device)
     assert combining.combine_batch(band, np.zeros((0, 3, 8), dtype=np.float32)).shape[0] == 0

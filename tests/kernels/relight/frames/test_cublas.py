@@ -70,13 +70,6 @@ def test_frames_of_a_range_need_two_products_a_group():
     assert len(done.products) == 2 * 3
 
 
-def test_frames_are_those_of_the_product_on_the_cpu():
-    stored, weights = scene(40)
-    band = packs.upload(stored, device="cpu")
-    ours = combine_batch(band, np.abs(weights)).numpy()[:, :, :PIXELS]
-    assert np.allclose(combine_by(StandIn(), band, np.abs(weights)).numpy()[:, :, :PIXELS], ours, rtol=cublas.TOLERANCE, atol=0)
-
-
 def test_rows_that_lie_apart_in_memory():
     """A band of a mapped stack: a part of each row."""
     rng = np.random.default_rng(1)

@@ -12,7 +12,7 @@ from service.relight.weights.triangulation import triangles_between, triangulate
 from service.relight.weights.weighting import Weighting, integrate_discs
 from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
 from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, stored, upload
-from tests.kernels.scenes import HALF_ROUNDING, cap, colours, store
+from tests.kernels.scenes import cap, colours, store
 from tests.reference import shading as reference
 
 SHARE = 5e-6
@@ -93,30 +93,6 @@ def test_a_light_far_away_is_shared_out_as_smooth_weighting_does(direction, devi
         np.testing.assert_allclose(got[:3], expected, rtol=2e-3 if holes else 2e-5)
 
 
-def test_a_sample_from_a_captured_light_is_its_image(device):
-    pixels, readings, _ = scene(40)
-    for light in (0, 7, 19):
-        got, held = summed(pixels, readings, sources.far(LIGHTS[[light]], np.ones((1, 3))), LIGHTS, device)
-        np.testing.assert_allclose(got[:3], held[light], rtol=10 * SHARE)  # of the next lights, whose images are at most ten times brighter
-
-
-@pytest.mark.parametrize("given", [*NEAR.values()], ids=[*NEAR])
-def test_images_that_are_the_model_sum_to_the_model(given, device):
-    pixels, _, visible = scene(45)
-    model = reference.readings(pixels, LIGHTS, visible)
-    got, _ = summed(pixels, model, given, LIGHTS, device, visible=visible)
-    # half rounding of the images, and the steps of halves below the normal range, of readings above 1 / 8 of a stored value
-    np.testing.assert_allclose(got[:3], got[3:], rtol=HALF_ROUNDING + LOBE, atol=1e-5)
-
-
-def test_visibility_darkens_the_model_and_not_the_images(device):
-    pixels, readings, _ = scene(40)
-    seen, _ = summed(pixels, readings, ALL, LIGHTS, device)
-    hidden, _ = summed(pixels, readings, ALL, LIGHTS, device, visible=np.zeros((len(LIGHTS), 40), np.uint8))
-    np.testing.assert_array_equal(hidden[:3], seen[:3])
-    assert (hidden[3:] == 0).all() and seen[3:].min() > 0
-
-
 def test_one_image_bright_shows_what_of_the_light_it_gets(device):
     """Every pixel sees a near light elsewhere: from under it the light is at the zenith, from beside it is not."""
     pixels = scattered_pixels(2)._replace(position=np.float32([[0, 0, 0], [-2, 0, 0]]))
@@ -125,13 +101,6 @@ def test_one_image_bright_shows_what_of_the_light_it_gets(device):
     got, _ = summed(pixels, readings, sources.point(np.array([0, 0, 2.0]), np.ones(3)), AXES, device, irradiance=np.ones((6, 3)))
     np.testing.assert_allclose(got[:3, 0], 1 / 4, rtol=2 * SHARE)
     np.testing.assert_allclose(got[:3, 1], 0.5 / 8, rtol=2 * SHARE)  # half way between +x and +z, d² = 8
-
-
-def test_light_adds_up(device):
-    pixels, readings, visible = scene(40)
-    parts = [summed(pixels, readings, given, LIGHTS, device, visible=visible)[0].astype(float) for given in NEAR.values()]
-    got, _ = summed(pixels, readings, ALL, LIGHTS, device, visible=visible)
-    np.testing.assert_allclose(got, sum(parts), rtol=(ALL.count + len(LIGHTS)) * FLOAT)  # float32 sums in another order
 
 
 def test_no_light_is_black(device):

@@ -5,7 +5,7 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.relight.model import shading, sources
-from tests.kernels.relight.lights import scattered, turn
+from tests.kernels.relight.lights import scattered
 from tests.kernels.relight.surfaces import FLOAT, LOBE, facing, pack_bytes, radiance, scattered_pixels, upload
 from tests.reference import shading as reference
 from tests.reference.microfacet import distribution, smith_lambda
@@ -47,15 +47,6 @@ def test_it_is_the_twin(kind, count, device):
     got = radiance(pixels, given, device)
     assert close(got, pixels, given)
     assert np.abs(got[:3]).max() > 0.01 and np.abs(got[3:]).max() > 0.001
-
-
-def test_many_kinds_at_once(device):
-    pixels, given = scattered_pixels(70, seed=3), sources.join([lights(kind) for kind in KINDS])
-    assert given.count > 100
-    got = radiance(pixels, given, device)
-    assert close(got, pixels, given)
-    apart = sum(radiance(pixels, lights(kind), device).astype(float) for kind in KINDS)
-    np.testing.assert_allclose(got, apart, rtol=given.count * FLOAT, atol=given.count * FLOAT * np.abs(apart).max())
 
 
 def test_packs_of_four_are_packs_of_more(monkeypatch):
@@ -155,31 +146,6 @@ def test_light_below_the_horizon_lights_nothing(device):
     assert (radiance(pixels, below, device)[:, 0] == 0).all()
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_turning_everything_changes_nothing(seed, device):
-    pixels, given, rotation = scattered_pixels(40), sources.join([lights(kind) for kind in KINDS]), turn(seed)
-
-    def turned(values):
-        values = values.copy()
-        values[:, :3] = values[:, :3] @ rotation.T
-        return values
-
-    other = pixels._replace(normal=turned(pixels.normal), view=turned(pixels.view), position=turned(pixels.position))
-    got = radiance(other, given._replace(place=turned(given.place), axis=turned(given.axis)), device)
-    expected = radiance(pixels, given, device)
-    # twice what one of them may be off by, and the turned values are rounded once more
-    np.testing.assert_allclose(got, expected, rtol=4 * LOBE, atol=32 * FLOAT * given.count)
-
-
-def test_farther_light_is_weaker_by_the_square_of_the_distance(device):
-    """To infinity with an intensity of E d²: a far light."""
-    pixels, direction = scattered_pixels(40), np.array([0.48, 0.6, 0.64])
-    near = radiance(pixels, sources.point(1e5 * direction, np.full(3, 1e10)), device)
-    far = radiance(pixels, sources.far(direction[None], np.ones((1, 3))), device)
-    # pixels up to 0.5 from the origin: directions and distances differ by 5e-6 and twice that; a lobe's slope is below 4 / α = 45
-    np.testing.assert_allclose(near, far, rtol=5e-4, atol=1e-5)
-
-
 @pytest.fixture
 def rows():
     """[6, 45]: all seen, none seen, and mixtures."""
@@ -201,26 +167,6 @@ def test_visibility_is_the_twin(rows, device):
     pixels, given = scattered_pixels(45), occluded()
     assert (given.occluder.max(axis=1) >= 0).any() and (given.occluder < 0).any()
     assert close(radiance(pixels, given, device, rows), pixels, given, rows)
-
-
-def test_a_seen_row_hides_nothing_and_an_unseen_one_all(rows, device):
-    pixels, given = scattered_pixels(45), lights("far")
-    alone = radiance(pixels, given, device)
-
-    def behind(*row):
-        occluder = np.full((given.count, 3), sources.NEVER, np.int32)
-        occluder[:, : len(row)] = row
-        return given._replace(occluder=occluder)
-
-    # v · (1 / 255) is one to a float32 step or two, at the worst with the rounding of every sum
-    np.testing.assert_allclose(radiance(pixels, behind(0), device, rows), alone, rtol=1e-5, atol=1e-6)
-    assert (radiance(pixels, behind(1), device, rows) == 0).all()
-    half = behind(1, 0)._replace(share=np.tile(np.float32([0.75, 0.25, 0]), (given.count, 1)))
-    np.testing.assert_allclose(radiance(pixels, half, device, rows), 0.25 * alone, rtol=1e-5, atol=1e-6)
-    seen = rows[2] == 255
-    mixed = radiance(pixels, behind(2), device, rows)
-    assert (mixed[:, ~seen] == 0).all()
-    np.testing.assert_allclose(mixed[:, seen], alone[:, seen], rtol=1e-5, atol=1e-6)
 
 
 def test_what_nothing_hides_needs_no_shares(rows, device):

@@ -133,28 +133,6 @@ def test_spin_turns_the_environment_from_z_towards_x(spin, light, device):
     assert np.flatnonzero(cells.energy[0, :, 0]).tolist() == [light]
 
 
-def test_a_symmetry_of_the_lights_permutes_their_energy(device):
-    """Quarter turns about +y of lights that map onto themselves, and of a map whose columns do."""
-    environment = np.random.default_rng(3).gamma(0.5, 1.0, (40, 80, 3))
-    quarters = [rotation_about_y(90 * q) for q in range(4)]
-    off = np.array([[0.48, 0.6, 0.64], [0.8, -0.36, 0.48]])
-    direction = np.concatenate([off @ q.T for q in quarters])  # light i of quarter q is at 2 q + i
-    cells = integrate_cells(environment, direction, np.stack(quarters), device=device)
-    for q in range(4):
-        # the environment turned by q quarters gives a light what the light q quarters before it had
-        np.testing.assert_allclose(cells.energy[q], np.roll(cells.energy[0], 2 * q, axis=0), rtol=SUM)
-        np.testing.assert_allclose(cells.solid_angle[q], np.roll(cells.solid_angle[0], 2 * q), rtol=SUM)
-
-
-def test_turning_the_map_by_columns_is_spinning_it(device):
-    """Rolling the image by n columns turns it by n · 360/W degrees: +z is at the centre, +x to its left."""
-    environment, direction = np.random.default_rng(5).random((36, 72, 3)), cap(20, 180)
-    rolled = integrate_cells(np.roll(environment, -5, axis=1), direction, STILL, device=device)
-    spun = integrate_cells(environment, direction, rotation_about_y(25.0)[None], device=device)
-    np.testing.assert_allclose(rolled.energy, spun.energy, rtol=SUM)  # samples fall on samples
-    np.testing.assert_allclose(rolled.energy.sum(axis=1), spun.energy.sum(axis=1), rtol=SUM)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_turning_a_map_about_any_axis_is_turning_the_lights_back(seed, device):
     """A map that brightens along an axis, turned in closed form."""

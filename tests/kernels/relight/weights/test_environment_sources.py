@@ -130,19 +130,6 @@ def test_samples_light_a_pixel_as_the_map_does(device):
         np.testing.assert_allclose(lit, np.maximum(directions @ normal, 0) @ amount / np.pi, rtol=6e-3)
 
 
-def test_turning_the_map_by_columns_turns_the_samples():
-    """By a quarter, where the cuts in halves fall on the same columns."""
-    environment = noise(16, 32)
-    got, turned = sample_environment(environment, 512), sample_environment(np.roll(environment, 8, axis=1), 512)
-
-    def moment(samples):
-        return np.einsum("nx,ny,nc->xyc", samples.direction, samples.direction, samples.energy)
-
-    # columns to the right are from +z towards -x: turned by -90 degrees about +y, (x, z) → (-z, x)
-    quarter = np.array([[0, 0, -1.0], [0, 1, 0], [1, 0, 0]])
-    np.testing.assert_allclose(moment(turned), np.einsum("ax,by,xyc->abc", quarter, quarter, moment(got)), rtol=1e-9, atol=1e-12)
-
-
 def test_small_bright_places_and_the_rest_are_the_whole_map():
     environment = np.ones((64, 128, 3)) + sun(64, 128, 20, 50, 1e4) + sun(64, 128, 40, 90, 5e3)
     small, broad = split_environment(environment, np.radians(2))

@@ -9,6 +9,7 @@ from kernels.status import Status
 from kernels.tof.continuous.continuous import Noise, decode
 from kernels.tof.continuous.decide import decide
 from kernels.tof.continuous.unwrap import decay, unwrap, vote
+from tests.kernels.tof.histogram.test_returns import flat_view
 from tests.reference import tof
 
 FAR = 14.98
@@ -29,11 +30,6 @@ def solve(images, settings, device, *, far=FAR, near=0.0, noise=NOISE, shape=Non
         weighed = vote(weighed, *shape)
     result = decide(found, weighed, light_speed=tof.LIGHT)
     return {name: getattr(result, name).numpy()[: flat.shape[1]] for name in result._fields}
-
-
-def flat_view(distance, albedo=0.8) -> tof.View:
-    distance = np.atleast_2d(distance)
-    return tof.View(distance, np.full(distance.shape, albedo), np.ones(distance.shape))
 
 
 def test_without_noise_every_range_of_fifteen_metres_is_exact(device):

@@ -49,16 +49,6 @@ def test_noise_figures_of_the_room(part, median_m, device):
     assert np.sqrt(np.mean((error[ok] / (found["sigma"][0][ok] * BIN_M)) ** 2)) == pytest.approx(1, abs=0.05)
 
 
-def test_pile_up_is_corrected(device):
-    view = flat_view(np.linspace(0.8, 1.2, 200))
-    counts = tof.histogram(view, 4000, pulses=2000)
-    truth = view.distance.reshape(-1)
-    raw = solve(counts, device)["position"][0] * BIN_M - truth
-    corrected = solve(counts, device, pulses=2000)["position"][0] * BIN_M - truth
-    assert raw.mean() < -0.05
-    assert np.abs(corrected).max() < 1e-3
-
-
 def test_pile_up_with_noise_has_no_bias(device):
     view = flat_view(np.full(4000, 1.0))
     found = solve(tof.histogram(view, 4000, pulses=2000, seed=1), device, pulses=2000)

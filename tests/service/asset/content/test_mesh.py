@@ -96,11 +96,6 @@ def test_perspective_points_project_onto_their_pixels():
     np.testing.assert_allclose(v[on_pixels], mesh.rows[on_pixels] + 0.5, atol=2e-5)
 
 
-def test_extent_is_tight(ball):
-    mesh = height_mesh(ball)
-    np.testing.assert_array_equal(mesh.extent, [mesh.points.min(axis=0), mesh.points.max(axis=0)])
-
-
 @pytest.mark.parametrize("rows, cols", [(2, 2), (3, 7), (20, 11)])
 def test_counts_of_a_full_sheet(rows, cols):
     mesh = height_mesh(make_sheet(np.ones((rows, cols), dtype=bool)))

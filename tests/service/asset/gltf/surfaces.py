@@ -33,13 +33,10 @@ def metal_and_paint(**changes):
 
 
 SURFACES = {
-    "everything": make_ball(),
-    "metal and paint": metal_and_paint(),
-    "ACEScg": metal_and_paint(color_space="lin_ap1_scene"),
+    "everything": make_ball(), "metal and paint": metal_and_paint(), "ACEScg": metal_and_paint(color_space="lin_ap1_scene"),
     "other dielectric": make_ball(specular=np.full((24, 24, 3), 0.08, np.float32)),
     "diffuse only": make_ball(specular=None, roughness=None),
-    "perspective height": make_wave("perspective", world_from_camera=POSE),
-    "no scale": make_wave("orthographic"),
+    "perspective height": make_wave("perspective", world_from_camera=POSE), "no scale": make_wave("orthographic"),
     "bow tie": make_sheet(np.array([[1, 0, 0], [1, 1, 1], [0, 0, 1]], dtype=bool)),
     "holes": make_sheet(holes(), diffuse_albedo=np.full((40, 40, 3), 0.5, np.float32), normal=np.full((40, 40, 3), 3**-0.5, np.float32)),
     "2x2": make_sheet(np.ones((2, 2), dtype=bool), diffuse_albedo=np.full((2, 2, 3), 0.5, dtype=np.float32)),

@@ -8,40 +8,25 @@ from service.asset.gltf.asset import write_depth
 from service.errors import AssetError
 from service.requests.export import Geometry, TextureFormat
 from stage.capture.camera import Camera
-from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps
+from tests.reference.colour import srgb_to_linear
+from tests.service.asset import walls
 from tests.service.asset.gltf.khronos import findings, validate
 from tests.service.asset.gltf.reading import Read
+from tests.service.asset.walls import cloud_of
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 CAMERA = Camera(projection="perspective", resolution=(24, 16), focal_px=(40.0, 40.0), world_from_camera=POSE)
 
 
 def make(**layers):
-    """A wall with a step, a hole and a lone column of pixels."""
-    depth = np.full((16, 24), 1.2, np.float32) + 0.002 * np.arange(24, dtype=np.float32)
-    depth[:, 12:] += 0.8
-    mask = np.ones((16, 24), bool)
-    mask[0, 0], mask[5:7, 8] = False, False
-    return DepthMaps(camera=CAMERA, mask=mask, depth=np.where(mask, depth, 0), provenance={"relit:capture": "wall"}, **layers)
-
-
-def cloud_of(maps):
-    points = maps.camera.points(-maps.depth)[maps.mask]
-    return PointCloud(points, np.random.default_rng(1).integers(0, 256, (len(points), 3)).astype(np.uint8))
+    return walls.make(broken=True, camera=CAMERA, **layers)
 
 
 def uncertain():
-    rng = np.random.default_rng(2)
-    sigma = rng.uniform(1e-3, 2e-3, (16, 24)).astype(np.float32)
-    sigma[3, 3] = np.inf
-    return {"sigma": sigma, "confidence": rng.random((16, 24)).astype(np.float32)}
-
-
-def linear(codes):
-    """IEC 61966-2-1."""
-    level = codes / 255
-    return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    layers = walls.uncertain()
+    layers["sigma"][3, 3] = np.inf
+    return layers
 
 
 def test_khronos_validator_finds_nothing(tmp_path):
@@ -61,7 +46,7 @@ def test_points_are_those_of_the_cloud(tmp_path):
     read = Read(tmp_path / "a.glb")
     assert read.primitive.mode == 0 and read.primitive.indices is None
     np.testing.assert_array_equal(read.attribute("POSITION"), cloud.points)
-    np.testing.assert_allclose(read.attribute("COLOR_0"), linear(cloud.colours), atol=3e-5)  # the curve of OpenColorIO
+    np.testing.assert_allclose(read.attribute("COLOR_0"), srgb_to_linear(cloud.colours / 255), atol=3e-5)  # the curve of OpenColorIO
     sigma = np.where(np.isfinite(maps.sigma), maps.sigma, 0)
     np.testing.assert_array_equal(read.attribute("_SIGMA"), sigma[maps.mask])
     np.testing.assert_array_equal(read.attribute("_CONFIDENCE"), maps.confidence[maps.mask])

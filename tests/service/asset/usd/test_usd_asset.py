@@ -28,10 +28,8 @@ every_suffix = pytest.mark.parametrize("suffix", SUFFIXES)
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
 
 SURFACES = {
-    "everything": make_ball(),
-    "diffuse only": make_ball(specular=None, roughness=None),
-    "height only": make_wave("perspective", world_from_camera=POSE),
-    "no scale": make_wave("orthographic"),
+    "everything": make_ball(), "diffuse only": make_ball(specular=None, roughness=None),
+    "height only": make_wave("perspective", world_from_camera=POSE), "no scale": make_wave("orthographic"),
     "bow tie": make_sheet(np.array([[1, 0, 0], [1, 1, 1], [0, 0, 1]], dtype=bool)),
     "2x2": make_sheet(np.ones((2, 2), dtype=bool), diffuse_albedo=np.full((2, 2, 3), 0.5, dtype=np.float32)),
 }
@@ -266,15 +264,3 @@ def test_unknown_suffix_names_the_known(ball, suffix, tmp_path):
     with pytest.raises(AssetError, match=r"\.usda, \.usdc or \.usdz"):
         write_asset(ball, tmp_path / f"ball{suffix}", name="Ball")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_maps_without_height_leave_nothing(ball, tmp_path):
-    with pytest.raises(AssetError, match="height"):
-        write_asset(dataclasses.replace(ball, height=None), tmp_path / "ball.usdz", name="Ball")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_maps_that_went_through_their_file_export_the_same_shape(ball, tmp_path):
-    ball.write(tmp_path / "maps.exr")
-    report = write_asset(SurfaceMaps.read(tmp_path / "maps.exr"), tmp_path / "sub" / "ball.usdc", name="Ball")
-    assert report.sizes == write_asset(ball, tmp_path / "direct.usdc", name="Ball").sizes

@@ -15,13 +15,10 @@ POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0,
 
 
 SCENES = {
-    "centred": make_ball(),
-    "no scale": make_wave("orthographic"),
+    "centred": make_ball(), "no scale": make_wave("orthographic"),
     "posed": make_wave("orthographic", pixel_size_m=0.01, world_from_camera=POSE),
-    "posed without scale": make_wave("orthographic", world_from_camera=POSE),
-    "perspective": make_wave("perspective"),
-    "perspective posed": make_wave("perspective", world_from_camera=POSE),
-    "no depth": make_wave("perspective", surface_z_m=None),
+    "posed without scale": make_wave("orthographic", world_from_camera=POSE), "perspective": make_wave("perspective"),
+    "perspective posed": make_wave("perspective", world_from_camera=POSE), "no depth": make_wave("perspective", surface_z_m=None),
 }
 
 

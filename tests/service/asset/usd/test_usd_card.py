@@ -126,8 +126,7 @@ def test_frames_that_cannot_be_shown_are_refused(relit, tmp_path):
               broken: "pixels are not finite", tmp_path / "grey.exr": "has no channels R, G and B",
               tmp_path / "none.####.exr": "there is no such frame", tmp_path / "none.exr": "is neither a frame nor a file name"}
     for card, fault in faults.items():
-        outcome = relit("export", tmp_path / "maps.exr", "--out", tmp_path / "out" / "a.usda", "--card", card)
-        assert outcome.code == 2 and fault in outcome.err and len(outcome.err.strip().splitlines()) == 1
+        assert fault in relit.refused("export", tmp_path / "maps.exr", "--out", tmp_path / "out" / "a.usda", "--card", card)
         assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 

@@ -14,40 +14,16 @@ from stage.capture.camera import Camera
 from stage.formats import images
 from stage.formats.ply import PointCloud, write_ply
 from stage.results.depth_maps import DepthMaps
+from tests.reference.colour import srgb_to_linear
+from tests.service.asset.walls import CAMERA, cloud_of, make, uncertain
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 LENS = {"model": "brown_conrady", "k": [-0.1, 0.02, 0.0], "p": [0.001, -0.002]}
-CAMERA = Camera.model_validate({"projection": "perspective", "resolution": [24, 16], "focal_px": [40.0, 40.0]})
 CAMERAS = {
     "perspective": CAMERA,
     "lens": Camera.model_validate({"projection": "perspective", "resolution": [24, 16], "focal_px": [40.0, 42.0], "distortion": LENS}),
     "orthographic": Camera.model_validate({"projection": "orthographic", "resolution": [24, 16], "pixel_size_m": 0.02}),
 }
-
-
-def make(broken=False, camera=CAMERA, **layers):
-    depth = np.full((16, 24), 1.2, np.float32) + 0.002 * np.arange(24, dtype=np.float32)
-    if broken:
-        depth[:, 12:] += 0.8
-    mask = np.ones((16, 24), bool)
-    mask[0, 0], mask[5:7, 8] = False, False
-    return DepthMaps(camera=camera, mask=mask, depth=np.where(mask, depth, 0), provenance={"relit:capture": "wall"}, **layers)
-
-
-def cloud_of(maps, normals=False):
-    points = maps.camera.points(-maps.depth)[maps.mask]
-    colours = np.random.default_rng(1).integers(0, 256, (len(points), 3)).astype(np.uint8)
-    return PointCloud(points, colours, np.tile(np.float32([0, 0, 1]), (len(points), 1)) if normals else None)
-
-
-def uncertain():
-    rng = np.random.default_rng(2)
-    return {"sigma": rng.uniform(1e-3, 2e-3, (16, 24)).astype(np.float32), "confidence": rng.random((16, 24)).astype(np.float32)}
-
-
-def linear(codes):
-    level = codes / 255
-    return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
 
 
 def opened(path, geo=None):
@@ -100,7 +76,7 @@ def test_points_keep_place_colour_and_normal(tmp_path):
     points = UsdGeom.Points(usd_stage.GetPrimAtPath("/Wall/Geom/Points"))
     assert (np.array(points.GetPointsAttr().Get()) == cloud.points).all()
     assert (np.array(points.GetNormalsAttr().Get()) == cloud.normals).all()
-    assert np.abs(np.array(points.GetDisplayColorPrimvar().ComputeFlattened()) - linear(cloud.colours)).max() < 1e-4
+    assert np.abs(np.array(points.GetDisplayColorPrimvar().ComputeFlattened()) - srgb_to_linear(cloud.colours / 255)).max() < 1e-4
     assert np.allclose(points.GetWidthsAttr().Get(), 1.5 * maps.depth[maps.mask] / 40, rtol=1e-5)
     api = UsdGeom.PrimvarsAPI(points)
     assert (np.array(api.GetPrimvar("sigma").ComputeFlattened()) == maps.sigma[maps.mask]).all()
@@ -124,7 +100,7 @@ def test_a_mesh_looks_like_the_scene(tmp_path, suffix, camera):
     api = UsdGeom.PrimvarsAPI(mesh)
     st = np.array(api.GetPrimvar("st").Get())
     pixel = np.rint((1 - st[:, 1]) * 16 - 0.5).astype(int), np.rint(st[:, 0] * 24 - 0.5).astype(int)
-    assert np.abs(np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened()) - linear(of_pixel[pixel])).max() < 1e-4
+    assert np.abs(np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened()) - srgb_to_linear(of_pixel[pixel] / 255)).max() < 1e-4
     for name in ("sigma", "confidence"):
         assert api.GetPrimvar(name).GetInterpolation() == UsdGeom.Tokens.vertex
         assert (np.array(api.GetPrimvar(name).ComputeFlattened()) == getattr(maps, name)[pixel]).all()
@@ -149,7 +125,7 @@ def test_points_between_pixels_colour_the_mesh(tmp_path):
     write_depth(maps, PointCloud(points, colours), tmp_path / "wall.usda", name="Wall")
     usd_stage = opened(tmp_path / "wall.usda")
     mesh = UsdGeom.Mesh(usd_stage.GetPrimAtPath("/Wall/Geom/Mesh"))
-    assert np.abs(np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened()) - linear(np.array([180, 90, 40]))).max() < 1e-4
+    assert np.abs(np.array(mesh.GetDisplayColorPrimvar().ComputeFlattened()) - srgb_to_linear(np.array([180, 90, 40]) / 255)).max() < 1e-4
 
 
 def test_a_mesh_is_not_bridged_over_a_break(tmp_path):
@@ -248,7 +224,5 @@ def test_relit_export_takes_a_depth(relit, tmp_path, geometry, prim):
 
 def test_geometry_is_for_a_depth(relit, tmp_path, ball):
     ball.write(tmp_path / "maps.exr")
-    outcome = relit("export", tmp_path, "--out", tmp_path / "a.usda", "--geometry", "points")
-    assert outcome.code == 2 and "--geometry points: is for a depth" in outcome.err
-    outcome = relit("export", tmp_path / "nothing", "--out", tmp_path / "a.usda")
-    assert outcome.code == 2 and "run `relit solve` or `relit depth` first" in outcome.err
+    assert "--geometry points: is for a depth" in relit.refused("export", tmp_path, "--out", tmp_path / "a.usda", "--geometry", "points")
+    assert "run `relit solve` or `relit depth` first" in relit.refused("export", tmp_path / "nothing", "--out", tmp_path / "a.usda")

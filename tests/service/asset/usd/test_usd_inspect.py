@@ -224,8 +224,7 @@ def test_half_a_package_is_one_sentence(part, tmp_path):
 
 def test_the_command_prints_facts_or_json(relit, tmp_path):
     write_asset(make_ball(), tmp_path / "ball.usda", name="Ball")
-    outcome = relit("inspect", tmp_path / "ball.usda")
-    assert (outcome.code, outcome.err) == (0, "")
+    outcome = relit.done("inspect", tmp_path / "ball.usda")
     lines = outcome.out.splitlines()
     assert lines[0].startswith(f"asset        {tmp_path}/ball.usda, ") and {"default_prim /Ball", "kind         component"} < set(lines)
     assert "variants     geo (mesh), look (metallic, specular)" in lines and lines[-1] == "found        0 errors, 0 warnings"

@@ -120,14 +120,6 @@ def test_the_interface_tells_variants_and_extents_without_its_payload(suffix, tm
     assert tuple(UsdGeom.ModelAPI(root).GetExtentsHint()[1]) == (4, 6, 0)
 
 
-@every_suffix
-def test_asset_info(suffix, tmp_path):
-    write_square(tmp_path / f"square{suffix}")
-    usd_stage = Usd.Stage.Open(str(tmp_path / f"square{suffix}"))
-    model = Usd.ModelAPI(usd_stage.GetDefaultPrim())
-    assert (model.GetAssetName(), model.GetAssetIdentifier().path, model.GetAssetVersion()) == ("Square", f"square{suffix}", "v007")
-
-
 def test_every_layer_says_where_it_comes_from(tmp_path):
     write_square(tmp_path / "square.usda")
     for file in tmp_path.rglob("*.usd?"):
@@ -154,8 +146,7 @@ def test_a_shot_that_refers_to_the_asset_chooses_variants_and_finds_its_provenan
 
 def test_an_exported_asset_has_the_whole_path_of_its_provenance(relit, tmp_path, ball):
     ball.write(tmp_path / "maps.exr")
-    outcome = relit("export", tmp_path, "--out", tmp_path / "a.usdz", "--name", "Kugel", "--version", "3")
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("export", tmp_path, "--out", tmp_path / "a.usdz", "--name", "Kugel", "--version", "3")
     usd_stage = Usd.Stage.Open(str(tmp_path / "a.usdz"))
     found = usd_stage.GetMetadata("customLayerData")["relit"]
     assert found["method"] == "svbrdf" and found["maps"] == digest(tmp_path / "maps.exr")

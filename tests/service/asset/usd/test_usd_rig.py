@@ -181,8 +181,7 @@ def test_what_is_no_rig_is_refused(relit, tmp_path):
               "none is lit by a light whose place is known": [{"type": "off"}, {"type": "full"}]}
     for index, (fault, lights) in enumerate(faults.items()):
         capture = capture_of(tmp_path / f"capture{index}", maps.camera, lights)
-        outcome = relit("export", tmp_path / "maps.exr", "--out", tmp_path / "a.usda", "--rig", capture.folder)
-        assert outcome.code == 2 and fault in outcome.err and len(outcome.err.strip().splitlines()) == 1
+        assert fault in relit.refused("export", tmp_path / "maps.exr", "--out", tmp_path / "a.usda", "--rig", capture.folder)
     other = capture_of(tmp_path / "other", maps.camera.model_copy(update={"principal_px": (1.0, 2.0)}), [{"type": "off"}])
     outcome = relit("export", tmp_path / "maps.exr", "--out", tmp_path / "a.usda", "--rig", other.folder)
     assert outcome.code == 2 and "its camera differs from that of the maps in principal_px" in outcome.err

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot, reflect
+from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot
 from service.light_estimation.ball import Ball, project, view_ball
 from service.light_estimation.ball_outline import ball_from_mask
 from stage.errors import CalibrationError
@@ -21,14 +21,6 @@ def exact(name):
     camera, geometry = SCENES[name]
     ball = Ball(geometry["centre"], geometry["radius"], True, 60.0, 0.0)
     return ball, view_ball(ball, camera), geometry
-
-
-def test_reflection_is_about_the_normal():
-    light = unit(0.3, -0.5, 0.4)
-    viewer = unit(0, 0, 1)
-    half = unit(*(light + viewer))
-    np.testing.assert_allclose(reflect(viewer, half), light, atol=1e-15)
-    assert angles_degrees(half, light) == pytest.approx(angles_degrees(light, viewer) / 2)  # the normal is half way, no more
 
 
 @pytest.mark.long

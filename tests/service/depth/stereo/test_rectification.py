@@ -27,10 +27,8 @@ def rig(pose, other=OTHER):
 
 
 RIGS = {
-    "beside, verged": POSE,
-    "to the left": reference.look_at((-0.2, 0.01, -0.01), (0.0, 0.0, -1.0)),
-    "above": turned("x", -8, (0.0, 0.15, 0.0)),
-    "below and turned about its axis": turned("z", 25, (0.02, -0.1, 0.01)),
+    "beside, verged": POSE, "to the left": reference.look_at((-0.2, 0.01, -0.01), (0.0, 0.0, -1.0)),
+    "above": turned("x", -8, (0.0, 0.15, 0.0)), "below and turned about its axis": turned("z", 25, (0.02, -0.1, 0.01)),
 }
 
 

@@ -47,6 +47,7 @@ def test_boxes_of_a_few_pixels_give_the_surface_of_whole_bricks(file, tmp_path, 
     assert (differ > 0).mean() < 2e-3 and (differ > 2).mean() < 1e-4
 
 
+@pytest.mark.long
 def test_no_box_is_seen_by_more_pixels_than_allowed_unless_it_is_the_smallest(file, tmp_path, monkeypatch):
     monkeypatch.setattr(boxes, "MOST_PIXELS", FEW)
     with fused_bricks(FuseRequest(scan_set=file, out=tmp_path, voxel_m=VOXEL, device="cpu"), Timings()) as known:

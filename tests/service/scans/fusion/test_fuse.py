@@ -14,6 +14,7 @@ from stage.capture.camera import Camera
 from stage.results.depth_maps import DepthMaps
 from stage.results.depth_normals import depth_normals
 from stage.results.maps import SurfaceMaps
+from tests.scenes.in_front import gradient, unit
 from tests.scenes.statue import SIGMA, colour_of, distance, shoot, shoot_parallel, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -52,10 +53,8 @@ def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
     assert ply.colours is not None and ply.normals is not None
     off = np.abs(ply.colours.astype(int) - colour_of(ply.points)).max(axis=1)
     assert np.percentile(off, 95) < 12  # over a pixel of 7.5 mm the colour changes by 7 of 255
-    step = 1e-3
-    gradient = np.stack([distance(ply.points + step * axis) - distance(ply.points - step * axis) for axis in np.eye(3)], axis=1)
-    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
-    assert np.median((ply.normals * gradient).sum(axis=1)) > np.cos(np.radians(5))  # 25 pixels with .25 mm of noise give 1°, bends more
+    true = unit(gradient(distance, ply.points))
+    assert np.median((ply.normals * true).sum(axis=1)) > np.cos(np.radians(5))  # 25 pixels with .25 mm of noise give 1°, bends more
 
 
 def test_the_report_lists_the_holes_and_what_was_seen(fused):

@@ -9,6 +9,7 @@ from service.scans.fusion.fuse import FuseResult, fuse
 from service.scans.points.ply_points import read_ply_points
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
+pytestmark = pytest.mark.long
 VOXEL = 26e-3
 """Somewhat more than six pixels."""
 
@@ -26,7 +27,6 @@ def both(tmp_path_factory) -> list[FuseResult]:
     return found
 
 
-@pytest.mark.long
 def test_the_surface_is_better(both):
     squares, pixels = (read_ply_points(found.mesh_path).points for found in both)
     assert [{scan["square_px"] for scan in found.facts["scans"]} for found in both] == [{3}, {1}]

@@ -8,6 +8,7 @@ from service.requests.register import FuseRequest
 from service.scans.fusion.fuse import FuseResult, fuse
 from service.scans.points.ply_points import read_ply_points
 from stage.results.maps import SurfaceMaps
+from tests.kernels.scenes import angle_degrees
 from tests.scenes.in_front import SCENES, face_normals, fan, gradient, photometric, unit, with_dead_pixels
 from tests.scenes.statue import Shot, write_scans
 from tests.service.scans.mesh_files import read_faces
@@ -33,10 +34,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def degrees(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(one - other, axis=-1) / 2, 0, 1)))
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "sigma"), NOISE)
 def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
@@ -58,11 +55,11 @@ def test_no_part_is_worse_than_by_its_depth_alone(tmp_path, name, sigma):
     assert np.median(np.abs(left)) < 0.5 * np.median(np.abs(error))
     # normals, where the lattice resolves the surface: not across edges, and not in the mouths of gaps
     exact = before.points - error[:, None] * unit(gradient(scene, before.points))
-    floor = degrees(face_normals(exact, faces), unit(gradient(scene, exact[faces].mean(axis=1))))
+    floor = angle_degrees(face_normals(exact, faces), unit(gradient(scene, exact[faces].mean(axis=1))))
     resolved = (floor < RESOLVED) & (np.abs(error[faces]).max(axis=1) < VOXEL)
     assert resolved.mean() > 0.75
-    found = degrees(face_normals(after.points, faces), unit(gradient(scene, after.points[faces].mean(axis=1))))[resolved]
-    given = degrees(before.normals[faces[:, 0]].astype(float), unit(gradient(scene, before.points[faces[:, 0]])))[resolved]
+    found = angle_degrees(face_normals(after.points, faces), unit(gradient(scene, after.points[faces].mean(axis=1))))[resolved]
+    given = angle_degrees(before.normals[faces[:, 0]].astype(float), unit(gradient(scene, before.points[faces[:, 0]])))[resolved]
     assert rms(found) < 1.1 * rms(given)  # docs/joining.md has at most 0.99 for such scenes
     assert np.median(found) < 0.6 * np.median(given)  # without most of the drift
     assert 0.005 < joined.facts["joined_normals"]["contradicted_vertices"] / len(before.points) < 0.2

@@ -10,9 +10,7 @@ from service.errors import RequestError
 from service.requests.register import FuseRequest
 from service.scans.fusion.fuse import FuseResult, fuse
 from service.scans.points.ply_points import read_ply_points
-from service.scans.points.rigid import exponential
-from stage.capture.camera import Camera
-from stage.results.maps import SurfaceMaps
+from tests.scenes.in_front import gradient, photometric, unit
 from tests.scenes.statue import Shot, turntable, write_scans
 from tests.service.scans.mesh_files import read_faces
 
@@ -29,27 +27,6 @@ def ball(points: np.ndarray) -> np.ndarray:
 
 def field(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points, axis=-1) - RADIUS - DEEP * np.sin(WAVE * points[..., 1]) * np.cos(WAVE * points[..., 0] / 2 + 1)
-
-
-def gradient(points: np.ndarray) -> np.ndarray:
-    step = 1e-6
-    return np.stack([field(points + step * axis) - field(points - step * axis) for axis in np.eye(3)], axis=-1) / (2 * step)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def maps_of(shot: Shot, seed: int, drift_degrees: float) -> SurfaceMaps:
-    """Normals that are turned by about the drift, in each view about another axis, and have noise."""
-    rng = np.random.default_rng(100 + seed)
-    camera = Camera(projection="perspective", resolution=shot.side[::-1], focal_px=(shot.focal, shot.focal))
-    points = camera.points(-shot.true)[shot.mask] @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
-    own = unit(gradient(points)) @ shot.world_from_camera[:3, :3]
-    turned = own @ exponential(np.radians(drift_degrees) * unit(rng.standard_normal(3))).T
-    normal = np.zeros((*shot.side, 3), dtype=np.float32)
-    normal[shot.mask] = unit(turned + NORMAL_SIGMA * rng.standard_normal(own.shape))
-    return SurfaceMaps(camera=camera, mask=shot.mask, normal=normal, sigma=np.full(shot.side, np.degrees(NORMAL_SIGMA), dtype=np.float32))
 
 
 @cache
@@ -69,7 +46,7 @@ class Errors(NamedTuple):
 def errors(result: FuseResult) -> Errors:
     ply, faces = read_ply_points(result.mesh_path), read_faces(result.mesh_path)
     inner = np.abs(ply.points[:, 1]) < 0.7 * RADIUS
-    slope = gradient(ply.points)
+    slope = gradient(field, ply.points)
     off = field(ply.points) / np.linalg.norm(slope, axis=-1)
     exact = ply.points - off[:, None] * unit(slope)
     corners = faces[inner[faces].all(axis=1)]
@@ -86,13 +63,14 @@ def errors(result: FuseResult) -> Errors:
 
 
 def angle(found: np.ndarray, places: np.ndarray) -> np.ndarray:
-    return np.degrees(2 * np.arcsin(np.linalg.norm(unit(found) - unit(gradient(places)), axis=1) / 2))
+    return np.degrees(2 * np.arcsin(np.linalg.norm(unit(found) - unit(gradient(field, places)), axis=1) / 2))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("drift", [0.0, 3.0])
 def test_the_joined_surface_has_the_place_of_the_depth_and_the_normals_of_the_photographs(tmp_path, drift):
-    file = write_scans(tmp_path, shots(), sigma=DEPTH_SIGMA, maps=[maps_of(shot, number, drift) for number, shot in enumerate(shots())])
+    file = write_scans(tmp_path, shots(), sigma=DEPTH_SIGMA, maps=[
+        photometric(field, shot, seed=number, noise_degrees=0.5, drift_degrees=drift) for number, shot in enumerate(shots())])
     request = FuseRequest(scan_set=file, out=tmp_path / "apart", voxel_m=VOXEL, texture=False, device="cpu")
     apart = fuse(request)
     joined = fuse(request.model_copy(update={"out": tmp_path / "joined", "join_normals": True}))

@@ -9,9 +9,11 @@ from service.scans.fusion.fuse import fuse
 from stage.capture.camera import Camera
 from stage.formats.images import read_pixels
 from stage.results.maps import SurfaceMaps
+from tests.scenes.in_front import gradient, unit
 from tests.scenes.statue import colour_of, distance, turntable, write_scans
 
 pytest.importorskip("xatlas", reason="xatlas is not installed")
+pytestmark = pytest.mark.long
 PX, FACES = 512, 4000
 WAVE_M, TILT = 0.02, 0.25
 """Length of the waves of the normals that solved maps show and depth does not, and their largest tilt, radians."""
@@ -21,12 +23,6 @@ def fine_normals(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Normals with waves along y, as of a relief far below the noise of the depth."""
     tilted = normals + TILT * np.cos(2 * np.pi * points[..., 1:2] / WAVE_M) * np.array([0.0, 1.0, 0.0])
     return tilted / np.linalg.norm(tilted, axis=-1, keepdims=True)
-
-
-def gradient(points: np.ndarray) -> np.ndarray:
-    step = 1e-5
-    found = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in np.eye(3)], axis=-1)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +37,7 @@ def _maps(shot) -> SurfaceMaps:
     camera = Camera(projection="perspective", resolution=shot.side[::-1], focal_px=(shot.focal, shot.focal))
     points = camera.points(-shot.true) @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
     normal = np.zeros((*shot.side, 3), dtype=np.float32)
-    normal[shot.mask] = fine_normals(points[shot.mask], gradient(points[shot.mask])) @ shot.world_from_camera[:3, :3]
+    normal[shot.mask] = fine_normals(points[shot.mask], unit(gradient(distance, points[shot.mask]))) @ shot.world_from_camera[:3, :3]
     albedo = np.where(shot.mask[..., None], (colour_of(points) / 255.0) ** 2.2, 0).astype(np.float32)
     return SurfaceMaps(camera=camera, mask=shot.mask, normal=normal, diffuse_albedo=albedo,
                        specular=np.where(shot.mask[..., None], np.float32(0.04), 0) * np.ones(3, np.float32),
@@ -71,7 +67,6 @@ def texel_places(asset):
     return point[large], normal[large], along_s[large], along_t[large], place[large]
 
 
-@pytest.mark.long
 def test_texels_hold_the_albedo_and_the_normals_of_the_places_that_they_show(asset):
     assert asset.facts["texture"]["faces"] <= FACES
     point, normal, along_s, along_t, place = texel_places(asset)
@@ -89,7 +84,7 @@ def test_texels_hold_the_albedo_and_the_normals_of_the_places_that_they_show(ass
     bitangent = np.cross(normal, tangent)
     bitangent *= np.sign((bitangent * along_t).sum(axis=1, keepdims=True))
     shown = local[:, :1] * tangent + local[:, 1:2] * bitangent + local[:, 2:] * normal
-    true = gradient(point)
+    true = unit(gradient(distance, point))
 
     def angle(one, other):
         return np.degrees(np.arccos(np.clip((one * other).sum(axis=1) / np.linalg.norm(one, axis=1), -1, 1)))

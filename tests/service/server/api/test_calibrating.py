@@ -29,7 +29,7 @@ from tests.service.calibrate.solvers import test_procam as boards
 from tests.service.calibrate.test_calibrate_tof import cw, sweep
 from tests.service.calibrate.test_laser_planes import boards as laser_boards
 from tests.service.calibrate.test_procam import write_view
-from tests.service.depth.test_tof import pulsed_frames
+from tests.service.depth.tof.test_tof import pulsed_frames
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import upload

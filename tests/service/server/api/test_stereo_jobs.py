@@ -11,7 +11,7 @@ from stage.results.depth_maps import DepthMaps
 from tests.scenes import stereo as scenes
 from tests.scenes.stereo import OTHER, POSE, Plane
 from tests.service.calibrate.test_calibrate_stereo import write_board
-from tests.service.depth.test_two_cameras import two_captures
+from tests.service.depth.stereo.test_two_cameras import two_captures
 from tests.service.server.api.job_calls import finish, made_by, refused, submit
 from tests.service.server.api.test_calibrating import sent
 

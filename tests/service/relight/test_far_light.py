@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.kernels.scenes import cap
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import rgb, write_exr
 from tests.scenes.glossy import ALBEDO, dome, lat_long, reflect, write_dome, write_maps
-from tests.service.relight.test_guided import rgb
+from tests.service.relight.test_clipping import relight
 
 SURFACE = dome(40)
 LIGHTS = cap(48, 45)
@@ -27,10 +27,6 @@ def sky(folder, degrees, rows=48):
     return truth * SURFACE.mask[..., None]
 
 
-def rmse(ours, truth):
-    return np.sqrt(((ours - truth)[SURFACE.mask] ** 2).mean() / (truth[SURFACE.mask] ** 2).mean())
-
-
 def patchy():
     """[rows, cols, 3] an albedo that is between half and 1.6 times the true one, in patches some pixels wide."""
     rows, cols = np.indices(SURFACE.mask.shape)
@@ -44,12 +40,6 @@ def scene(tmp_path_factory):
     return folder, sky(folder, SUN_DEGREES)
 
 
-def relight(relit, folder, out, *options):
-    outcome = relit("relight", folder / "cap", "--environment", folder / "sky.exr", "--out", out / "f.#.exr", *options)
-    assert (outcome.code, outcome.err) == (0, "")
-    return rgb(out / "f.1.exr"), outcome.out
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("wrong", ["nothing", "albedo", "normals"])
 def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp_path, wrong):
@@ -59,9 +49,9 @@ def test_guided_frames_are_nearer_to_the_truth_than_plain_ones(relit, scene, tmp
     changes = {"nothing": {}, "albedo": {"diffuse_albedo": patchy()},
                "normals": {"normal": (SURFACE.normal[:, :, [1, 0, 2]] * (-1, 1, 1)).astype(np.float32)}}[wrong]
     maps = write_maps(tmp_path / "maps", SURFACE, **changes)
-    plain = min(rmse(relight(relit, folder, tmp_path / w, "--weights", w)[0], truth) for w in ("kernel", "cells", "smooth"))
+    plain = min(SURFACE.off(relight(relit, folder, tmp_path / w, "--weights", w)[0], truth) for w in ("kernel", "cells", "smooth"))
     frame, _ = relight(relit, folder, tmp_path / "guided", "--maps", maps)
-    assert rmse(frame, truth) < {"nothing": 0.02, "albedo": 0.1, "normals": 1.0}[wrong] * plain
+    assert SURFACE.off(frame, truth) < {"nothing": 0.02, "albedo": 0.1, "normals": 1.0}[wrong] * plain
     if wrong == "albedo":
         lit = SURFACE.mask & (truth.mean(axis=-1) > 0.2 * truth.mean(axis=-1).max())
         assert (frame[lit].mean(axis=-1) > 0.5 * truth[lit].mean(axis=-1)).mean() > 0.99
@@ -96,9 +86,8 @@ def test_shade_is_guided_beyond_too(relit, scene, tmp_path):
     tilt = np.radians(SUN_DEGREES)
     towards = np.array([np.sin(tilt) * 0.8, np.sin(tilt) * 0.6, np.cos(tilt)])
     light = [*(100 * towards), 1e4, 1e4, 1e4]
-    outcome = relit("shade", maps, "--light", ",".join(f"{v:.6f}" for v in light), "--capture", folder / "cap", "--out", tmp_path / "a.exr")
-    assert (outcome.code, outcome.err) == (0, "")
+    relit.done("shade", maps, "--light", ",".join(f"{v:.6f}" for v in light), "--capture", folder / "cap", "--out", tmp_path / "a.exr")
     truth = reflect(SURFACE.normal, towards) * SURFACE.mask[..., None]
-    assert rmse(rgb(tmp_path / "a.exr"), truth) < 0.1
+    assert SURFACE.off(rgb(tmp_path / "a.exr"), truth) < 0.1
     outcome = relit("shade", maps, "--environment", folder / "sky.exr", "--capture", folder / "cap", "--out", tmp_path / "b.exr")
     assert "of the light of the picture comes from" in outcome.out

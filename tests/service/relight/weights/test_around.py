@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from kernels.errors import ArrayError
 from service.relight.weights.triangulation import left_out, lights_around
 from tests.kernels.relight.lights import AXES, CUBE, dodecahedron, icosahedron, ring, scattered, turn
 from tests.kernels.scenes import cap
@@ -59,21 +58,13 @@ def test_shares_are_those_of_the_delaunay_triangle(direction):
     np.testing.assert_allclose(got, shares_around(direction, samples), atol=SHARE)
 
 
-def points_along(direction, samples, tolerance=1e-6):
-    """Tolerance: float32 shares, over a sum of corners no shorter than a fifth."""
-    around, share = lights_around(direction, samples)
-    sums = np.einsum("nk,nkx->nx", share.astype(float), direction[around])
-    np.testing.assert_allclose(sums / np.linalg.norm(sums, axis=1, keepdims=True), samples, atol=tolerance)
-
-
-@pytest.mark.parametrize("direction", ROUND.values(), ids=ROUND)
-def test_weighted_corners_point_along_the_sample(direction):
-    points_along(direction, scattered(5000, 2))
-
-
 def test_inside_a_dome_too():
+    """Tolerance: float32 shares, over a sum of corners no shorter than a fifth."""
     samples = scattered(5000, 3)
-    points_along(DOME, samples[samples[:, 2] > 0.35])  # its rim lies below
+    samples = samples[samples[:, 2] > 0.35]  # its rim lies below
+    around, share = lights_around(DOME, samples)
+    sums = np.einsum("nk,nkx->nx", share.astype(float), DOME[around])
+    np.testing.assert_allclose(sums / np.linalg.norm(sums, axis=1, keepdims=True), samples, atol=1e-6)
 
 
 @LAYOUT
@@ -97,18 +88,6 @@ def test_below_a_dome_are_lights_of_its_rim():
     """Not those in its middle, though the hull's faces below would have some."""
     around, share = lights_around(DOME, np.array([[0.1, 0.2, -0.97], [0, 0, -1.0]]) / [[np.linalg.norm([0.1, 0.2, -0.97])], [1]])
     assert (DOME[around, 2][share > 0] < 0.35).all()
-
-
-def test_none_asked_is_none_given():
-    around, share = lights_around(AXES, np.zeros((0, 3)))
-    assert around.shape == share.shape == (0, 3)
-
-
-def test_of_lights_in_one_place_the_first_is_meant():
-    around, share = lights_around(LAYOUTS["twice"], scattered(300, 0))
-    single, same = lights_around(icosahedron(), scattered(300, 0))
-    np.testing.assert_array_equal(around, 2 * single)
-    np.testing.assert_array_equal(share, same)
 
 
 def test_many_samples_are_their_parts():
@@ -169,11 +148,6 @@ def test_a_light_between_its_neighbours_is_predicted_and_one_at_the_rim_is_not()
     assert (DOME[lights] * DOME[:, None]).sum(axis=2)[inside].min() > np.cos(np.radians(37))  # those beside it, at most 36 degrees away
 
 
-def test_an_octahedron_predicts_nothing():
-    """The neighbours of each light lie a quarter away, all in one plane with the centre."""
-    assert (left_out(AXES)[1] == 0).all()
-
-
 def test_opposite_lights_of_a_ring_are_halved():
     """One of 16 lights on the horizon lies between the two beside it; what is above and below gives nothing."""
     direction = np.concatenate([ring(16, 0), ring(8, 50), ring(8, -50), [[0, 1, 0], [0, -1, 0]]])
@@ -181,25 +155,3 @@ def test_opposite_lights_of_a_ring_are_halved():
     for light in range(16):
         got = dict(zip(lights[light].tolist(), share[light].tolist(), strict=True))
         assert got[(light + 1) % 16] == pytest.approx(0.5, abs=1e-6) and got[(light - 1) % 16] == pytest.approx(0.5, abs=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_turning_all_turns_the_prediction(seed):
-    """Where it is unique."""
-    direction = scattered(40, 9)
-    lights, share = left_out(direction)
-    turned, same = left_out(direction @ turn(seed).T)
-    np.testing.assert_array_equal(lights, turned)
-    np.testing.assert_allclose(share, same, atol=1e-6)
-
-
-@pytest.mark.parametrize("direction, message", [
-    (AXES[:3], "lights in four different places, got 3"),
-    (np.repeat(AXES[:3], 3, axis=0), "lights in four different places, got 3"),
-    (ring(12, 0), "not all in one plane, got 12"),
-    (ring(7, 50), "not all in one plane, got 7"),
-])
-@pytest.mark.parametrize("function", [lambda direction: lights_around(direction, AXES), left_out], ids=["around", "left out"])
-def test_lights_that_enclose_nothing_are_refused(direction, message, function):
-    with pytest.raises(ArrayError, match=message):
-        function(direction)

@@ -7,7 +7,7 @@ import pytest
 
 from stage.formats import exr
 from tests.reference import microfacet
-from tests.scenes.captures import write_exr, write_image
+from tests.scenes.captures import rgb, write_exr, write_image
 from tests.scenes.glossy import PIXEL_M, VIEW, dome, sphere_directions
 
 SURFACE = dome(26)
@@ -39,11 +39,6 @@ def capture(tmp_path_factory):
         "schema": "relit.capture/1", "name": "border", "mask": "mask.png", "frames": frames,
         "camera": {"projection": "orthographic", "resolution": [26, 26], "pixel_size_m": PIXEL_M}}))
     return folder
-
-
-def rgb(path, layer=""):
-    channels, _ = exr.read(path)
-    return np.stack([channels[layer + c].astype(np.float64) for c in "RGB"], axis=-1)
 
 
 @pytest.mark.long

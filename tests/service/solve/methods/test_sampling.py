@@ -1,16 +1,15 @@
 """relit solve on captures under diffused sources: from images on disk to maps.exr, with a known truth."""
 
-import json
 
 import numpy as np
 import pytest
 
 from stage.formats import exr
-from stage.results.maps import SurfaceMaps
 from tests.reference import sampling as twin
 from tests.scenes import horn
 from tests.scenes.captures import angles_degrees
 from tests.scenes.extended_lights import COLOUR, SHARPNESS, VIEW, ball, light, write_sampling
+from tests.service.solve.methods.test_gradient import solve
 
 SIDE, LIGHTS = 16, 20
 CENTRES = twin.lattice(LIGHTS)
@@ -26,12 +25,6 @@ def half_painted() -> np.ndarray:
     paint = twin.lambert(NORMALS, CENTRES, SHARPNESS)[..., None] * PAINT
     metal = twin.ggx(NORMALS, VIEW, CENTRES, SHARPNESS, alpha=ALPHA, f0=METAL)[..., None]
     return np.where(PAINTED[:, None, None], paint, metal) * COLOUR
-
-
-def solve(relit, folder, *arguments):
-    outcome = relit("solve", folder, "--out", folder / "out", *arguments)
-    assert (outcome.code, outcome.err) == (0, "")
-    return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
 @pytest.mark.long

@@ -7,20 +7,12 @@ import pytest
 
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
+from tests.reference.sampling import lattice
 from tests.scenes.captures import angles_degrees, edit_frame, edit_manifest, write_exr, write_image, write_manifest
 
 LIGHTS, SIDE = 24, 40
 RNG = np.random.default_rng(5)
-
-
-def directions() -> np.ndarray:
-    i = np.arange(LIGHTS) + 0.5
-    z = 1 - 0.75 * i / LIGHTS
-    turn = np.pi * (1 + 5**0.5) * i
-    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
-
-
-DIRECTIONS = directions()
+DIRECTIONS = lattice(LIGHTS, 75.5225)
 STRENGTH = RNG.uniform(0.5, 2.0, (LIGHTS, 3))
 
 
@@ -148,33 +140,22 @@ def test_method_and_ball_go_together(relit, captures, arguments):
     assert outcome.code == 2 and "--method reference and --reference-ball CAPTURE go together" in outcome.err
 
 
-def refused(relit, captures) -> str:
+FAULTS = {
+    "other lights": (lambda ball: edit_frame(ball, 3, light={"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}),
+                     "the light of 003.exr is not that of 003.exr of the capture"),
+    "fewer lights": (lambda ball: edit_frame(ball, 3, light={"type": "off"}), "23 are lit, the capture has 24"),
+    "no mask": (lambda ball: edit_manifest(ball, mask=None), "mask: is missing: it says where the ball is"),
+    "no ball": (lambda ball: write_image(ball / "mask.png", np.pad(np.full((90, 10), 255, np.uint8), ((25, 25), (65, 65)))), "ball"),
+    "perspective": (lambda ball: edit_manifest(ball, camera={"projection": "perspective", "resolution": [140, 140],
+                                                             "focal_px": [300, 300], "principal_px": [70, 70]}),
+                    "camera.projection: is perspective"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_what_is_no_reference_is_refused(relit, captures, fault):
+    change, words = FAULTS[fault]
+    change(captures / "ball")
     outcome = solve(relit, captures, "--method", "reference", "--reference-ball", captures / "ball")
     assert outcome.code == 2 and not (captures / "out").exists()
-    return " ".join(outcome.err.split())
-
-
-def test_other_lights_are_refused(relit, captures):
-    edit_frame(captures / "ball", 3, light={"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]})
-    assert "the light of 003.exr is not that of 003.exr of the capture" in refused(relit, captures)
-
-
-def test_another_number_of_lights_is_refused(relit, captures):
-    edit_frame(captures / "ball", 3, light={"type": "off"})
-    assert "23 are lit, the capture has 24" in refused(relit, captures)
-
-
-def test_a_ball_without_a_mask_is_refused(relit, captures):
-    edit_manifest(captures / "ball", mask=None)
-    assert "mask: is missing: it says where the ball is" in refused(relit, captures)
-
-
-def test_a_mask_that_is_no_ball_is_refused(relit, captures):
-    write_image(captures / "ball" / "mask.png", np.pad(np.full((90, 10), 255, np.uint8), ((25, 25), (65, 65))))
-    assert "ball" in refused(relit, captures)
-
-
-def test_a_perspective_camera_is_refused(relit, captures):
-    edit_manifest(captures / "ball", camera={"projection": "perspective", "resolution": [140, 140], "focal_px": [300, 300],
-                                             "principal_px": [70, 70]})
-    assert "camera.projection: is perspective" in refused(relit, captures)
+    assert words in " ".join(outcome.err.split())

@@ -16,13 +16,6 @@ def test_a_pixel_between_doubtful_ones_is_as_doubtful():
     assert np.array_equal(neighbours_doubt(doubt.T, inside), found.T)
 
 
-def test_a_single_doubtful_pixel_doubts_itself_alone():
-    doubt, inside = np.zeros((40, 40)), np.ones((40, 40), bool)
-    doubt[20, 20] = 30
-    found = neighbours_doubt(doubt, inside)
-    assert found[20, 20] == 30 and (found > 0).sum() == 1
-
-
 def test_it_is_the_largest_of_the_window():
     """Against a plain loop."""
     doubt = np.repeat(np.repeat(np.random.default_rng(1).uniform(0, 9, (16, 16)), 4, axis=0), 4, axis=1)

@@ -14,7 +14,7 @@ from service.solve.sharing.sharing import Results, SharedSolve, digest
 from service.solve.solve import help_solve, solve
 from stage.stack import stack
 from tests.service.owl import write_small_owl
-from tests.service.solve.test_several_devices import (
+from tests.service.solve.sharing.test_several_devices import (
     BAND_BYTES,
     BATCH_BYTES,
     CAPTURES,

@@ -11,13 +11,13 @@ import pytest
 from kernels.status import Status
 from service.depth.stereo.rectification import rectify
 from stage.capture.camera import Camera, OtherCamera
-from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.reference import projector as reference
 from tests.scenes import stereo as scenes
 from tests.scenes.captures import edit_manifest, write_exr
 from tests.scenes.depth import entry_of
 from tests.scenes.stereo import CAMERA, OTHER, POSE, Plane, Rectangle, Sphere
+from tests.service.depth.stereo.test_stereo import pixels_off, solve
 
 WALL, BALL = Plane((0.0, 0.05, -1.05), (0.25, -0.3, 1.0), 0.65), Sphere((-0.06, 0.05, -0.88), 0.1, 0.55)
 ABOVE = np.eye(4)
@@ -40,17 +40,6 @@ def recorded(view, seed, **noise):
     return [scenes.recorded(image, rng, **noise) for image in view.images]
 
 
-def solve(relit, folder, *arguments):
-    outcome = relit("depth", folder, "--out", folder / "out", *arguments)
-    assert outcome.code == 0, outcome.err
-    return DepthMaps.read(folder / "out" / "depth.exr", unsure=True), json.loads((folder / "out" / "report.json").read_text())
-
-
-def pixels_off(maps, truth, pose=POSE):
-    with np.errstate(divide="ignore"):
-        return CAMERA.focal * np.linalg.norm(np.asarray(pose)[:3, 3]) * (1 / maps.depth - 1 / truth)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("textures", "cell", "noise"), [
     (1, 3, {}), (3, 4, {"read": 0.008, "photons": 3000.0}), (2, 5, {"read": 0.001, "photons": 1e5})])
@@ -65,6 +54,7 @@ def test_sigma_is_that_of_the_true_error(relit, tmp_path, textures, cell, noise)
     assert (~right_ones).mean() < 0.005
 
 
+@pytest.mark.long
 def test_at_least_as_accurate_as_opencv_on_the_same_images(relit, tmp_path):
     left, right = pair((WALL, BALL))
     ours, theirs = recorded(left, 3), recorded(right, 4)

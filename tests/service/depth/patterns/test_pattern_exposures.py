@@ -52,8 +52,7 @@ def capture(folder, times, *, bits=16, **fields):
 
 
 def decoded(relit, folder):
-    outcome = relit("depth", folder, "--out", folder / "out", "--device", "cpu", "--read-noise", READ, "--photon-gain", GAIN)
-    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    relit.done("depth", folder, "--out", folder / "out", "--device", "cpu", "--read-noise", READ, "--photon-gain", GAIN)
     layers, _ = exr.read(folder / "out" / "depth.exr")
     maps = Maps(layers["mask.Y"] > 0.5, *(layers[name].astype(np.float64) for name in ("projector.U", "sigma.U", "amplitude.Y")))
     return maps, json.loads((folder / "out" / "report.json").read_text())
@@ -94,8 +93,7 @@ def test_a_pattern_without_an_exposure_is_named(relit, tmp_path):
     manifest = json.loads((folder / "capture.json").read_text())
     del manifest["frames"][5]
     (folder / "capture.json").write_text(json.dumps(manifest))
-    outcome = relit("depth", folder, "--out", folder / "out")
-    assert outcome.code == 2 and "was taken at 0.01 s, other patterns at 0.01, 0.16 s: every" in outcome.err
+    assert "was taken at 0.01 s, other patterns at 0.01, 0.16 s: every" in relit.refused("depth", folder, "--out", folder / "out")
 
 
 def test_floating_point_images_say_where_they_saturate(relit, tmp_path):
@@ -105,8 +103,7 @@ def test_floating_point_images_say_where_they_saturate(relit, tmp_path):
         write_exr(folder / f"{number:03d}.exr", np.repeat(image[..., None], 3, axis=2))
         manifest["frames"][number]["image"] = f"{number:03d}.exr"
     (folder / "capture.json").write_text(json.dumps(manifest))
-    outcome = relit("depth", folder, "--out", folder / "out")
-    assert outcome.code == 2 and "saturation: is missing: exposures of floating-point images" in outcome.err
+    assert "saturation: is missing: exposures of floating-point images" in relit.refused("depth", folder, "--out", folder / "out")
 
 
 @pytest.mark.parametrize("order", ["exposure", "pattern"])
@@ -119,8 +116,7 @@ def test_an_import_names_the_exposures(relit, tmp_path, order):
     names = [f"frame_{number}.png" for number in range(len(taken))]
     words = ["import", "phase", tmp_path / "scan", "--projector", f"{WIDTH}x64", "--periods", "16", "--steps", "4", "--exposures-s",
              ",".join(map(str, TIMES)), "--exposure-order", order]
-    outcome = relit(*words, "--images", "frame_?.png")
-    assert outcome.code == 2 and "where these options have 4 patterns at 2 exposures" in outcome.err
+    assert "where these options have 4 patterns at 2 exposures" in relit.refused(*words, "--images", "frame_?.png")
     phases = names[-8:] if order == "exposure" else [*names[len(names) // 2 - 4 : len(names) // 2], *names[-4:]]
     for name in set(names) - set(phases):
         (tmp_path / "scan" / name).unlink()

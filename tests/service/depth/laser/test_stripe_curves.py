@@ -38,14 +38,15 @@ def test_a_gap_of_dark_lines_does_not_end_a_curve():
     assert link(place, status == OK).max() == 0
 
 
-def test_one_stripe_stays_as_it_is():
-    found = choose_curves(*frame((20.0, 1.0, 0, LINES)))
+@pytest.mark.parametrize("curves", [
+    [(20.0, 1.0, 0, LINES)],
+    [(20.0, 1.0, 0, 30), (60.0, 0.9, 30, LINES)],
+    [(20.0, 1.0, 0, LINES), (90.0, 0.1, 0, LINES), (150.0, 0.09, 0, LINES)],
+    [(20.0, 1.0, 0, LINES), (90.0, 0.9, 30, 31)],
+], ids=["one", "a step of the surface", "two reflections, which say nothing of each other", "a hot pixel, which is no stripe"])
+def test_one_laser_is_not_in_doubt(curves):
+    found = choose_curves(*frame(*curves))
     assert (found.peak == 0).all() and (found.status == OK).all() and not found.doubled.any()
-
-
-def test_pieces_that_follow_each_other_are_one_laser():
-    """A step of the surface: the stripe goes on elsewhere."""
-    assert (choose_curves(*frame((20.0, 1.0, 0, 30), (60.0, 0.9, 30, LINES))).status == OK).all()
 
 
 def test_a_reflection_is_left_out_where_it_is_seen_alone_too():
@@ -63,12 +64,3 @@ def test_a_short_rival_casts_doubt_on_its_lines_alone():
     found = choose_curves(*frame((20.0, 1.0, 0, LINES), (90.0, 0.6, 10, 18)))
     assert (found.status[10:18] == Status.MULTIPATH).all()
     assert (np.delete(found.status, range(10, 18)) == OK).all()
-
-
-def test_two_reflections_say_nothing_of_each_other():
-    found = choose_curves(*frame((20.0, 1.0, 0, LINES), (90.0, 0.1, 0, LINES), (150.0, 0.09, 0, LINES)))
-    assert (found.status == OK).all() and not found.doubled.any()
-
-
-def test_a_hot_pixel_is_no_stripe():
-    assert (choose_curves(*frame((20.0, 1.0, 0, LINES), (90.0, 0.9, 30, 31))).status == OK).all()

@@ -70,15 +70,6 @@ def test_a_disc_that_moves_changes_lights_without_a_jump(weighting):
     assert np.abs(np.diff(energy, axis=0)).max() < 0.05
 
 
-def test_lights_in_one_place_are_one():
-    energy = integrate_discs(np.array([[0.0, 0.0, 1.0]]), np.array([1.0]), np.concatenate([AXES, AXES]), weighting=Weighting.SMOOTH)
-    assert energy[0, 2] == pytest.approx(1, abs=0.01) and (energy[0, 6:] == 0).all()
-
-
-def test_no_disc_is_no_energy():
-    assert integrate_discs(np.zeros((0, 3)), np.zeros(0), AXES[:1], weighting=Weighting.SMOOTH).shape == (0, 1)
-
-
 @pytest.mark.parametrize(("middles", "angles", "directions", "words"), [
     (np.zeros((1, 2)), np.zeros(1), AXES, r"middles are \(1, 2\)"),
     (np.zeros((1, 3)), np.zeros(2), AXES, r"angles \(2,\)"),
