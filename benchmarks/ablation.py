@@ -19,8 +19,8 @@ from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.svbrdf import SHAPE_TEMPERATURE, average_normals, solve_svbrdf
 from kernels.status import Status
 from service.reporting.progress import Timings
+from service.solve.base.solution import SolveInput
 from service.solve.methods.material import SPREAD_PIXELS, MaterialOptions, solve_material
-from service.solve.sharing.solution import SolveInput
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
 from stage.colour.colour import GREY_WEIGHTS

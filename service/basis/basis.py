@@ -15,16 +15,10 @@ SUFFIXES = {BasisKind.SVD: ".exr", BasisKind.PTM: ".ptm", BasisKind.LRGB_PTM: ".
 
 
 def make_basis(request: BasisRequest, progress: Progress | None = None) -> BasisResult:
-    """Reduce a capture to a basis and write it.
-
-    Args:
-        request: capture, kind, how many coefficients, and where to put them.
-        progress: told of every stage.
+    """Reduce a capture to a basis and write it, whole or not at all.
 
     Raises:
         RequestError: a suffix or a count that the kind does not have, or a result that would replace an input.
-        StageError, KernelError: bad input; names file and field.
-        StorageError: a file cannot be written; nothing half-written is left.
     """
     kind = resolve_kind(request.kind, request.out)
     device = devices.resolve(request.device)
@@ -36,11 +30,7 @@ def make_basis(request: BasisRequest, progress: Progress | None = None) -> Basis
 
 
 def resolve_kind(kind: BasisKind | None, out: Path) -> BasisKind:
-    """Return the kind that is asked for, by name or by the suffix of the file.
-
-    Raises:
-        RequestError: the suffix is not that of the kind, or no kind has it.
-    """
+    """Return the kind that is asked for, by name or by the suffix of the file, which must be that of the kind."""
     suffix = out.suffix.lower()
     if kind is None:
         kind = next((k for k, s in SUFFIXES.items() if s == suffix), None)

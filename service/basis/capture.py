@@ -76,12 +76,7 @@ class BasisResult(NamedTuple):
 
 
 def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:
-    """Open the capture of a request.
-
-    Raises:
-        RequestError: a result would replace an image of the capture.
-        StageError: bad input; names file and field.
-    """
+    """Open the capture of a request, none of whose images a result may replace."""
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
     lights = lights_from_centre(capture)
@@ -111,12 +106,10 @@ class StackBand(NamedTuple):
 
 
 def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings: Timings, stage: str) -> Iterator[StackBand]:
-    """Yield the bands of the stack on the device, without those that have no pixel inside the mask.
+    """Yield the bands of the stack on the device, without those that have no pixel inside the mask, as one stage of the work.
 
     Args:
-        source, device: the capture, and where.
         bytes_per_pixel: what the caller allocates beside the stack for each pixel.
-        timings: told of the bands as one `stage` of the work.
     """
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))

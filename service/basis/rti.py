@@ -71,13 +71,7 @@ class Model(NamedTuple):
 
 
 def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, device: str, timings: Timings) -> BasisResult:
-    """Write a `.ptm` or `.rti` file, and exposure, lights and errors as JSON beside it.
-
-    Raises:
-        RequestError: a count that the kind does not have.
-        ManifestError: too few lights in front of the object, or none that determine the coefficients.
-        StorageError: a file cannot be written.
-    """
+    """Write a `.ptm` or `.rti` file, and exposure, lights and errors as JSON beside it."""
     model, stack = _model(request, kind, source), source.stack
     terms, pixels = model.terms, stack.pixel_count
     bytes_per_pixel = (6 + 4) * stack.shape[1] + 8 * 12 * terms  # display values, luminances, and coefficients in their stages

@@ -21,12 +21,7 @@ DEFAULT_COUNT = 16
 
 
 def make_svd(request: BasisRequest, source: BasisCapture, device: str, timings: Timings) -> BasisResult:
-    """Write coefficient images as an EXR, and matrices and errors as JSON beside it.
-
-    Raises:
-        RequestError: more coefficients than lights.
-        StorageError: a file cannot be written.
-    """
+    """Write coefficient images as an EXR, and matrices and errors as JSON beside it."""
     stack, lights = source.stack, source.stack.light_count
     count = min(DEFAULT_COUNT, lights) if request.count is None else request.count
     if count > lights:

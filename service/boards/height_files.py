@@ -27,11 +27,7 @@ class Nominal(NamedTuple):
 
 
 def write_board(path: Path, heights: HeightMap, provenance: dict[str, str]) -> None:
-    """Write board.exr: the height, its σ and the part of σ that is noise, all 0 outside of the mask.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Write board.exr: the height, its σ and the part of σ that is noise, all 0 outside of the mask."""
     there = heights.measured
     layers = {HEIGHT: heights.height, SIGMA: heights.sigma, NOISE: np.sqrt(heights.variance)}
     channels = {name: np.where(there, values, 0).astype(np.float32) for name, values in layers.items()}
@@ -45,10 +41,6 @@ def read_golden(path: Path, regions: Path | None = None) -> Nominal:
     Args:
         path: a result folder of relit inspect-board, or its board.exr.
         regions: the JSON file of the regions that are judged on it; None: there are none.
-
-    Raises:
-        ResultError, ImageError: the file is no height map.
-        ManifestError: the file of the regions is wrong, or one lies beyond the height map.
     """
     file = path / BOARD_FILE if path.is_dir() else path
     channels, metadata = exr.read(file)
@@ -65,12 +57,7 @@ def read_golden(path: Path, regions: Path | None = None) -> Nominal:
 
 
 def read_design(path: Path) -> Nominal:
-    """Read a design: its JSON file and the height map that it names.
-
-    Raises:
-        ManifestError: the file is wrong, or the height map has another size than it says.
-        ResultError, ImageError: the height map cannot be used.
-    """
+    """Read a design: its JSON file and the height map that it names, which has the size that the file says."""
     design = read_record(path, BoardDesign, DESIGN_SCHEMA)
     file = path.parent / design.height_map.path
     channels, _ = exr.read(file)

@@ -76,12 +76,7 @@ class _Judged(NamedTuple):
 
 
 def inspect_board(request: InspectBoardRequest, progress: Progress | None = None) -> InspectBoardResult:
-    """Inspect a board.
-
-    Raises:
-        StageError, KernelError: bad input, or tiles or heights that do not fit together; nothing is written.
-        StorageError: the results cannot be written.
-    """
+    """Inspect a board; nothing is written where tiles or heights do not fit together."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     nominal = _nominal(request)

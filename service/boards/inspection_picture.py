@@ -29,9 +29,6 @@ def write_picture(path: Path, heights: HeightMap, deviation: Deviation | None, i
     Args:
         deviation, inspected, wanted: of the comparison, [rows, cols]: the pixels that were inspected, and those that have a nominal height.
         defects, regions: drawn as frames.
-
-    Raises:
-        StorageError: the file cannot be written.
     """
     low, high = np.percentile(heights.height[heights.measured], [1, 99])
     grey = np.clip((heights.height - low) / max(high - low, 1e-12), 0, 1)

@@ -34,8 +34,6 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
     """Register a height map to the nominal one; both are on the nominal grid, the measured one at the stage's pose.
 
     Args:
-        measured: the blend of the tiles on the nominal grid.
-        nominal: what it is compared with.
         placement_m: standard deviation of the board's place, metres; None: SHIFT_SIGMA_PX pixels.
 
     Raises:
@@ -79,17 +77,7 @@ def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placemen
 
 
 def check_size(measured: HeightMap, tiles: Sequence[TilePoints], stitched: Stitched, nominal: Nominal) -> None:
-    """Refuse a nominal map that is not as large as the board, or lies elsewhere.
-
-    Args:
-        measured: the blend of the tiles on the nominal grid.
-        tiles: that were measured.
-        stitched: of the tiles, with the grid of what was measured.
-        nominal: the map.
-
-    Raises:
-        BoardError: says both sizes.
-    """
+    """Refuse a nominal map that is not as large as the board, or lies elsewhere than the blend of the tiles on its grid, `measured`."""
     grid, pixel = nominal.heights.grid, stitched.grid.pixel_m
     own = stitched.grid.size_m
     sizes = f"it is {grid.size_m[0]:.4g} x {grid.size_m[1]:.4g} m, the board was measured over {own[0]:.4g} x {own[1]:.4g} m"

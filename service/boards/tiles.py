@@ -29,16 +29,8 @@ class BoardTiles(NamedTuple):
 
 
 def read_tiles(path: Path, *, device: str | None, cache: Path | None, progress: Progress) -> BoardTiles:
-    """Read a board.json and all of its tiles.
-
-    Args:
-        path: the file, or the folder with it.
-        device: on which captures are decoded.
-        cache: folder for the image stacks of captures; None: beside each.
-
-    Raises:
-        StageError, KernelError: the file or a tile cannot be used; the message names it.
-    """
+    """Read a board.json, or that in a folder, and all of its tiles; captures are decoded on the device, with their image stacks in the
+    folder `cache`, or beside each where it is None."""
     file = path / SCAN_FILE if path.is_dir() else path
     scan = read_record(file, BoardScan, SCAN_SCHEMA)
     progress.stage("tiles", len(scan.tiles))

@@ -1,22 +1,46 @@
-"""The balls that a request names by circles and masks, with what is known of their size and place."""
+"""The balls of a calibration: those that a request names by circles and masks, or else those that are found in the images."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from service.calibrate.results import digits
+import numpy as np
+
+from kernels.photometric.model.samples import evenly
+from service.calibrate.results import LightCaptures, digits
+from service.calibrate.solvers.apply import LitFrame, as_direction
+from service.calibrate.solvers.ball_search import find_outlines
+from service.calibrate.solvers.mirror_ball import find_spot
 from service.errors import RequestError
-from service.light_estimation.ball import Ball, ball_from_circle
+from service.light_estimation.ball import Ball, BallView, ball_from_circle, project, view_ball
 from service.light_estimation.ball_outline import ball_from_mask
+from service.light_estimation.grey_ball import fit_brightness, fit_direction
 from service.requests.calibrate import BallRequest
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
 from stage.errors import CalibrationError, ManifestError
 from stage.formats import images
+from stage.stack.correction import Correction
 
 RADIUS_TOLERANCE = 0.05
 """Relative difference of a ball's radius in metres from its radius in pixels × pixel_size_m, above which one of them must be wrong."""
+FRAMES = 16
+"""The most frames in which each outline is looked at."""
+CANDIDATES = 12
+"""The most outlines that are looked at."""
+WHITE = 0.995
+"""The quantile of a frame that is shown white."""
+GAMMA = 0.45
+"""Exponent with which frames are shown, so that dark outlines count."""
+LEAST_FRAMES = 0.7
+"""The part of the frames that must agree that an outline is that of the ball: some lights stand behind it."""
+LEAST_MOVE = 0.05
+"""The least standard deviation of the place of the spot over the frames, relative to the radius: the lamp of the room stands still."""
+GREY_RESIDUAL = 0.1
+"""The largest residual of the shading of a grey ball; a flat disc leaves 0.3."""
+DARK = 0.05
+"""An outline whose brightest frame is darker than this part of the brightest pixels is that of a shadow."""
 
 
 def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None, at_least: int = 1,
@@ -25,13 +49,8 @@ def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None
 
     Args:
         exactly: how many balls there must be; None: `at_least` says it.
-        at_least: how many balls there must be at least.
         radii: metres, one for all balls or one for each; empty: not known.
         heights: camera-frame z of the centres, one for all balls or one for each; empty: surface_z_m.
-
-    Raises:
-        RequestError: the number of balls, radii or heights is not what is needed.
-        StageError: a ball lies outside the image, or a mask shows none.
     """
     count = len(request.circles) + len(request.masks)
     if count < at_least or exactly not in (None, count):
@@ -54,12 +73,7 @@ def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None
 
 
 def check_metric(capture: Capture, balls: Sequence[Ball], radii: Sequence[float]) -> None:
-    """Check that the size of each ball in metres is known, and that two sources of it agree.
-
-    Raises:
-        RequestError: a perspective camera needs --ball-radius-m.
-        ManifestError: camera.pixel_size_m is missing, or differs from --ball-radius-m.
-    """
+    """Check that the size of each ball in metres is known, and that two sources of it agree."""
     if capture.camera.projection == "perspective":
         if not radii:
             raise RequestError("--ball-radius-m: is missing: a perspective camera sees the size of a ball, not its distance")
@@ -89,3 +103,119 @@ def _masked_ball(path: Path, camera: Camera, radius: float | None, z: float | No
         return ball_from_mask(camera, coverage, radius_m=radius, z_m=z)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
+
+
+class _Seen(NamedTuple):
+    """The pixels of one frame within an outline."""
+
+    lit: LitFrame
+    radiance: np.ndarray
+    saturated: np.ndarray | None
+
+
+def find_mirror_ball(captures: LightCaptures, level: float) -> Ball:
+    """Find the mirror ball, the only round outline in which the bright spot is small and moves from frame to frame."""
+    return _only(captures, "mirror", _mirrors(captures, level, None, None))
+
+
+def find_mirror_balls(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> list[Ball]:
+    """Find the mirror balls of a capture: two round outlines or more in which the bright spot is small and moves from frame to frame.
+
+    Args:
+        captures: lit by one lamp a frame.
+        radius_m: of every ball; None: not known.
+        z_m: camera-frame z of every centre, for an orthographic camera; None: not known.
+    """
+    found = _mirrors(captures, level, radius_m, z_m)
+    if len(found.balls) < 2:
+        raise RequestError(f"{captures.source.folder}: {_counted(len(found.balls))} found in the images ({found.looked_at} round outlines "
+                           "were looked at), and near lights need two or more: name them with --ball U,V,R or --ball-mask FILE, once each")
+    return found.balls
+
+
+class _Found(NamedTuple):
+    """The balls of a capture."""
+
+    balls: list[Ball]
+    looked_at: int
+    """The number of round outlines."""
+
+
+def _mirrors(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> _Found:
+    def is_mirror(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
+        places = []
+        for seen in frames:
+            try:
+                places.append(find_spot(seen.radiance, seen.saturated, ball, view, level=level).uv)
+            except CalibrationError:
+                continue
+        if len(places) < LEAST_FRAMES * len(frames):
+            return False
+        return len(frames) == 1 or float(np.hypot(*np.std(places, axis=0))) > LEAST_MOVE * ball.radius_px
+
+    return _find(captures, is_mirror, radius_m, z_m)
+
+
+def _counted(count: int) -> str:
+    return "no mirror ball is" if count == 0 else f"{count} mirror ball is"
+
+
+def find_grey_ball(captures: LightCaptures, radius_m: float | None, z_m: float | None) -> Ball:
+    """Find the grey ball, the only round outline with the shading of a Lambertian ball under one distant light a frame."""
+    def is_grey(ball: Ball, view: BallView, frames: list[_Seen]) -> bool:
+        residuals = []
+        for seen in frames:
+            try:
+                direction = fit_direction(seen.radiance, seen.saturated, view).direction
+                light = as_direction(seen.lit.light, direction)
+                residuals.append(fit_brightness(seen.radiance, seen.saturated, light, view).residual)
+            except CalibrationError:
+                residuals.append(np.inf)
+        return float(np.mean(np.array(residuals) < GREY_RESIDUAL)) >= LEAST_FRAMES
+
+    return _only(captures, "grey", _find(captures, is_grey, radius_m, z_m))
+
+
+def _find(captures: LightCaptures, is_ball: Callable[[Ball, BallView, list[_Seen]], bool], radius_m: float | None,
+          z_m: float | None) -> _Found:
+    camera, correction = captures.source.camera, Correction.of(captures.source)
+    mean, brightest = np.zeros((camera.height, camera.width)), np.zeros((camera.height, camera.width))
+    for lit in captures.lit:
+        grey = correction.apply(lit.frame).pixels.mean(axis=-1, dtype=np.float64)
+        shown = np.clip(grey / max(float(np.quantile(grey, WHITE)), 1e-12), 0, 1) ** GAMMA
+        mean += shown / len(captures.lit)
+        brightest = np.maximum(brightest, shown)
+    outlines = find_outlines(camera, [mean, brightest])[:CANDIDATES]
+    placed = [(outline, outline.place(camera, radius_m, z_m)) for outline in outlines]
+    views = [view_ball(ball, camera) for _, ball in placed]
+    seen: list[list[_Seen]] = [[] for _ in placed]
+    for number in evenly(len(captures.lit), FRAMES):
+        lit = captures.lit[number]
+        frame = correction.apply(lit.frame)
+        for view, frames in zip(views, seen, strict=True):
+            frames.append(_Seen(lit, frame.pixels[view.box], None if frame.saturated is None else frame.saturated[view.box]))
+    balls: list[Ball] = []
+    for (_, ball), view, frames in zip(placed, views, seen, strict=True):
+        if brightest[view.box][view.inside].max(initial=0) < DARK or any(_overlap(camera, ball, other) for other in balls):
+            continue
+        if is_ball(ball, view, frames):
+            balls.append(ball)
+    return _Found(balls, len(outlines))
+
+
+def _only(captures: LightCaptures, kind: str, found: _Found) -> Ball:
+    """Return the only ball that was found, or raise RequestError."""
+    where = captures.source.folder
+    balls, camera = found.balls, captures.source.camera
+    if not balls:
+        raise RequestError(f"{where}: no {kind} ball is found in the images ({found.looked_at} round outlines were looked at): name it "
+                           "with --ball U,V,R or --ball-mask FILE")
+    if len(balls) > 1:
+        named = " and ".join(",".join(f"{value:.1f}" for value in (*project(camera, ball.centre), ball.radius_px)) for ball in balls)
+        raise RequestError(f"{where}: {len(balls)} {kind} balls are found, at {named} (U,V,R): name one of them with --ball")
+    return balls[0]
+
+
+def _overlap(camera: Camera, one: Ball, other: Ball) -> bool:
+    (u, v), (other_u, other_v) = project(camera, one.centre), project(camera, other.centre)
+    return bool(np.hypot(u - other_u, v - other_v) < max(one.radius_px, other.radius_px))

@@ -1,26 +1,36 @@
 """Calibration of the sensor: dark.exr, flat.exr and the saturation of a capture, from images with the lens covered, of a white card,
-and of anything bright."""
+and of anything bright.
 
-from collections.abc import Sequence
+The correction (stage/stack/correction.py) subtracts the dark frame of the manifest from the flat field. The dark frame of the exposure of
+the white card is therefore replaced by the dark frame of the manifest.
+"""
+
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from service import __version__
-from service.calibrate.results import digits, manifest_to_write, write_results
-from service.calibrate.solvers.flat_field import make_flat, mean_image, recorded_values
-from service.calibrate.solvers.saturation import TopHistogram, capture_saturation
+from service.calibrate.results import digits, open_capture, write_results
 from service.errors import RequestError
-from service.reporting.progress import Progress, Timings
+from service.reporting.progress import Progress
 from service.requests.calibrate import DarkRequest, FlatFieldRequest, SaturationRequest
 from stage.capture.capture import Capture
+from stage.colour.colour import convert, linearise
+from stage.colour.colour_spaces import linear_space
 from stage.colour.radiance import RAW_STRAY, check_radiance
-from stage.errors import CalibrationError
+from stage.errors import CalibrationError, ImageError
 from stage.formats import exr, images
 from stage.formats.camera_raw import path_is_raw
 
 DARK_FILE, FLAT_FILE = "dark.exr", "flat.exr"
+BIN = 0.01
+"""The width of the compared bins, relative to the largest value."""
+MIN_COUNT = 20
+"""The least count of saturated readings: fewer may belong to one highlight."""
+EXCESS = 3.0
+"""The least ratio of the readings in the top bin to the mean of the two bins below, because a smooth histogram falls towards its end."""
 
 
 class ImageCalibration(NamedTuple):
@@ -44,15 +54,8 @@ class Saturation(NamedTuple):
 
 
 def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibration:
-    """Write the mean of dark images as dark.exr, and name it in the manifest.
-
-    Raises:
-        StageError, RequestError: the input is wrong; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
-    manifest_path = manifest_to_write(capture, request.out)
+    """Write the mean of dark images as dark.exr, and name it in the manifest."""
+    capture, manifest_path, timings = open_capture(request, progress)
     _refuse_overwrite(request.images, manifest_path.parent / DARK_FILE)
     timings.stage("images", len(request.images))
     mean = mean_image(request.images, capture, progress=timings.advance)
@@ -62,15 +65,8 @@ def dark(request: DarkRequest, progress: Progress | None = None) -> ImageCalibra
 
 
 def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> ImageCalibration:
-    """Write the mean of white-card images, less their dark, as flat.exr, and name it in the manifest.
-
-    Raises:
-        StageError, RequestError: the input is wrong; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
-    manifest_path = manifest_to_write(capture, request.out)
+    """Write the mean of white-card images, less their dark, as flat.exr, and name it in the manifest."""
+    capture, manifest_path, timings = open_capture(request, progress)
     _refuse_overwrite([*request.images, *request.dark_images], manifest_path.parent / FLAT_FILE)
     timings.stage("images", len(request.images) + len(request.dark_images))
     white = mean_image(request.images, capture, refuse_saturated=True, progress=timings.advance)
@@ -86,15 +82,8 @@ def flat_field(request: FlatFieldRequest, progress: Progress | None = None) -> I
 
 
 def saturation(request: SaturationRequest, progress: Progress | None = None) -> Saturation:
-    """Find the level at which the readings of a capture's frames pile up, and write it to the manifest if the request says so.
-
-    Raises:
-        StageError: the input is wrong, or nothing piles up; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
-    manifest_path = manifest_to_write(capture, request.out)
+    """Find the level at which the readings of a capture's frames pile up, and write it to the manifest if the request says so."""
+    capture, manifest_path, timings = open_capture(request, progress)
     paths = [capture.file(frame.image) for frame in capture.manifest.frames if Path(frame.image).suffix.lower() != ".npy"]
     timings.stage("peaks", len(paths))
     peaks = np.zeros(3)
@@ -122,6 +111,48 @@ def saturation(request: SaturationRequest, progress: Progress | None = None) -> 
     return Saturation(level, counts, manifest_path, report)
 
 
+class ChannelSaturation(NamedTuple):
+    """The saturation of one channel."""
+
+    level: float | None
+    """The value at and above which readings are saturated, or None when none are."""
+    readings: int
+    """The count of readings at or above the level."""
+
+
+class TopHistogram:
+    """The three topmost bins of the histogram of one channel over many images, the largest value of all of which is `peak`."""
+
+    def __init__(self, peak: float) -> None:
+        self.peak = peak
+        self._counts = np.zeros(3, dtype=np.int64)
+
+    def add(self, values: np.ndarray) -> None:
+        """Count the recorded values of an image, an array of any shape."""
+        if self.peak > 0:
+            edges = self.peak * (1 - BIN * np.array([3, 2, 1]))
+            above = [int((values >= edge).sum()) for edge in edges]
+            self._counts += [above[2], above[1] - above[2], above[0] - above[1]]
+
+    def saturation(self) -> ChannelSaturation:
+        """Return the saturation of the channel: whether the top bin holds more readings than the bins below explain."""
+        top, *below = (int(count) for count in self._counts)
+        saturated = top >= MIN_COUNT and top > EXCESS * (sum(below) / len(below) + 1)
+        return ChannelSaturation(self.peak * (1 - BIN) if saturated else None, top if saturated else 0)
+
+
+def capture_saturation(channels: list[ChannelSaturation]) -> float:
+    """Return the saturation of a capture, one number for all channels: the least level of a channel, to four digits.
+
+    Raises:
+        CalibrationError: no channel saturates.
+    """
+    levels = [channel.level for channel in channels if channel.level is not None]
+    if not levels:
+        raise CalibrationError("no channel piles up at its largest value: nothing shows where readings saturate")
+    return float(f"{min(levels):.4g}")
+
+
 def _recorded(path: Path) -> np.ndarray:
     pixels = images.read_pixels(path)
     check_radiance(path, pixels, stray=RAW_STRAY if path_is_raw(path) else 0.0)
@@ -146,3 +177,74 @@ def _write(name: str, field: str, request: DarkRequest | FlatFieldRequest, captu
         "relit:inputs": " ".join(path.name for path in request.images)})
     report = write_results(kind, request, capture.manifest.model_copy(update={field: name}), manifest_path, section)
     return ImageCalibration(manifest_path, report, image_path, section["noise"])
+
+
+class MeanImage(NamedTuple):
+    """The mean of several images of one object, and their noise."""
+
+    pixels: np.ndarray  # [rows, cols, 3] float64, linear
+    noise: float
+    """The root mean square of the difference of an image from the mean, over all pixels; 0 for one image."""
+    images: int
+    """The count of images."""
+
+
+def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
+               progress: Callable[[int], None] | None = None) -> MeanImage:
+    """Return the mean of images, which have the resolution and the encoding of the capture, in linear values.
+
+    Args:
+        refuse_saturated: True makes a saturated reading inside the mask an error.
+        progress: called after every image with the count of images that have been read.
+    """
+    if not paths:
+        raise CalibrationError("no image is given")
+    manifest = capture.manifest
+    mask = capture.mask() if refuse_saturated and manifest.saturation is not None else None
+    total = np.zeros((capture.camera.height, capture.camera.width, 3))
+    squares = 0.0
+    for index, path in enumerate(paths):
+        images.check_resolution(path, capture.camera.resolution)
+        recorded = images.read_pixels(path).astype(np.float32, copy=False)
+        check_radiance(path, recorded, stray=RAW_STRAY if path_is_raw(path) else 0.0)
+        if mask is not None and manifest.saturation is not None:
+            count = int((np.any(recorded >= manifest.saturation, axis=-1) & mask).sum())
+            if count:
+                raise ImageError(f"{path}: {count} pixels are at or above the saturation of {manifest.saturation:g}: "
+                                 "shorten the exposure")
+        linear = linearise(recorded, manifest.color_space).astype(np.float64)
+        total += linear
+        squares += float((linear**2).mean())
+        if progress is not None:
+            progress(index + 1)
+    mean = total / len(paths)
+    variance = max(squares / len(paths) - float((mean**2).mean()), 0.0)
+    return MeanImage(mean, variance**0.5, len(paths))
+
+
+def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:
+    """Return the flat field for the correction: white card minus its own dark frame, plus the dark frame of the capture.
+
+    Args:
+        white_dark: the mean of dark images at the same exposure; None takes the dark frame of the capture for them.
+
+    Returns:
+        [rows, cols, 3] float32, linear.
+    """
+    dark = np.zeros_like(white.pixels)
+    if capture.manifest.dark is not None:
+        path = capture.file(capture.manifest.dark)
+        recorded = images.read_pixels(path).astype(np.float32, copy=False)
+        check_radiance(path, recorded)
+        dark = linearise(recorded, capture.manifest.color_space).astype(np.float64)
+    light = white.pixels - (dark if white_dark is None else white_dark.pixels)
+    unlit = int((light[capture.mask()] <= 0).any(axis=-1).sum())
+    if unlit:
+        raise CalibrationError(f"the white card is not brighter than the dark frame at {unlit} pixels of the mask")
+    return np.maximum(light + dark, 0).astype(np.float32)
+
+
+def recorded_values(linear: np.ndarray, capture: Capture) -> np.ndarray:
+    """Encode scene-linear values, [rows, cols, 3] float32, as the images of a capture are encoded."""
+    space = capture.manifest.color_space
+    return convert(np.ascontiguousarray(linear, dtype=np.float32), linear_space(space), space)

@@ -13,7 +13,7 @@ from service.calibrate.results import (
 )
 from service.calibrate.solvers.apply import with_brightness
 from service.light_estimation.semi_calibrated import check_directions, fit_intensities
-from service.reporting.progress import Progress, Timings
+from service.reporting.progress import Progress
 from service.requests.calibrate import IntensityRequest
 from stage.capture.light import DistantLight
 from stage.capture.manifest import FILE_NAME
@@ -25,14 +25,8 @@ BEHIND_Z = -0.2
 
 
 def intensity(request: IntensityRequest, progress: Progress | None = None) -> LightCalibration:
-    """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1.
-
-    Raises:
-        StageError, RequestError: the input is wrong, or the images do not determine the brightness; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    captures = open_captures(request)
+    """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1."""
+    captures, timings = open_captures(request, progress)
     source = captures.source
     for lit in captures.lit:
         if not isinstance(lit.light, DistantLight):

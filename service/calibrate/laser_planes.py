@@ -1,6 +1,7 @@
-"""Calibration of the planes of a laser from poses of a chessboard, or of a step, on which its stripes are seen."""
+"""Calibration of the planes of a laser from poses of a target on which its stripes are seen: a chessboard, or a step of known height,
+which is a right-angled block on a flat base."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,23 +10,30 @@ import numpy as np
 from kernels import device as devices
 from kernels.status import Status
 from kernels.structured.stripe import find_stripe
-from service.calibrate.even_light import even_light, uniform
-from service.calibrate.laser_step import check_step, planes_on_step
 from service.calibrate.results import digits, manifests_to_replace, write_results
 from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, inside_board
+from service.calibrate.solvers.laser_step import fit_step
 from service.calibrate.solvers.procam import find_corners
-from service.depth.laser.stripes import stripe_signal
+from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
+from service.depth.laser.laser import ambient_light
+from service.depth.laser.stripes import Signal, stripe_signal
 from service.depth.patterns.triangulation_check import check_perspective
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Frame
 from stage.capture.ranging import LaserPlane
+from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError, ManifestError
+from stage.patterns.base import UniformPattern
 from stage.stack.correction import Correction
 
 LEAST_BOARDS = 2
 """The fewest poses of a board: its stripe in one is a line, through which any plane goes."""
+LEAST_EVEN = 0.02
+"""Part of the brightest light of the room below which a pixel says nothing of its albedo."""
+LARGEST_RESIDUAL_PX = 1.0
+"""Largest root mean square distance of the lines of a stripe on a step from where the planes put them."""
 
 
 class LaserPlanes(NamedTuple):
@@ -61,11 +69,7 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
     """Measure the plane of each laser frame, and write it to the manifests.
 
     Args:
-        request: the captures of the board, and those that are written too.
         manifest_paths: the manifest to write for each capture, then for each of `apply_to`; None: their own.
-
-    Raises:
-        StageError, KernelError: the input is wrong, or a plane is not determined; nothing is written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -85,14 +89,7 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
         raise ManifestError(f"{captures[0].folder / FILE_NAME}: frames: none has a laser plane: give each a placeholder, such as "
                             '{"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}')
     if request.step_m is not None:
-        step = planes_on_step(captures, [_laser_frames(capture) for capture in captures], request.step_m, device, timings)
-        check_step(step.fit, [frame.image for frame in _laser_frames(captures[0])])
-        found = _OnTarget(
-            [MeasuredPlane(plane.point, plane.normal, plane.sigma_degrees,
-                           {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"),
-                            "sigma_depth": float(f"{plane.sigma:.3g}"), "poses": plane.stripes},
-                           (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth")) for plane in step.fit.planes],
-            {"steps": step.poses})
+        found = _on_steps(captures, request.step_m, device, timings)
     else:
         found = _on_boards(captures, request, device, timings)
     timings.close()
@@ -100,7 +97,7 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
     return _write(request, targets, manifests_to_replace(targets, manifest_paths), found)
 
 
-def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str, timings: Timings) -> "_OnTarget":
+def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str, timings: Timings) -> _OnTarget:
     """Measure the planes on a chessboard."""
     assert request.board is not None and request.square_m is not None
     if len(captures) < LEAST_BOARDS:
@@ -137,7 +134,7 @@ def _laser_frames(capture: Capture) -> list[Frame]:
 def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float, device: str) -> tuple[float, list[np.ndarray]]:
     """Return how well the pose of the board fits, pixels, and the points of each stripe on it, [n, 3] metres; none where it is not seen."""
     correction = Correction.of(capture)
-    grey, black = even_light(capture, correction), uniform(capture, correction, "black")
+    grey, black = _even_light(capture, correction), _uniform(capture, correction, "black")
     if grey is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames: none shows the board without the laser: add one under a white "
                             'projection, or under the light of the room, {"type": "off"}')
@@ -152,17 +149,92 @@ def _stripes_on_board(capture: Capture, board: tuple[int, int], square_m: float,
     albedo = np.where(inside, np.maximum(grey, 0), 0).astype(np.float32)
     for frame in _laser_frames(capture):
         signal = stripe_signal(correction.apply(frame).pixels - dark, inside)
-        best = np.zeros((0, 2))
-        for along in ("row", "column"):
-            stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)
-            centre, status = stripe.centre.numpy(), stripe.status.numpy()
-            lines = np.flatnonzero(status == Status.OK)
-            places = np.stack([centre[lines], lines + 0.5], axis=1).astype(np.float64)
-            places = places if along == "row" else places[:, ::-1]
-            if len(places) > len(best):
-                best = places
-        found.append(plane.meet(capture.camera, best[:, 0], best[:, 1]))
+        u, v, _ = max(_stripes(signal, albedo, device), key=lambda stripe: len(stripe[2]))
+        found.append(plane.meet(capture.camera, u, v))
     return plane.rms_px, found
+
+
+def _on_steps(captures: list[Capture], height_m: float, device: str, timings: Timings) -> _OnTarget:
+    """Measure the planes on a step, and refuse those whose lines miss it by far more than their noise."""
+    camera = captures[0].camera
+    assert camera.focal_px is not None
+    pixel = 2 / sum(camera.focal_px)
+    stripes = []
+    timings.stage("steps", len(captures))
+    for number, capture in enumerate(captures, start=1):
+        stripes.append(_stripes_on_step(capture, device, pixel))
+        timings.advance(number)
+    fit = fit_step(stripes, height_m, pixel)
+    worst = max(range(len(fit.planes)), key=lambda number: fit.planes[number].residual_px)
+    if fit.planes[worst].residual_px > LARGEST_RESIDUAL_PX:
+        raise CalibrationError(f"frame {_laser_frames(captures[0])[worst].image}: its stripe misses base, riser and top of an upright "
+                               f"block by {fit.planes[worst].residual_px:.2g} px: look for light of other surfaces, a base that is not "
+                               "flat, or a block that is not right-angled")
+    planes = [MeasuredPlane(plane.point, plane.normal, plane.sigma_degrees,
+                            {"residual_px": float(f"{plane.residual_px:.3g}"), "sigma_degrees": float(f"{plane.sigma_degrees:.3g}"),
+                             "sigma_depth": float(f"{plane.sigma:.3g}"), "poses": plane.stripes},
+                            (f"{plane.residual_px:.3f} px", f"{100 * plane.sigma:.2f} % of depth")) for plane in fit.planes]
+    return _OnTarget(planes, {"steps": [
+        {"capture": str(capture.folder), "stripes": sum(stripe is not None for stripe in found),
+         "with_riser": sum(stripe is not None and stripe.riser is not None for stripe in found), "distance_m": float(f"{distance:.5g}")}
+        for capture, found, distance in zip(captures, stripes, fit.distances_m, strict=True)]})
+
+
+def _stripes_on_step(capture: Capture, device: str, pixel: float) -> list[StepStripe | None]:
+    """Return the stripe of each laser frame of a capture, along rows or columns, whichever shows more of it."""
+    correction, mask, frames = Correction.of(capture), capture.mask(), _laser_frames(capture)
+    background, _ = ambient_light(capture, correction, frames, Timings(None))
+    albedo = _step_albedo(capture, correction, mask)
+    found: list[StepStripe | None] = []
+    for frame in frames:
+        signal = stripe_signal(correction.apply(frame).pixels - background, mask)
+        best: StepStripe | None = None
+        most = 0
+        for u, v, lines in _stripes(signal, albedo, device):
+            x, y = capture.camera.plane_at(u, v)
+            parts = split_stripe(x, y, lines, pixel)
+            if parts is not None and len(lines) > most:
+                best, most = parts, len(lines)
+        found.append(best)
+    return found
+
+
+def _step_albedo(capture: Capture, correction: Correction, mask: np.ndarray) -> np.ndarray | None:
+    """Return how bright the scene is under even light, by which stripes are divided; None: none shows it, or parts are too dark."""
+    light = _even_light(capture, correction)
+    if light is None:
+        return None
+    grey = np.where(mask, light, 0)
+    least = LEAST_EVEN * float(grey.max())
+    return np.maximum(grey, 0) if least > 0 and (grey[mask] > least).all() else None
+
+
+def _stripes(signal: Signal, albedo: np.ndarray | None, device: str) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the points of a stripe that is looked for along rows, then along columns: u, v and the number of the line of each, [n]."""
+    for along in ("row", "column"):
+        stripe = find_stripe(np.ascontiguousarray(signal.values), along=along, noise=signal.noise, device=device, albedo=albedo)
+        centre, status = stripe.centre.numpy(), stripe.status.numpy()
+        lines = np.flatnonzero(status == Status.OK)
+        across, down = centre[lines].astype(np.float64), lines + 0.5
+        yield (across, down, lines) if along == "row" else (down, across, lines)
+
+
+def _uniform(capture: Capture, correction: Correction, code: str) -> np.ndarray | None:
+    """Return the frame under a white or black projection, [rows, cols, 3] linear; None: there is none."""
+    frames = (frame for frame in capture.manifest.frames if isinstance(frame.pattern, UniformPattern) and frame.pattern.code == code)
+    frame = next(frames, None)
+    return None if frame is None else correction.apply(frame).pixels
+
+
+def _even_light(capture: Capture, correction: Correction) -> np.ndarray | None:
+    """Return the grey of the target, [rows, cols] float32, under a white projection, or else under the light of the room.
+
+    The light of the room is a frame without the laser, or that under a black projection. None: no frame shows the target.
+    """
+    shown = _uniform(capture, correction, "white")
+    if shown is None:
+        shown = correction.ambient if correction.ambient is not None else _uniform(capture, correction, "black")
+    return None if shown is None else np.asarray(shown @ np.array(GREY_WEIGHTS, np.float32), dtype=np.float32)
 
 
 def _write(request: LaserPlanesRequest, targets: list[Capture], paths: tuple[Path, ...], found: _OnTarget) -> LaserPlanes:

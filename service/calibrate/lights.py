@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.ball_finder import find_grey_ball, find_mirror_ball, find_mirror_balls
-from service.calibrate.balls import ball_entry, balls_of, check_metric
+from service.calibrate.balls import ball_entry, balls_of, check_metric, find_grey_ball, find_mirror_ball, find_mirror_balls
 from service.calibrate.results import (
     LightCalibration,
     LightCaptures,
@@ -21,7 +20,7 @@ from service.calibrate.results import (
 )
 from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
 from service.calibrate.solvers.light_positions import MISSES, nearest_point
-from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot
+from service.calibrate.solvers.mirror_ball import find_spot
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction
@@ -46,25 +45,18 @@ class BallPixels(NamedTuple):
 
 
 def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) -> LightCalibration:
-    """Measure the directions of distant lights from the bright spot on one mirror ball.
-
-    Raises:
-        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    captures = open_captures(request)
-    options = SpotOptions(level=request.level)
+    """Measure the directions of distant lights from the bright spot on one mirror ball."""
+    captures, timings = open_captures(request, progress)
     if request.circles or request.masks:
         (ball,) = balls_of(request, captures.source.camera, exactly=1)
     else:
-        ball = find_mirror_ball(captures, options)
+        ball = find_mirror_ball(captures, request.level)
     view = view_ball(ball, captures.source.camera)
     # what is not measured stays as the target has it
     targets = _targets(captures)
 
     def measure(lit: LitFrame, patches: Sequence[BallPixels]) -> MeasuredLight:
-        spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, options)
+        spot = find_spot(patches[0].radiance, patches[0].saturated, ball, view, level=request.level)
         light = targets[lit.number]
         flags = [*spot.flags, *(["irradiance set to 1"] if isinstance(light, PointLight) else [])]
         entry = {"direction": digits(spot.direction), "uncertainty_degrees": round(spot.uncertainty_degrees, 4),
@@ -80,19 +72,12 @@ def mirror_ball(request: MirrorBallRequest, progress: Progress | None = None) ->
 
 
 def light_positions(request: LightPositionsRequest, progress: Progress | None = None) -> LightCalibration:
-    """Measure the positions of near lights from the bright spots on two or more mirror balls.
-
-    Raises:
-        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    captures = open_captures(request)
+    """Measure the positions of near lights from the bright spots on two or more mirror balls."""
+    captures, timings = open_captures(request, progress)
     camera = captures.source.camera
-    options = SpotOptions(level=request.level)
     named = bool(request.circles or request.masks)
     balls = (balls_of(request, camera, at_least=2, radii=request.ball_radius_m, heights=request.ball_z_m) if named
-             else _balls_in_sight(request, captures, options))
+             else _balls_in_sight(request, captures))
     check_metric(captures.source, balls, request.ball_radius_m)
     views = [view_ball(ball, camera) for ball in balls]
     middle = np.mean([ball.centre for ball in balls], axis=0)
@@ -102,7 +87,7 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
         spots = []
         for number, (patch, ball, view) in enumerate(zip(patches, balls, views, strict=True), start=1):
             try:
-                spots.append(find_spot(patch.radiance, patch.saturated, ball, view, options))
+                spots.append(find_spot(patch.radiance, patch.saturated, ball, view, level=request.level))
             except CalibrationError as error:
                 raise CalibrationError(f"ball {number}: {error}") from error
         found = nearest_point(np.array([spot.point for spot in spots]), np.array([spot.direction for spot in spots]),
@@ -124,12 +109,8 @@ def light_positions(request: LightPositionsRequest, progress: Progress | None = 
                         summary={"balls": [ball_entry(ball) for ball in balls]})
 
 
-def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures, options: SpotOptions) -> list[Ball]:
-    """Find the mirror balls of a capture, all of one size and at one height.
-
-    Raises:
-        RequestError: fewer than two are found, or sizes are given without the places that they belong to.
-    """
+def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures) -> list[Ball]:
+    """Find the mirror balls of a capture, all of one size and at one height."""
     for name, values in (("--ball-radius-m", request.ball_radius_m), ("--ball-z-m", request.ball_z_m)):
         if len(values) > 1:
             raise RequestError(f"{name}: is given {len(values)} times, and no ball is named that each belongs to: name the balls with "
@@ -138,18 +119,12 @@ def _balls_in_sight(request: LightPositionsRequest, captures: LightCaptures, opt
     if camera.projection == "perspective" and not request.ball_radius_m:
         check_metric(captures.source, [], request.ball_radius_m)
     level = camera.surface_z_m if camera.projection == "orthographic" else None
-    return find_mirror_balls(captures, options, next(iter(request.ball_radius_m), None), next(iter(request.ball_z_m), level))
+    return find_mirror_balls(captures, request.level, next(iter(request.ball_radius_m), None), next(iter(request.ball_z_m), level))
 
 
 def grey_ball(request: GreyBallRequest, progress: Progress | None = None) -> LightCalibration:
-    """Measure the irradiance or intensity of each light from the shading of one grey ball.
-
-    Raises:
-        StageError, RequestError: the input is wrong, or a light cannot be measured; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    captures = open_captures(request)
+    """Measure the irradiance or intensity of each light from the shading of one grey ball."""
+    captures, timings = open_captures(request, progress)
     camera = captures.source.camera
     if request.circles or request.masks:
         (ball,) = balls_of(request, camera, exactly=1, radii=() if request.ball_radius_m is None else (request.ball_radius_m,),

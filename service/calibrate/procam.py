@@ -46,11 +46,7 @@ def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest
     """Calibrate a projector-camera pair, and write camera, projector and their pose to the manifests.
 
     Args:
-        request: the captures of the board, and those that are written too.
         manifest_paths: the manifest to write for each of `captures`, then for each of `apply_to`; None: their own.
-
-    Raises:
-        StageError, KernelError: the input is wrong, or too few views show the board; nothing is written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)

@@ -1,21 +1,38 @@
-"""Calibration of a projector's response (its gamma) from images of evenly grey projections."""
+"""Calibration of a projector's response (its light at each level, its gamma) from images of uniformly grey projections.
 
+A camera pixel reads ambient + s · g(level) with an ambient light and a scale s of its own and one response g for all pixels. Relative
+to the darkest and the brightest image every pixel gives g directly; the response is the median over the pixels that see the projector
+well. A monotonic least-squares fit and interpolation to even levels follow.
+
+Source: Ayer et al., "An empirical distribution function for sampling with incomplete information", Annals of Mathematical Statistics
+    26(4), 1955 (pool adjacent violators).
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
-from service.calibrate.results import digits, manifest_to_write, write_results
-from service.calibrate.solvers.response import fit_response
+from service.calibrate.results import digits, open_capture, write_results
 from service.errors import RequestError
-from service.reporting.progress import Progress, Timings
+from service.reporting.progress import Progress
 from service.requests.calibrate import ResponseRequest
-from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
 from stage.colour.colour import GREY_WEIGHTS, linearise
 from stage.colour.radiance import check_radiance
 from stage.errors import CalibrationError, ManifestError
 from stage.formats import images
+
+EVEN_LEVELS = 256
+"""The count of levels of the response, which is that of an eight-bit projector."""
+LEAST_PART = 0.2
+"""The least difference between brightest and darkest image, relative to the largest, of a pixel that sees the projector well."""
+LEAST_STEP = 1e-6
+"""The least rise of the response from level to level, so that it can be inverted."""
+MOST_PIXELS = 200_000
+"""The most pixels that are used."""
 
 
 class ResponseResult(NamedTuple):
@@ -30,18 +47,11 @@ class ResponseResult(NamedTuple):
 
 
 def response(request: ResponseRequest, progress: Progress | None = None) -> ResponseResult:
-    """Fit the response of a capture's projector, and write it to the manifest.
-
-    Raises:
-        StageError, RequestError: the input is wrong; nothing is written.
-    """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
+    """Fit the response of a capture's projector, and write it to the manifest."""
+    capture, manifest_path, timings = open_capture(request, progress)
     manifest = capture.manifest
     if manifest.projector is None:
         raise ManifestError(f"{capture.folder / FILE_NAME}: projector: is missing: the response is written into it")
-    manifest_path = manifest_to_write(capture, request.out)
     levels = request.levels or tuple(np.linspace(0, 1, len(request.images)).tolist())
     if len(levels) != len(request.images):
         raise RequestError(f"--levels: has {len(levels)} values, there are {len(request.images)} images: give one for each")
@@ -70,3 +80,56 @@ def response(request: ResponseRequest, progress: Progress | None = None) -> Resp
         "images": len(request.images), "levels": digits(levels), "gamma": float(f"{found.gamma:.4g}"),
         "spread": float(f"{found.spread:.3g}")})
     return ResponseResult(manifest_path, report, found.gamma, found.spread)
+
+
+class Response(NamedTuple):
+    """The response of a projector, and how well it fits the pixels."""
+
+    values: np.ndarray  # [256] float64, light from 0 to 1 at even levels, rising
+    gamma: float
+    """The exponent of the nearest power law."""
+    spread: float
+    """The median absolute deviation of the pixels from the response, relative to full scale."""
+
+
+def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndarray | None = None) -> Response:
+    """Fit the response of a projector to images of uniform levels.
+
+    Args:
+        levels: the level of each image, from 0 to 1, all different, with 0 and 1 among them.
+        images: [levels, pixels] float32, linear readings.
+        usable: [pixels] bool, True for pixels that saturate in no image; None for all.
+
+    Raises:
+        CalibrationError: the levels are invalid, or the images do not become brighter with the level.
+    """
+    order = np.argsort(levels)
+    x = np.asarray(levels, dtype=np.float64)[order]
+    if len(x) < 3 or len(np.unique(x)) < len(x) or x[0] != 0 or x[-1] != 1:
+        listed = ", ".join(f"{level:g}" for level in levels)
+        raise CalibrationError(f"the levels are {listed}: give three or more different ones, with 0 and 1")
+    dark, bright = images[order[0]].astype(np.float64), images[order[-1]].astype(np.float64)
+    swing = bright - dark
+    good = swing > LEAST_PART * max(float(np.percentile(swing, 99.5)), 0.0)
+    good &= swing > 0
+    if usable is not None:
+        good &= usable
+    count = int(np.count_nonzero(good))
+    if count < 10:
+        raise CalibrationError(f"only {count} pixels get brighter with the level and do not saturate: check the images and their order")
+    kept = np.flatnonzero(good)[:: max(1, count // MOST_PIXELS)]
+    ratio = (images[order][:, kept] - dark[kept]) / swing[kept]
+    curve = np.median(ratio, axis=1)
+    if (np.diff(curve) < -0.02).any():
+        worst = int(np.argmin(np.diff(curve)))
+        raise CalibrationError(f"the light falls from level {x[worst]:g} to {x[worst + 1]:g}: check the order of the images")
+    rising = isotonic_regression(curve).x
+    inner = (x > 0) & (x < 1) & (rising > 0)
+    gamma = float(np.median(np.log(rising[inner]) / np.log(x[inner]))) if inner.any() else 1.0
+    # between measured levels along the nearest power law, which bends as responses do, then corrected to pass through all of them
+    even = np.linspace(0, 1, EVEN_LEVELS)
+    values = even**gamma + np.interp(even, x, rising - x**gamma)
+    values = np.maximum.accumulate(values + LEAST_STEP * np.arange(EVEN_LEVELS))
+    values = (values + LEAST_STEP * np.arange(EVEN_LEVELS)) - values[0]
+    spread = float(np.median(np.abs(ratio - curve[:, None])))
+    return Response(values / values[-1], gamma, spread)

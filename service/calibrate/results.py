@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 from service.calibrate.solvers.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import requested, versions, with_names
 from service.requests.base.base import Options
-from service.requests.calibrate import LightsRequest
+from service.requests.calibrate import FramesRequest, LightsRequest, ResponseRequest, SaturationRequest
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME, Manifest, write_manifest
 from stage.errors import CalibrationError
@@ -53,28 +54,30 @@ class MeasuredLight(NamedTuple):
     """Uncertainty or residual, by which the table is sorted."""
 
 
-def open_captures(request: LightsRequest) -> LightCaptures:
-    """Open the captures that a request names.
+def open_capture(request: FramesRequest | SaturationRequest | ResponseRequest,
+                 progress: Progress | None) -> tuple[Capture, Path, Timings]:
+    """Begin the stage "open", and return the capture of a request, the manifest to write, and the timings."""
+    timings = Timings(progress)
+    timings.stage("open", 1)
+    capture = Capture.open(request.capture)
+    return capture, _manifest_to_write(capture, request.out), timings
 
-    Raises:
-        RequestError: --out is not a .json file of its own.
-        StageError: a capture is wrong, or the two captures do not match.
-    """
+
+def open_captures(request: LightsRequest, progress: Progress | None) -> tuple[LightCaptures, Timings]:
+    """Begin the stage "open", and return the captures of a request and the timings."""
+    timings = Timings(progress)
+    timings.stage("open", 1)
     source = Capture.open(request.capture)
     lit = lit_frames(source)
     target = source
     if request.apply_to is not None:
         target = Capture.open(request.apply_to)
         check_same_setup(source, target)
-    return LightCaptures(source, target, manifest_to_write(target, request.out), lit)
+    return LightCaptures(source, target, _manifest_to_write(target, request.out), lit), timings
 
 
-def manifest_to_write(capture: Capture, out: Path | None) -> Path:
-    """Return the path of the manifest that a calibration writes: `out`, or that of the capture.
-
-    Raises:
-        RequestError: `out` is not a .json file of its own.
-    """
+def _manifest_to_write(capture: Capture, out: Path | None) -> Path:
+    """Return the path of the manifest that a calibration writes: `out`, or that of the capture."""
     path = capture.folder / FILE_NAME if out is None else out
     if path.suffix.lower() != ".json" or path.name == CALIBRATION_FILE or path.is_dir():
         raise RequestError(f"--out {path}: must be a .json file of its own: it takes the place of {FILE_NAME}")
@@ -83,11 +86,7 @@ def manifest_to_write(capture: Capture, out: Path | None) -> Path:
 
 def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight | CalibrationError], *,
                        drop_failed: bool) -> list[MeasuredLight]:
-    """Return the results with each failure as a frame that is left out.
-
-    Raises:
-        CalibrationError: a light failed without `drop_failed`, or every light failed; names the first frame.
-    """
+    """Return the results with each failure as a frame that is left out; without `drop_failed`, or where every light failed, raise."""
     failed = [(lit, result) for lit, result in zip(captures.lit, results, strict=True) if isinstance(result, CalibrationError)]
     if failed and (not drop_failed or len(failed) == len(results)):
         lit, error = failed[0]
@@ -103,8 +102,7 @@ def write_lights(kind: str, request: Options, captures: LightCaptures, results: 
     """Write the report, then the manifest, each whole or not at all, and return what was written.
 
     Args:
-        kind: of the calibration, the section of the report.
-        captures: that were read and that get the lights.
+        kind: the section of the report.
         headings: of the table, between frame and flags.
         summary: what the report says beside the lights.
         relative: whether the common scale of the measured lights is unknown; None: their strength was not measured.
@@ -129,11 +127,8 @@ def write_lights(kind: str, request: Options, captures: LightCaptures, results: 
 
 
 def write_results(kind: str, request: Options, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
-    """Write calibration.json beside the manifest, with the sections of other commands that it held, then the manifest.
-
-    Returns:
-        The path of the report.
-    """
+    """Write calibration.json beside the manifest, with the sections of other commands that it held, then the manifest; return the path
+    of the report."""
     path = manifest_path.parent / CALIBRATION_FILE
     data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": versions()}}
     write_text(path, with_names(json.dumps(data, indent=2) + "\n"))

@@ -44,11 +44,7 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
     """Calibrate several cameras, and write them to the manifests.
 
     Args:
-        request: the capture of the board, and those that are written too.
         manifest_paths: the manifest to write for the capture, then for each of `apply_to`; None: their own.
-
-    Raises:
-        StageError: the input is wrong, or too few views show the board; nothing is written.
     """
     timings = Timings(progress)
     timings.stage("open", 1)
@@ -83,11 +79,7 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
 
 
 def _check_cameras(target: Capture, capture: Capture) -> None:
-    """Refuse a capture of other cameras.
-
-    Raises:
-        ManifestError: names the field.
-    """
+    """Refuse a capture of other cameras."""
     theirs, ours = ([(other.name, other.resolution) for other in each.manifest.other_cameras] for each in (target, capture))
     if theirs != ours:
         raise ManifestError(f"{target.folder / FILE_NAME}: other_cameras: differ in name or resolution from those of {capture.folder}: one "

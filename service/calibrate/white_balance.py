@@ -5,12 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.results import digits, manifest_to_write, write_results
-from service.calibrate.solvers.flat_field import mean_image
+from service.calibrate.images import mean_image
+from service.calibrate.results import digits, open_capture, write_results
 from service.errors import RequestError
-from service.reporting.progress import Progress, Timings
+from service.reporting.progress import Progress
 from service.requests.calibrate import WhiteBalanceRequest
-from stage.capture.capture import Capture
 from stage.colour.colour import linearise, rgb_matrix
 from stage.colour.colour_spaces import linear_space
 from stage.errors import CalibrationError
@@ -41,10 +40,7 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
         StageError: an image is wrong, saturated in the region, or dark in a channel; nothing is written.
         RequestError: the region leads out of the images, or images of other kinds are mixed.
     """
-    timings = Timings(progress)
-    timings.stage("open", 1)
-    capture = Capture.open(request.capture)
-    manifest_path = manifest_to_write(capture, request.out)
+    capture, manifest_path, timings = open_capture(request, progress)
     region = Crop(*request.region) if request.region is not None else Crop(0, 0, *capture.camera.resolution)
     if not region.is_within(capture.camera.resolution):
         raise RequestError(f"--region {region}: leads out of the images of {capture.folder}, which are "

@@ -5,9 +5,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.light_estimation.explanations import MIN_LIGHTS, PIXELS, Sample, better_explanation, fit_manifest, grey_readings
+from service.light_estimation.explanations import (
+    MIN_LIGHTS,
+    PIXELS,
+    Sample,
+    better_explanation,
+    explanation_sentence,
+    fit_manifest,
+    grey_readings,
+)
 from service.light_estimation.lambertian import Fit
-from service.light_estimation.sentences import explanation_sentence
 from service.light_estimation.suspects import Suspect, suspects
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight

@@ -44,14 +44,8 @@ class JoinResult(NamedTuple):
 def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
     """Join solved maps with a depth.
 
-    Args:
-        request: the two results, and the folder of the new one.
-        progress: told of every stage.
-
     Raises:
         RequestError: the two are not of one camera, do not overlap, or contradict each other; or the output would replace an input.
-        ResultError: a file is missing, damaged, or lacks a layer.
-        StorageError: a file cannot be written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -74,8 +68,7 @@ def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
     timings.stage("join", 100)
     x, y = maps.camera.plane_coordinates()
     joined = join_depth(np.moveaxis(maps.normal, -1, 0), np.radians(maps.sigma), maps.mask, depth.depth, depth.sigma, measured, x, y,
-                        perspective=maps.camera.projection == "perspective", device=device,
-                        progress=timings.advance_percent)
+                        perspective=maps.camera.projection == "perspective", device=device, progress=timings.advance_percent)
     if joined.unexplained is not None and joined.unexplained > CONTRADICTION:
         raise RequestError(f"{maps_file}: its normals leave {joined.unexplained:.0%} of the relief in {depth_file} unexplained: they are "
                            "not of one surface, or the axes of one of them are flipped")
@@ -92,7 +85,7 @@ def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
 
 
 def _check_cameras(one: Camera, other: Camera, maps_file: Path, depth_file: Path) -> None:
-    """Raises RequestError: the two see other pixels, or a pixel has no length in metres."""
+    """Refuse two cameras that see other pixels, or whose pixels have no length in metres."""
     def numbers(camera: Camera) -> dict[str, Any]:
         pose = None if one.world_from_camera is None or other.world_from_camera is None else camera.world_from_camera
         return {"projection": camera.projection, "resolution": camera.resolution, "focal_px": camera.focal_px,

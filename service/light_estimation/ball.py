@@ -59,16 +59,9 @@ def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.nda
 
 def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, radius_m: float | None = None,
                      z_m: float | None = None) -> Ball:
-    """Return the ball whose outline is a given circle.
+    """Return the ball whose outline is a given circle, which lies wholly inside the image.
 
     In a perspective image the outline of a ball off the axis is an ellipse, which the circle approximates.
-
-    Args:
-        u, v: the centre, continuous image coordinates.
-        radius_px: the radius in pixels.
-
-    Raises:
-        CalibrationError: the circle is not wholly inside the image.
     """
     if not (radius_px > 1 and radius_px <= u <= camera.width - radius_px and radius_px <= v <= camera.height - radius_px):
         raise CalibrationError(f"ball {u:g},{v:g},{radius_px:g}: is not wholly inside the {camera.width}x{camera.height} image")
@@ -109,13 +102,7 @@ def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, r
 
 
 def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Fit a circle x² + y² = 2ax + 2by + c to points by linear least squares (Kåsa 1976).
-
-    Args:
-        points: [points, 2], three or more.
-
-    Returns:
-        centre [2] and radius.
+    """Fit a circle x² + y² = 2ax + 2by + c to three points or more by linear least squares (Kåsa 1976), and return centre and radius.
 
     Raises:
         numpy.linalg.LinAlgError: the points lie on a line.
@@ -129,10 +116,7 @@ def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
-    """Fit a cone to unit rays by linear least squares of r·g = 1, with g the axis over the cosine of the half angle.
-
-    Args:
-        rays: [rays, 3] unit, three or more.
+    """Fit a cone to three unit rays or more by linear least squares of r·g = 1, with g the axis over the cosine of the half angle.
 
     Returns:
         axis [3], a unit vector, and the half angle in radians.
@@ -155,11 +139,7 @@ def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def view_ball(ball: Ball, camera: Camera) -> BallView:
-    """Return the normals, lines of sight and surface points of the pixels of a ball.
-
-    Raises:
-        CalibrationError: no pixel of the image shows the ball.
-    """
+    """Return the normals, lines of sight and surface points of the pixels of a ball, of which the image must show one."""
     rows, cols = _box(ball, camera)
     u, v = np.meshgrid(np.arange(cols.start, cols.stop) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
     inside, point, direction = intersect(ball, camera, u, v)

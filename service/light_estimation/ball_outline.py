@@ -65,9 +65,6 @@ def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> t
 
     Returns:
         The ball without a scale, which points lie within a pixel of its outline, and the standard error of its centre in pixels.
-
-    Raises:
-        CalibrationError: the points lie on a line.
     """
     for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
         ball = ball_from_outline(camera, outline[inside], error_px=0.0)
@@ -79,14 +76,7 @@ def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> t
 
 
 def outline_points(coverage: np.ndarray) -> np.ndarray:
-    """Return the points at which a mask crosses one half between neighbouring pixel centres, by linear interpolation.
-
-    Args:
-        coverage: [rows, cols], 0 to 1.
-
-    Returns:
-        [points, 2] float64 u, v.
-    """
+    """Return the points, [n, 2] u and v, at which a mask crosses one half between neighbouring pixel centres, by linear interpolation."""
     values = coverage.astype(np.float64)
     found = []
     for axis in (0, 1):

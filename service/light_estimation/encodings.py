@@ -18,11 +18,8 @@ def other_readings(radiance: np.ndarray, exposure: np.ndarray | float, declared:
     """Yield the radiance that the same recorded values stand for under other encodings, with the colour space that declares each.
 
     Args:
-        radiance: [..., rows, cols, 3] or [rows, cols, 3], scene-linear as declared.
+        radiance: [..., rows, cols, 3], scene-linear as declared; if it is declared linear, other encodings need values up to 1.
         exposure: recorded values over radiance; has the dimensions of `radiance` or fewer.
-
-    Yields:
-        A colour space, and float64 in the shape of `radiance`; of images declared linear only if no value is above 1.
     """
     recorded = (radiance * exposure).astype(np.float32)
     if not is_linear(declared):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.light_estimation.encodings import other_readings
+from service.light_estimation.encodings import ENCODINGS, other_readings
 from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, least_squares, median_of
 from service.light_estimation.semi_calibrated import TINY, fit_intensities
 from stage.colour.colour import GREY_WEIGHTS
@@ -98,12 +98,7 @@ def fit_manifest(sample: Sample) -> Fit:
 
 
 def better_explanation(sample: Sample, given: Fit) -> Explanation | None:
-    """Return what explains the images much better than the manifest, or None.
-
-    Args:
-        sample: pixels spread over the object.
-        given: their fit, of fit_manifest.
-    """
+    """Return what explains the images much better than the manifest, or None; `given` is the fit of fit_manifest."""
     count, misfit = len(sample.directions), given.misfit()
     if count < MIN_LIGHTS or given.spare.sum() < MIN_PIXELS or given.spare.mean() < MIN_PART:
         return None
@@ -131,12 +126,7 @@ def _angle(one: Fit, other: Fit) -> float:
 
 
 def grey_readings(radiance: np.ndarray, irradiance: np.ndarray) -> np.ndarray:
-    """Return grey readings, [lights, pixels], from the channels in which every light has irradiance.
-
-    Args:
-        radiance: [lights, pixels, 3].
-        irradiance: [lights, 3].
-    """
+    """Return grey readings, [lights, pixels], of radiance [lights, pixels, 3] from the channels in which every light has irradiance."""
     weights = np.where((irradiance > 0).all(axis=0), GREY_WEIGHTS, 0)
     factors = np.divide(weights, irradiance, out=np.zeros_like(irradiance), where=irradiance > 0)
     return np.asarray(np.einsum("lpc,lc->lp", radiance, factors))
@@ -243,3 +233,28 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
         return None
     halves = [fit_lambertian(readings[part::2], sample.usable[part::2], sample.directions[part::2]) for part in (0, 1)]
     return Explanation(Cause.DIRECTIONS, misfit, free, _angle(*halves))
+
+
+def explanation_sentence(found: Explanation, sample: Sample) -> str:
+    """Return the sentence for what explains the images better than the manifest."""
+    fits = f"the readings then fit to {100 * found.left:.1f} %, as declared to {100 * found.misfit:.1f} %"
+    alike = " (every light is declared alike)" if np.ptp(sample.irradiance, axis=0).max() < 1e-6 * sample.irradiance.max() else ""
+    measure = "`relit calibrate intensity` measures it"
+    return {
+        Cause.ENCODED: f"color_space: the images look display-encoded, but {sample.color_space} is declared: decoded as "
+                       f"{ENCODINGS.get(found.space)}, {fits}; declare {found.space} if they are",
+        Cause.LINEAR: f"color_space: the images look linear, but {sample.color_space} is declared: taken as linear, {fits}; declare a "
+                      "linear space, such as lin_rec709_scene",
+        Cause.IRRADIANCE: f"frames[].light.irradiance: it is missing or wrong{alike}: with the brightness that the images ask for, "
+                          f"{fits}; {measure} (a missing exposure_s, and near lights that are declared distant, act alike)",
+        Cause.ENCODED_OR_IRRADIANCE: f"color_space or frames[].light.irradiance: the images look display-encoded, or the irradiance is "
+                                     f"missing or wrong{alike}: {fits}; declare {found.space} if they are encoded, else {measure}",
+        Cause.NORMALISED: f"frames[].light.irradiance: the images look as if they were divided by it already: with equal lights, {fits}; "
+                          "declare the same irradiance for every light",
+        Cause.REVERSED: f"frames[].light: the order looks reversed: with the lights from last to first, {fits}; check which light "
+                        "belongs to which image",
+        Cause.SHIFTED: f"frames[].light: the lights look one frame off: with each light one image earlier or later, {fits}; check which "
+                       "light belongs to which image",
+        Cause.DIRECTIONS: f"frames[].light.direction: images and directions do not belong together: with other directions, {fits}; "
+                          "check which light belongs to which image, and the directions",
+    }[found.cause]

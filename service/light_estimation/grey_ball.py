@@ -52,14 +52,9 @@ class Shading(NamedTuple):
 
 
 def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
-    """Return the irradiance at every pixel of a ball under a light of irradiance or intensity 1.
+    """Return the irradiance at every pixel of a ball, [h, w], under a light whose own irradiance or intensity is taken as 1.
 
-    Args:
-        light: the light; its irradiance or intensity is not used.
-        view: the pixels of the ball; a point light needs a view in metres.
-
-    Returns:
-        [h, w] float64; 0 in the attached shadow and outside the ball.
+    It is 0 in the attached shadow and outside the ball. A point light needs a view in metres.
     """
     if isinstance(light, DistantLight):
         return np.maximum(view.normal @ np.array(light.direction), 0)
@@ -79,8 +74,7 @@ def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: Di
     Args:
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
-        light: the light, which gives direction or position.
-        view: the pixels of the ball.
+        light: gives direction or position.
 
     Raises:
         CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated; the message does not name the frame.
@@ -109,10 +103,7 @@ def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: D
     """Return another encoding under which the shading of the ball is much more Lambertian, or None.
 
     Args:
-        radiance: [h, w, 3] scene-linear as declared, the box of `view`.
-        saturated: [h, w] bool, or None.
-        light: the light, which gives direction or position.
-        view: the pixels of the ball.
+        radiance, saturated, light, view: as of fit_brightness.
         exposure: recorded values over radiance.
         residual: of `fit_brightness` as declared.
 
@@ -131,11 +122,7 @@ def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: Ball
     """Measure the direction of a distant light by re-weighted least squares of b·n = reading, b = ρ/π E l, over the lit pixels.
 
     The fit starts from the brighter pixels and then decides from its own result which pixels are lit, so that noise does not decide.
-
-    Args:
-        radiance: [h, w, 3] scene-linear, the box of `view`.
-        saturated: [h, w] bool, or None.
-        view: the pixels of the ball.
+    Parameters are as of fit_brightness.
 
     Raises:
         CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated, or they do not determine a direction.

@@ -58,7 +58,6 @@ def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndar
         readings: [lights, pixels] radiance over irradiance.
         usable: [lights, pixels] bool, True for unsaturated readings.
         directions: [lights, 3] unit.
-        rounds: how often the weights are found again.
     """
     lit = usable & (readings > SHADOW * bright_readings(readings, usable)) & (readings > 0)
     weight = lit.astype(np.float64)
@@ -89,12 +88,7 @@ def bright_readings(readings: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
 
 def median_of(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Return the lower median of the chosen values of each column, [columns]; 0 where none is chosen.
-
-    Args:
-        values: [rows, columns], finite where chosen.
-        chosen: [rows, columns] bool.
-    """
+    """Return the lower median of the chosen values of each column, [columns]; 0 where none is chosen."""
     count = chosen.sum(axis=0)
     ordered = np.sort(np.where(chosen, values, np.inf), axis=0)
     return np.where(count > 0, ordered[np.maximum(count - 1, 0) // 2, np.arange(values.shape[1])], 0.0)

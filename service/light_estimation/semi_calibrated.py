@@ -77,15 +77,11 @@ def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: n
 
     Args:
         readings: [lights, pixels] scene-linear grey readings of pixels of the object.
-        usable: [lights, pixels] bool, True for unsaturated readings.
-        directions: [lights, 3] unit.
+        usable, directions: as of fit_intensities, which raises the same errors.
         rounds: the most rounds, more than LINEAR_ROUNDS.stop.
 
     Returns:
         [lights] float64, mean 1 over the measured lights; NaN for a light that too few pixels show.
-
-    Raises:
-        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
     """
     told, (fit,) = _fit_channels(readings[..., None], usable, directions, ("grey",), rounds)
     result = np.full(len(directions), np.nan)

@@ -49,12 +49,10 @@ def camera_attributes(camera: Camera) -> dict[str, Any]:
 
 
 def time_attributes(number: int, rate: float) -> dict[str, Any]:
-    """Return the rate as a fraction, and the time code of a frame; a rate above 30 has no time code, and neither has one that is not
-    whole, or whole times 1000/1001.
+    """Return the rate, frames per second, as a fraction, and the time code of a frame.
 
-    Args:
-        number: of the frame; frame 0 is at 00:00:00:00, and after 24 hours the time code begins again.
-        rate: frames per second, above 0.
+    Frame 0 is at 00:00:00:00, and after 24 hours the time code begins again. A rate above 30 has no time code, and neither has one that
+    is not whole, or whole times 1000/1001.
     """
     exact = exact_rate(rate)
     found: dict[str, Any] = {"framesPerSecond": exact}

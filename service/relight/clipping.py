@@ -21,12 +21,7 @@ class Clipping(NamedTuple):
 
     @classmethod
     def of(cls, stack: Stack, inside: np.ndarray) -> "Clipping":
-        """Sum the readings of a stack.
-
-        Args:
-            stack: of a capture.
-            inside: [pixels] bool, the object.
-        """
+        """Sum the readings of a stack over the pixels of the object, [pixels] bool."""
         lights = stack.shape[1]
         level, any_clipped = np.full(lights, np.inf), 0
         padded = np.zeros(stack.shape[2], dtype=bool)
@@ -62,7 +57,6 @@ def clipped_channels(values: np.ndarray, bits: np.ndarray, scale: np.ndarray, le
     Args:
         values: [3, lights padded, n] stored values.
         bits: [lights padded / 8, n] of the stack.
-        scale: [lights padded] radiance of a stored 1.0.
         level: [lights padded] of Clipping.
     """
     return _unpacked(bits) & (values.astype(np.float32) * scale[:, None] >= LEVEL_MARGIN * level[:, None])

@@ -15,7 +15,6 @@ from stage.stack.stack import PIXEL_PAD, Stack
 CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
-
 BLOCK_BYTES = 1280 << 20
 """Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
 and 64 lights, a block of 64 frames has 128 rows; every block of every frame costs some milliseconds beyond its pixels."""
@@ -38,13 +37,7 @@ def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:
 
 
 def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
-    """Yield blocks of rows whose readings and pictures fit in memory, from the top to the bottom.
-
-    Args:
-        stack: the images.
-        width: of an image.
-        pictures: pictures of three channels that are made of the rows of a block.
-    """
+    """Yield blocks of rows whose readings, and the pictures of three channels that are made of them, fit in memory, from the top down."""
     channels, lights, _ = stack.shape
     multiple = math.lcm(BLOCK_ROWS, PIXEL_PAD)  # whole chunks of EXR files and whole packs of pixels
     step = max(multiple, BLOCK_BYTES // (channels * (2 * lights + 4 * pictures) * width) // multiple * multiple)
@@ -59,7 +52,6 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
     """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
 
     Args:
-        stack: the images.
         weights: [frames, 3, lights padded] float32.
         places: the row of each frame in the full chunk, also when only some of its frames are made: cuBLAS sums may differ by row, and
             frames that are made later must be identical to the last bit. None: a single frame that is the whole job, for which a

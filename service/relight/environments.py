@@ -44,9 +44,6 @@ class Environments:
         """Keep the path of the maps, as it was given.
 
         With `clip_negative`, values that are negative beyond the noise of their map are set to 0; else such maps are refused.
-
-        Raises:
-            RequestError: several runs of #, or one in the folder.
         """
         self._pattern = pattern
         self._sequence = "#" in str(pattern) and not pattern.is_file()
@@ -62,24 +59,14 @@ class Environments:
         return self._pattern.with_name(numbered(self._pattern.name, number)) if self._sequence else self._pattern
 
     def check(self, numbers: Iterable[int]) -> None:
-        """Check the header of the environment map of every frame.
-
-        Raises:
-            RequestError: an environment map of the sequence is not there; names it and its frame.
-            ImageError: not EXR or HDR, or not twice as wide as high.
-            StorageError: an environment map cannot be opened.
-        """
+        """Check that the environment map of every frame is there, by its header an EXR or HDR file, and twice as wide as high."""
         for path, number in {self.path(number): number for number in numbers}.items():
             if self._sequence and not path.exists():
                 raise RequestError(f"--environment {self._pattern}: frame {number} has no map: {path} is not there")
             check_environment(path)
 
     def read(self, path: Path, space: str) -> EnvironmentMap:
-        """Return one environment map in a working space; the last one that was read is kept.
-
-        Raises:
-            ImageError: impossible values (counted), or a colour space that is not known.
-        """
+        """Return one environment map in a working space; the last one that was read is kept."""
         if self._last is None or self._last[:2] != (path, space):
             self._last = (path, space, EnvironmentMap(read_environment(path, space, clipped=self.clipped)))
         return self._last[2]

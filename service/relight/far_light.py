@@ -39,16 +39,12 @@ class FarSamples(NamedTuple):
         """Return all samples of one part or more, in order."""
         return FarSamples(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
+
 NO_SAMPLES = FarSamples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=bool))
 
 
 def far_light(frame: ScheduledFrame, environments: Environments | None, space: str) -> FarLight:
-    """Return the environment and the discs of a frame in a scene-linear working space.
-
-    Raises:
-        ImageError: the map has impossible values (counted), or a colour space that is not known.
-        StorageError: the map cannot be read.
-    """
+    """Return the environment and the discs of a frame in a scene-linear working space."""
     discs = tuple(disc._replace(irradiance=np.maximum(rgb_matrix(disc.color_space, space) @ disc.irradiance, 0), color_space=space)
                   for disc in frame.discs if any(disc.irradiance))  # a colour outside the working space's gamut has a negative channel
     if frame.environment is None or environments is None:

@@ -18,11 +18,7 @@ PREFIX = "light_"
 
 
 def group_names(has_environment: bool, keys: LightKeys | None) -> tuple[str, ...]:
-    """Return the name of the layer of each light: letters, digits and underscores, each name once.
-
-    Raises:
-        RequestError: there are more than MOST_GROUPS.
-    """
+    """Return the name of the layer of each light, MOST_GROUPS at most: letters, digits and underscores, each name once."""
     wanted = ["environment"] if has_environment else []
     if keys is not None:
         wanted += [track.name for track in keys.lights] + [image.rsplit(".", 1)[0] for image in _images(keys)]

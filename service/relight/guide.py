@@ -56,13 +56,8 @@ class Guide:
         """Compare the model with every captured image, fit β, and estimate the clipped readings.
 
         Args:
-            maps: of the capture, in its working space.
-            where: their file, for messages.
-            stack, lights: the captured images and lights.
-            clipping: of the captured images.
-            space: the scene-linear space of the stack.
-            device: where.
-            progress: told of every batch.
+            where: the file of the maps, for messages.
+            space: the scene-linear space of the stack, which must be that of the maps.
 
         Raises:
             ResultError: maps of other images or another colour space, or without the layers that a model needs; fewer than four

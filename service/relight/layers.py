@@ -28,6 +28,7 @@ class Content(NamedTuple):
     dtype: type[np.floating[Any]] = np.float16
     is_colour: bool = False
 
+
 STILL = {
     Layer.MASK: Content("mask", "Y", "mask"),
     Layer.NORMAL: Content("normal", "XYZ", "normal"),
@@ -55,11 +56,7 @@ class StillLayer(NamedTuple):
 
 
 def check_layers(options: PictureOptions, maps: Path | None) -> None:
-    """Refuse layers that need maps where none are given, and layers of data that a lossy compression would change.
-
-    Raises:
-        RequestError: names the layer.
-    """
+    """Refuse layers that need maps where none are given, and layers of data that a lossy compression would change."""
     for layer in options.aov:
         if layer in NEED_MAPS and maps is None:
             raise RequestError(f"--aov {layer} needs --maps DIR")
@@ -75,11 +72,7 @@ def in_parts(options: PictureOptions) -> bool:
 
 
 def frame_matte(options: PictureOptions, capture: Capture, stack: Stack) -> Matte | None:
-    """Return the matte of the frames of a capture, or None where none is wanted.
-
-    Raises:
-        ImageError: the mask is empty or unreadable.
-    """
+    """Return the matte of the frames of a capture, or None where none is wanted."""
     if options.matte is FrameMatte.NONE:
         return None
     return matte_of(capture, stack) if options.matte is FrameMatte.SOFT else hard_matte(capture.mask())
@@ -92,11 +85,7 @@ def hard_matte(mask: np.ndarray) -> Matte:
 
 
 def maps_file(folder: Path, capture: Path, captures: int) -> Path:
-    """Return the file of a capture's maps: in the folder, or for a sequence in its sub-folder of the capture's name.
-
-    Raises:
-        RequestError: they are not there.
-    """
+    """Return the file of a capture's maps, which must be there: in the folder, or for a sequence in its sub-folder of that name."""
     path = (folder / capture.name if captures > 1 else folder) / MAPS_FILE
     if not path.is_file():
         raise RequestError(f"--maps {folder}: {path} is not there: run `relit solve` first")
@@ -104,12 +93,7 @@ def maps_file(folder: Path, capture: Path, captures: int) -> Path:
 
 
 def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
-    """Read the solved maps of a capture.
-
-    Raises:
-        ResultError: not a maps.exr, or of another size.
-        ImageError: it cannot be read.
-    """
+    """Read the solved maps of a capture, which must be of its size."""
     maps = SurfaceMaps.read(path)
     check_same_pixels(path, maps.camera, capture)
     return maps
@@ -124,10 +108,6 @@ def still_layers(layers: Collection[Layer], capture: Capture | None, maps: Surfa
         capture: gives the mask where there are no maps.
         maps, where: solved maps and their file, or None.
         space: the scene-linear colour space of the frames.
-
-    Raises:
-        ResultError: the maps lack a layer.
-        ImageError: the capture's mask is empty or unreadable.
     """
     found = []
     for layer, content in STILL.items():

@@ -19,7 +19,8 @@ from service.relight.far_light import FarLight, far_light, far_samples
 from service.relight.model_light import CapturedEnergy, ModelLight, model_light
 from service.relight.range_light import RangeLight, RangeLighting
 from service.relight.schedule import ScheduledFrame
-from service.relight.weights.weighting import Weighting, integrate, integrate_discs, light_weights
+from service.relight.weights.weighting import integrate, integrate_discs, light_weights
+from service.requests.relight import LightWeights
 from stage.capture.point_lights import DistantLights
 from stage.stack.stack import Stack
 
@@ -53,17 +54,13 @@ class FrameLight(NamedTuple):
 class CaptureLighting:
     """Resolves the light of the frames of one capture."""
 
-    def __init__(self, lights: DistantLights, stack: Stack, environments: Environments | None, space: str, *, weighting: Weighting,
+    def __init__(self, lights: DistantLights, stack: Stack, environments: Environments | None, space: str, *, weighting: LightWeights,
                  device: str, model: ModelUse) -> None:
         """Keep what the frames of the capture have in common.
 
         Args:
-            lights, stack: the captured lights and images.
-            environments: where the environment maps of frames are read from.
             space: the scene-linear space of the stack.
-            weighting: how light from between the captured lights is shared out over them.
             device: where maps are shared out.
-            model: whether a model of the surface is lit too.
         """
         self._lights, self._stack, self._environments, self._space = lights, stack, environments, space
         self._weighting, self._device, self._model = weighting, device, model
@@ -75,11 +72,7 @@ class CaptureLighting:
         return float(np.degrees(2 * reach(self._lights.direction)))
 
     def frames(self, scheduled: Sequence[ScheduledFrame]) -> Iterator[FrameLight]:
-        """Yield the light of each frame; a map is read when its first frame comes.
-
-        Raises:
-            StageError, KernelError: a map cannot be used; names it.
-        """
+        """Yield the light of each frame; a map is read when its first frame comes."""
         for _, group in groupby(scheduled, key=lambda frame: None if frame.environment is None else frame.environment.path):
             members = list(group)
             for begin in range(0, len(members), RUN):
@@ -125,12 +118,8 @@ class CaptureLighting:
         return light_weights(energy, self._lights.irradiance, self._stack.scale)
 
     def _captured_energy(self, weights: np.ndarray, captured: Mapping[int, float]) -> CapturedEnergy:
-        """Return what a frame takes of the captured images.
-
-        Args:
-            weights: [3, lights padded] of the stored images.
-            captured: how much of which captured image the frame adds.
-        """
+        """Return what a frame takes of the captured images, by the weights [3, lights padded] of the stored images, among which `captured`
+        says how much of which the frame adds."""
         irradiance = self._lights.irradiance
         count = len(irradiance)
         scale = np.asarray(self._stack.scale[:count], dtype=np.float64)

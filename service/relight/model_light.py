@@ -8,7 +8,8 @@ import numpy as np
 from kernels.relight.model import sources
 from kernels.relight.model.sources import Sources, far, grouped, join
 from service.relight.far_light import FarSamples, captured_lights, hidden_as_captured
-from service.relight.weights.weighting import Weighting, share_samples
+from service.relight.weights.weighting import share_samples
+from service.requests.relight import LightWeights
 from service.requests.shade import PointLight, RectangleLight, SphereLight
 
 FAR_MARCHES = 24
@@ -54,15 +55,13 @@ class LightBeyond(NamedTuple):
 
 
 def model_light(samples: FarSamples, beyond: np.ndarray, energy: CapturedEnergy, directions: np.ndarray,
-                weighting: Weighting) -> ModelLight:
+                weighting: LightWeights) -> ModelLight:
     """Return the light of one frame.
 
     Args:
         samples: of the environment and the discs.
         beyond: [samples] how far each lies beyond the captured lights.
-        energy: what the frame takes of the captured images.
         directions: [lights, 3] unit vectors to the captured lights.
-        weighting: how light from between the captured lights is shared out over them.
     """
     given, outside = energy.given, None
     if (beyond > 0).any():
@@ -75,16 +74,15 @@ def model_light(samples: FarSamples, beyond: np.ndarray, energy: CapturedEnergy,
     return ModelLight(wanted, given, outside, added, marched)
 
 
-def weighting_beyond(weighting: Weighting) -> Weighting:
+def weighting_beyond(weighting: LightWeights) -> LightWeights:
     """Return how light from beyond the captured lights is shared out over them: share_kernel leaves it to share_smooth."""
-    return Weighting.SMOOTH if weighting is Weighting.KERNEL else weighting
+    return LightWeights.SMOOTH if weighting is LightWeights.KERNEL else weighting
 
 
 def light_samples(samples: FarSamples, directions: np.ndarray) -> tuple[Sources, np.ndarray]:
     """Return far light for a model, and the directions in which sharp shadows are marched for it.
 
     Args:
-        samples: of the light of one frame.
         directions: [lights, 3] unit vectors whose visibility has the first rows; samples that throw no sharp shadow take it.
 
     Returns:

@@ -132,11 +132,7 @@ class ModelRange:
     """Lights a model of the surface for many frames."""
 
     def __init__(self, model: SurfaceModel, lights: DistantLights) -> None:
-        """Prepare the model for the captured lights.
-
-        Raises:
-            ArrayError: fewer than four lights, or all in one plane.
-        """
+        """Prepare the model for the captured lights, four or more, not all in one plane."""
         self._towards = direction_grid().direction
         grid = FarSamples(self._towards, np.ones((len(self._towards), 3)), np.zeros(len(self._towards), dtype=bool))
         self._model, self._lights = model, lights
@@ -173,10 +169,7 @@ class ModelRange:
         """Light the model for frames, portion by portion of a batch; on the CPU every thread lights portions of its own.
 
         Args:
-            batch, band: pixels, and their captured images.
-            scale: [lights padded] radiance of a stored 1.0.
             visible: [lights, P] of the captured lights.
-            light: of the frames.
             use: called, by several threads, with the pixels of the batch that a portion has, and the model there.
         """
         device = self._model.device
@@ -233,7 +226,6 @@ def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyo
     """Return what is added to frames, and the model's specular part of their light.
 
     Args:
-        model: under their light.
         plain: [3, n] or [frames, 3, n] sums of captured images.
         trust: [n] β between the captured lights.
         trust_beyond: [n] β beyond them; not None where the model has such light.

@@ -13,8 +13,8 @@ import numpy as np
 from service import __version__
 from service.errors import RequestError
 from service.relight.environments import Environments
+from service.relight.opened_capture import OpenedCapture
 from service.relight.schedule import ScheduledFrame
-from service.relight.sequence import OpenedCapture
 from service.reporting.provenance import choices
 from service.requests.light.frame_range import numbered
 from service.requests.light.picture_options import FrameMatte, Layer
@@ -41,11 +41,7 @@ RESOLVED = {
 
 
 def frame_path(pattern: str, number: int) -> Path:
-    """Return the file that a frame is written to.
-
-    Raises:
-        RequestError: no run of # in the file name, several, or a suffix other than .exr.
-    """
+    """Return the file that a frame is written to: of the pattern, whose name has one run of # and ends in .exr."""
     folder, name = os.path.split(pattern)
     if len(re.findall(r"#+", name)) != 1 or "#" in folder:
         raise RequestError(f"--out {pattern}: the file name needs one run of # for the frame number, such as frame.####.exr")
@@ -59,7 +55,6 @@ def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -
 
     Args:
         outputs: (option as it was given, file) of every file that will be written.
-        inputs: every file that will be read.
     """
     written: dict[Path, tuple[str, Path]] = {}
     for option, path in outputs:
@@ -83,15 +78,8 @@ def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -
 
 def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequence[ScheduledFrame], environments: Environments | None,
                  rate: float) -> list[str]:
-    """Return a hash for each frame of everything that its pixels and its camera and time attributes depend on.
-
-    Args:
-        opened: the capture of the frames.
-        request: with the weights that are used.
-        frames: what lights each.
-        environments: the maps that the frames name.
-        rate: frames per second.
-    """
+    """Return a hash for each frame of everything that its pixels and its camera and time attributes depend on; the request has the weights
+    that are used."""
     mask = opened.capture.manifest.mask
     scene = _hash(
         stack=opened.ingest.key, direction=_digits(opened.lights.direction), irradiance=_digits(opened.lights.irradiance),

@@ -101,11 +101,7 @@ def make_plan(request: RelightRequest) -> Plan:
 
 
 def _rate(request: RelightRequest, keys: LightKeys | None) -> float:
-    """Return the frames per second of a request and its light keys.
-
-    Raises:
-        RequestError: the two differ.
-    """
+    """Return the frames per second of a request and its light keys, which may not differ."""
     wanted, keyed = request.frames_per_second, None if keys is None else keys.frames_per_second
     if wanted is not None and keyed is not None and wanted != keyed:
         raise RequestError(f"--frames-per-second {wanted:g}: {request.keys} has frames_per_second {keyed:g}: give one of them")

@@ -14,7 +14,8 @@ from kernels.relight.model.beyond import share_beyond
 from kernels.relight.model.sources import Sources, disc_samples, far
 from service.relight.far_light import NO_SAMPLES, FarLight, FarSamples, disc_light, hidden_as_captured
 from service.relight.model_light import CapturedEnergy, weighting_beyond
-from service.relight.weights.weighting import Weighting, share_samples
+from service.relight.weights.weighting import share_samples
+from service.requests.relight import LightWeights
 
 SMALL_DISC_DEGREES = 20.0
 """Largest diameter of a disc that casts shadows of its own; the visibility of larger ones is interpolated from the captured lights."""
@@ -45,13 +46,8 @@ class RangeBeyond(NamedTuple):
 class RangeLighting:
     """Resolves the light of frames for a model whose responses to the grid are known."""
 
-    def __init__(self, directions: np.ndarray, weighting: Weighting) -> None:
-        """Keep what the frames have in common.
-
-        Args:
-            directions: [lights, 3] unit vectors to the captured lights.
-            weighting: how light from between the captured lights is shared out over them.
-        """
+    def __init__(self, directions: np.ndarray, weighting: LightWeights) -> None:
+        """Keep what the frames have in common: unit vectors to the captured lights, [lights, 3], and the weighting."""
         self._directions, self._weighting = directions, weighting
         self._beyond = share_beyond(directions, direction_grid().direction)
 

@@ -20,11 +20,10 @@ from service.relight.groups import add_up, in_groups
 from service.relight.guide import Guide
 from service.relight.layers import frame_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, FrameLight, ModelUse
+from service.relight.opened_capture import OpenedCapture, open_capture
 from service.relight.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.relight.plan import Plan, PlannedFrame, make_plan
-from service.relight.sequence import OpenedCapture, open_capture
 from service.relight.sheet import contact_sheet
-from service.relight.weights.weighting import Weighting
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
@@ -64,20 +63,13 @@ class RelightResult(NamedTuple):
 def relight(request: RelightRequest, progress: Progress | None = None) -> RelightResult:
     """Relight a capture, or a sequence of captures with one frame each.
 
-    Args:
-        request: captures, light, frames and where to put them.
-
-    Returns:
-        The frames, and what the user should know of them.
-
     Raises:
         RequestError: a bad frame range, a pattern without ####, options that do not fit, or a frame that would replace an input.
-        StageError, KernelError: bad input; names file and field.
         StorageError: a frame cannot be written; frames already there are whole.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
-    request = request.model_copy(update={"weights": request.weighting})  # which is recorded
+    request = request.model_copy(update={"weights": request.used_weights})  # which is recorded
     timings.stage("open", 1)
     plan = make_plan(request)
     skipped = near_lights = 0
@@ -161,7 +153,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     whole = chunk_frames(stack, CHUNK_FRAMES if guide is None else MODEL_CHUNK_FRAMES)
     size = max(1, (ROW_CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
-    lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=Weighting[request.weighting.name],
+    lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=request.used_weights,
                                device=device, model=use)
     lights = lighting.frames([frame.scheduled for frame, _ in todo])
     single = [in_groups(frame.scheduled, plan.keys) for frame, _ in todo] if len(plan.groups) > 1 else []

@@ -26,11 +26,11 @@ from service.relight.outputs import check_outputs
 from service.relight.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
 from service.relight.surface_model import SurfaceModel
 from service.relight.time_steps import capture_files
-from service.relight.weights.weighting import Weighting
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata
 from service.requests.light.picture_options import FrameMatte, Layer
+from service.requests.relight import LightWeights
 from service.requests.shade import ShadeRequest
 from stage.capture.capture import Capture
 from stage.capture.lighting import lights_from_centre
@@ -60,15 +60,10 @@ class ShadeResult(NamedTuple):
 
 
 def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResult:
-    """Light solved maps.
-
-    Args:
-        request: maps, lights and where the picture goes.
+    """Light solved maps, and write the picture whole or not at all.
 
     Raises:
         RequestError: no light, a file that is no .exr, or one that would replace an input.
-        StageError, KernelError: bad input; names file and field.
-        StorageError: the picture cannot be written; nothing is left half-written.
     """
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -103,14 +98,10 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
 
 
 def check(request: ShadeRequest) -> Path:
-    """Check a request as far as that is cheap; nothing is written.
-
-    Returns:
-        The file of the maps.
+    """Check a request as far as that is cheap, and return the file of the maps.
 
     Raises:
         RequestError: no light, a file that is no .exr or would replace an input, or layers that cannot be written.
-        StageError: maps, capture or folder are not there; names them.
     """
     if not (request.light or request.sphere or request.rectangle) and request.environment is None:
         raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
@@ -160,7 +151,7 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     clipping = Clipping.of(stack, capture.mask().reshape(-1))
     guide = Guide(maps, path, stack, lights, clipping, space=maps.color_space, device=device, progress=timings)
     timings.stage("shade", 2)
-    captured = CaptureLighting(lights, guide.stack, environments, maps.color_space, weighting=Weighting.SMOOTH, device=device,
+    captured = CaptureLighting(lights, guide.stack, environments, maps.color_space, weighting=LightWeights.SMOOTH, device=device,
                                model=ModelUse.FRAME)
     light, = captured.frames([lighting])
     frames = linear_frames(guide.stack, light.weights[None], None, device=device)

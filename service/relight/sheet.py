@@ -27,12 +27,7 @@ DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
 
 
 def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
-    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with.
-
-    Raises:
-        StorageError: the sheet cannot be written, or a frame cannot be read.
-        ImageError: a frame is damaged.
-    """
+    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with."""
     shown = [frames[i] for i in np.linspace(0, len(frames), min(MOST_FRAMES, len(frames)), endpoint=False).astype(int)]
     tiles = []
     for frame in shown:
@@ -44,25 +39,14 @@ def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
 
 
 def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:
-    """Write (title, [rows, cols, 3] display values 0…1) of pictures, each scaled to a height in pixels, row by row as one PNG.
-
-    Raises:
-        StorageError: the picture cannot be written.
-    """
+    """Write (title, [rows, cols, 3] display values 0…1) of pictures, each scaled to a height in pixels, row by row as one PNG."""
     sheet = _sheet([[(title, fit(image, height)) for title, image in row] for row in rows], height)
     with replacing(path) as temporary:
         write_png(temporary, np.asarray(sheet.get_pixels(oiio.UINT8)), srgb=True)
 
 
 def read_frame(path: Path) -> tuple[np.ndarray, str]:
-    """Read a relit frame.
-
-    Returns:
-        [rows, cols, 3] float32 radiance, and its colour space.
-
-    Raises:
-        ImageError, StorageError: it cannot be read.
-    """
+    """Return the radiance of a relit frame, [rows, cols, 3] float32, and its colour space."""
     channels, metadata = exr.read(path)
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
 

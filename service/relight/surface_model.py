@@ -15,14 +15,13 @@ from kernels.relight.model.shading import SecondLobe, Surface, upload_surface
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.surface.shadows import extent_of
+from service.solve.base.batches import view_directions
 from service.solve.height.height import projection_of
-from service.solve.sharing.batches import view_directions
 from stage.errors import ResultError
 from stage.results.maps import LOBES, SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
-
 NORMAL_CELLS = 32
 """Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
 
@@ -44,7 +43,6 @@ class SurfaceModel:
             maps: with normal, diffuse albedo and height; without specular and roughness there is no specular lobe, and where abundance
                 is above 0 there are those of two materials.
             where: their file, for messages.
-            device: where.
             chosen: [rows, cols] bool, the pixels that will be lit; the others only cast shadows. None: all.
             by_normal: True to make pixels of like normals neighbours within each batch; else pixels ascend.
         """
@@ -139,12 +137,7 @@ class SurfaceModel:
 
 def _by_normal(pixels: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the pixels [n] of each batch sorted by the cell of their normal, the cells in Morton order: a far light leaves neighbours dark
-    together (service.relight.model_range).
-
-    Args:
-        pixels: row-major positions.
-        normal: [all pixels, 3] unit vectors.
-    """
+    together (service.relight.model_range)."""
     ordered = []
     for start in range(0, len(pixels), BATCH_PIXELS):
         batch = pixels[start : start + BATCH_PIXELS]

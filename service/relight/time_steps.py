@@ -19,12 +19,8 @@ def time_steps(path: Path) -> list[Path]:
     """Return the captures that frames are made from, in the order of the file, else of name; the path alone where it is no sequence.
 
     Args:
-        path: a capture, or a sequence: a sequence.json, its folder, or a folder without capture.json whose sub-folders have one.
-
-    Raises:
-        RequestError: two captures differ in resolution or colour space.
-        ManifestError: a capture.json is wrong; names the field.
-        StorageError: a folder cannot be read.
+        path: a capture, or a sequence: a sequence.json, its folder, or a folder without capture.json whose sub-folders have one. Its
+            captures must have one resolution and colour space.
     """
     if not is_sequence(path):
         return [path]
@@ -38,11 +34,7 @@ def time_steps(path: Path) -> list[Path]:
 
 
 def capture_files(folder: Path) -> Iterator[Path]:
-    """Yield every file that a capture is read from; where there is no manifest, nothing: opening the capture says so.
-
-    Raises:
-        ManifestError: the manifest is wrong; names the field.
-    """
+    """Yield every file that a capture is read from; where there is no manifest, nothing: opening the capture says so."""
     manifest = folder if folder.name == FILE_NAME else folder / FILE_NAME
     if manifest.is_file():
         yield manifest

@@ -59,8 +59,6 @@ class FrameFormat(NamedTuple):
         """Return the format of frames.
 
         Args:
-            options: of the request.
-            camera: of the capture or the maps.
             space: the scene-linear space that the frames are computed in.
             written: the one that they are written in.
             layers: that all of them share.
@@ -128,7 +126,6 @@ class FrameWriter:
         """Wait until the chunk before is written, then begin to write this one.
 
         Args:
-            files, form: the files of the frames, and the format of all.
             frames: [frames, 3, pixels] float32 radiance; the writer may change it.
             colours: further layers of radiance by name, each [frames, 3, pixels] float32, which the writer may change; where `form` has
                 parts, `specular` is among them.

@@ -60,6 +60,6 @@ class RelightRequest(RelightOptions, Request):
     """Write a report: what was made, and how long each part of the work took."""
 
     @property
-    def weighting(self) -> LightWeights:
+    def used_weights(self) -> LightWeights:
         """Return the weights that are used."""
         return self.weights or (LightWeights.KERNEL if self.maps is None else LightWeights.SMOOTH)

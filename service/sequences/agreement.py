@@ -55,23 +55,14 @@ def noise_share(difference: np.ndarray, variance: np.ndarray, both: np.ndarray, 
     number, everywhere = np.searchsorted(edges, size), np.searchsorted(edges, variance)
     for part in range(len(edges) + 1):
         inside = ratio[number == part]
-        if len(inside) >= LEAST_PIXELS:
-            share[everywhere == part] = np.clip(np.median(inside) / MEDIANS[freedom], LEAST_SHARE, MOST_SHARE)
-        else:
-            share[everywhere == part] = np.clip(np.median(ratio) / MEDIANS[freedom], LEAST_SHARE, MOST_SHARE)
+        told = inside if len(inside) >= LEAST_PIXELS else ratio
+        share[everywhere == part] = np.clip(np.median(told) / MEDIANS[freedom], LEAST_SHARE, MOST_SHARE)
     return share
 
 
 def agree(difference: np.ndarray, variance: np.ndarray, both: np.ndarray, freedom: int) -> np.ndarray:
-    """Return where a difference is no more than noise, at the pixel and in the mean around it.
-
-    Args:
-        difference, both, freedom: as for noise_share.
-        variance: [rows, cols] of noise alone.
-
-    Returns:
-        [rows, cols] bool.
-    """
+    """Return where a difference is no more than noise, at the pixel and in the mean around it, [rows, cols] bool; arguments are those of
+    noise_share, with the variance of noise alone."""
     limit = LIMITS[freedom]
     found = both & ((difference**2).sum(axis=-1) <= limit * variance)
     found &= _window(found, RADII[1]) >= LEAST_AROUND * _window(both, RADII[1])  # among pixels that disagree, one agrees by chance
@@ -119,7 +110,6 @@ def begin(values: np.ndarray, sigma: np.ndarray, share: np.ndarray, valid: np.nd
         values: [rows, cols, k].
         sigma: [rows, cols], standard deviation: root of the mean squared length of the error.
         share: [rows, cols] part of its square that is noise, which may be above 1.
-        valid: [rows, cols] bool, where there is an estimate.
     """
     noise = np.where(valid, share * sigma**2, 0).astype(np.float32)
     constant = np.where(valid, np.sqrt(np.maximum(1 - share, 0)) * sigma, 0).astype(np.float32)
@@ -130,7 +120,6 @@ def advance(track: Track, new: Track, joined: np.ndarray, *, unit: bool = False)
     """Return the track after a further step.
 
     Args:
-        track: so far.
         new: of the step alone, of `begin`.
         joined: [rows, cols] bool, where both agree; elsewhere the step stands alone.
         unit: whether means are directions.

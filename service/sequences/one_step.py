@@ -19,11 +19,7 @@ AnyRequest = TypeVar("AnyRequest", SolveRequest, DepthRequest)
 
 
 def shared_lights(request: SolveRequest) -> LightsOverTime:
-    """Return what the steps of a solve share, before the first.
-
-    Raises:
-        RequestError: lights are to be found from the images of each step.
-    """
+    """Return what the steps of a solve share, before the first; lights may not be found from the images of each step."""
     if request.lights is not LightsKnown.DECLARED:
         raise RequestError(f"--lights {request.lights}: each step of a sequence would find lights of its own, and the surfaces would not "
                            "fit each other: measure the lights once (relit calibrate), and write them into every step")
@@ -45,7 +41,6 @@ def solve_alone(request: SolveRequest, step: TimeStep, progress: Progress, light
 
     Args:
         lights: what the steps before have found; takes what this one finds.
-        sharing: the part of this process where several share the solve.
 
     Returns:
         The request of the step, and whether it was done before.

@@ -11,8 +11,7 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.depth import DepthRequest
 from service.requests.solve import SolveRequest
-from service.sequences.joined_depth import DepthJoiner, moved_points
-from service.sequences.joined_maps import MapsJoiner
+from service.sequences.joined_steps import DepthJoiner, MapsJoiner, moved_points
 from service.sequences.one_step import depth_alone, shared_lights, solve_alone
 from service.sequences.steps import ALONE, StepProgress, check_outputs, step_report
 from stage.capture.light import PointLight
@@ -27,7 +26,6 @@ FIGURES = re.compile(r"\d[\d.]*")
 """The numbers in a sentence, which may differ between steps whose sentences say the same."""
 UNTIMED = "the steps are folders in order of name, taken at {:g} a second: a sequence.json says the rate and times"
 """The warning in the report about a sequence without a file."""
-
 OF_LIGHTS = ("found", "suspect_lights")
 """Entries that the report of a joined step repeats from that of the step alone: the lights under which its model is to be looked at."""
 
@@ -60,12 +58,10 @@ def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> S
 
     Args:
         request: its `capture` is the sequence, its `out` the folder for a folder of each step.
-        progress: told of every stage of every step.
 
     Raises:
         RequestError: lights are to be found from the images of each step, or results would lie in a capture.
         StageError, KernelError: bad input; the steps before are whole.
-        StorageError: the results cannot be written; nothing is left half-written.
     """
     lights = shared_lights(request)
     sequence, manifests = _open(request)

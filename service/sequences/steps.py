@@ -44,11 +44,7 @@ class StepProgress:
 
 
 def check_outputs(out: Path, sequence: Sequence) -> None:
-    """Check that no result of a step would lie in a capture.
-
-    Raises:
-        RequestError: it would.
-    """
+    """Check that no result of a step would lie in a capture."""
     folders = {step.folder.resolve() for step in sequence.steps}
     for step in sequence.steps:
         if (out / step.name).resolve() in folders:
@@ -56,16 +52,8 @@ def check_outputs(out: Path, sequence: Sequence) -> None:
 
 
 def capture_digest(folder: Path, request: Request, shared: object) -> str:
-    """Return a hash of everything that the result of a step follows from.
-
-    Args:
-        folder: of its capture.
-        request: of the step.
-        shared: what other steps have given it, as plain data.
-
-    Raises:
-        StageError: the capture is wrong; names file and field.
-    """
+    """Return a hash of everything that the result of a step follows from: its capture, its request, and what other steps have given it,
+    `shared`, as plain data."""
     capture = Capture.open(folder)
     names = sorted({name for _, name in capture.files()})
     hashes = Fingerprints(capture.folder, (request.cache or capture.folder / CACHE_FOLDER) / "files.json").of(names)
@@ -110,11 +98,7 @@ def left_by(folder: Path) -> dict[str, Any]:
 
 
 def step_report(folder: Path) -> dict[str, Any]:
-    """Return the report of a step that is done.
-
-    Raises:
-        ResultError: it cannot be read.
-    """
+    """Return the report of a step that is done."""
     try:
         found = json.loads((folder / REPORT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -6,11 +6,11 @@ from kernels import device as devices
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
+from service.solve.base.solution import SolveInput
 from service.solve.height.distance import Distance, find_distance
 from service.solve.lights.intensities import LightsOverTime, choose_intensities
 from service.solve.methods.methods import METHODS, Solver
 from service.solve.sharing.sharing import SharedSolve
-from service.solve.sharing.solution import SolveInput
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_surface, distant_lights
 from stage.capture.manifest import FILE_NAME
@@ -46,16 +46,7 @@ class Opened(NamedTuple):
 
 def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings, sharing: SharedSolve | None,
                over_time: LightsOverTime | None = None) -> Opened:
-    """Open the capture of a request, and read its images into a stack.
-
-    Args:
-        capture: that of the request with its pixels; None: it is opened here.
-        sharing: the part of this process where several share the solve.
-        over_time: what the captures of a sequence share.
-
-    Raises:
-        StageError: the input is wrong.
-    """
+    """Open the capture of a request, unless it is given with its pixels, and read its images into a stack."""
     chosen = devices.resolve_all(request.device)
     timings.stage("open", 1)
     capture = capture or Capture.open(request.capture, request.pixels)

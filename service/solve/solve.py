@@ -12,6 +12,7 @@ from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
 from service.requests.solve import MAX_SIGMA, Method, SolveRequest
+from service.solve.base.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from service.solve.height import integrability
 from service.solve.height.height import guessed_part, height_warnings, integrate
 from service.solve.height.parts import Placement, numbered, place_solution
@@ -20,7 +21,6 @@ from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
 from service.solve.sharing.sharing import SharedSolve
-from service.solve.sharing.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour_spaces import linear_space
@@ -49,8 +49,6 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
     """Solve a capture, and write its maps and a report.
 
     Args:
-        request: the capture, the method and the folder of the results.
-        progress: told how far the work is.
         capture: that of the request, opened with its pixels; None: it is opened here.
         sharing: the part of this process where several share the solve; the others call `help_solve`.
         over_time: what the captures of a sequence share; None: the capture is no step of one.
@@ -70,11 +68,8 @@ def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, 
     Args:
         request: that of the other process, on a device of the same kind.
         progress: told how far the solve is; it ends the help by an exception.
-        sharing: the part of this process.
-        over_time: as for solve.
 
     Raises:
-        StageError, KernelError: the input is wrong.
         DivergedError: this process finds something else than the other.
     """
     opened = open_solve(request, None, Timings(progress), sharing, over_time)

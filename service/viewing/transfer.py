@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.model.beyond import share_beyond
-from service.relight.weights.weighting import Weighting, light_weights, share_samples
+from service.relight.weights.weighting import light_weights, share_samples
+from service.requests.relight import LightWeights
 from stage.capture.point_lights import DistantLights
 
 COLS, ROWS = 64, 32
@@ -49,7 +50,7 @@ def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -
         part = slice(begin, begin + COLS)
         channels = np.stack([np.diag(each) for each in energy[part].T], axis=1)  # [kinds, n, kinds]: a channel of its own for each
         shared = share_samples(samples[part].reshape(-1, 3), channels.reshape(-1, channels.shape[2]), lights.direction,
-                               weighting=Weighting.KERNEL)
+                               weighting=LightWeights.KERNEL)
         found[part] = light_weights(shared.T[..., None].repeat(3, axis=2), lights.irradiance, np.ones(len(lights.direction)))
     return found
 

@@ -58,7 +58,7 @@ STEP = 0.05
 class Model(NamedTuple):
     """Lobes that a pixel may reflect, as a table, and how bright each may be."""
 
-    table: wp.array  # [cells, lights, lobes] of response_table.search_table or a reference_table
+    table: wp.array  # [cells, lights, lobes] of response_table.search_table or of a reference ball
     bound: np.ndarray  # [lobes] float32, largest weights in the units of the readings
 
 

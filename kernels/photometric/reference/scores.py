@@ -54,7 +54,7 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
         centre: [n, 3] unit normals.
         offsets: [candidates, 4] of `candidates.rings`; the first is the centre.
         noise: [n, 2] standard deviation of a reading: constant part and part of the reading, both relative to the pixel's level.
-        table: [cells, lights, lobes] of response_table.search_table or a reference_table.
+        table: [cells, lights, lobes] of response_table.search_table or of a reference ball.
         bound: [lobes] largest weight of each lobe, in the units of the readings.
 
     Returns:

@@ -118,7 +118,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         wide: radii of the first rings, about the start, in degrees, and the number of candidates on the last of them.
         fine: the same of the rings that follow, each about the best candidate so far.
         options: how candidates are judged.
-        table: [cells, lights, lobes] of response_table.search_table or a reference_table, in place of the samples' directions;
+        table: [cells, lights, lobes] of response_table.search_table or of a reference ball, in place of the samples' directions;
             its diffuse lobe is what it is, whatever the shape.
         prior: normals that candidates are drawn to, of which the costs include the cost; None: none.
 

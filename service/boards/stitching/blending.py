@@ -1,49 +1,110 @@
-"""Blending of the patches of all tiles into one height map, by inverse variance."""
-
-from typing import NamedTuple
+"""Points of tiles onto the grid of a board, and the blend of the patches of all tiles into one height map, by inverse variance."""
 
 import numpy as np
 
-from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch, shift_error
+from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch, gradients, shift_error
 
+LEAST_WEIGHT = 0.5
+"""The least sum of weights of the points around a measured pixel; where every pixel has a point, the sum is 1."""
 LEAST_SHIFT_PX = 0.02
 """The least standard deviation of a tile's shift, pixels: what interpolation leaves of the shift that the overlaps measure."""
 DISAGREE = 9.0
 """Tiles disagree at a pixel where chi squared over the degrees of freedom is more than this."""
 
 
-class TileErrors(NamedTuple):
-    """The errors of one tile's motion."""
+def grid_points(x: np.ndarray, y: np.ndarray, z: np.ndarray, sigma: np.ndarray, grid: BoardGrid) -> HeightPatch:
+    """Return the heights of scattered points on the smallest part of a grid that holds them.
 
-    covariance: np.ndarray  # [6, 6] m², as in Motions
-    shared_m: float
-    """Standard deviation of the error that the pixels of a block share."""
+    Each point counts in the four pixels around it by its bilinear weight, so that the weights of a point add up to one. The mean of a
+    pixel is moved along the slope to the pixel's centre from where its points lie on average. The noise of a point is then spread over
+    four pixels: `variance` is the weighted mean of σ², with which the sum of independent pixels has the variance that the sum over a
+    region has, but for the region's border, where it is larger than the truth.
+
+    Args:
+        x, y, z, sigma: [n] metres, board frame.
+
+    Returns:
+        The patch, empty where no point lies on the grid.
+    """
+    row, col = grid.place(x, y)
+    inside = (row > -1) & (row < grid.rows) & (col > -1) & (col < grid.cols)
+    row, col, z, variance = row[inside], col[inside], z[inside].astype(np.float64), sigma[inside].astype(np.float64) ** 2
+    if row.size == 0:
+        empty = np.full((0, 0), np.nan)
+        return HeightPatch(0, 0, empty, empty, 1.0)
+    first_row, first_col = np.floor(row).astype(np.int64), np.floor(col).astype(np.int64)
+    top, left = int(first_row.min()), int(first_col.min())
+    rows, cols = int(first_row.max()) - top + 2, int(first_col.max()) - left + 2
+    down, right = row - first_row, col - first_col
+    base = (first_row - top) * cols + first_col - left
+    mean = float(np.median(z))
+    sums = np.zeros((6, rows * cols))
+    for step_row in (0, 1):
+        for step_col in (0, 1):
+            weight = (down if step_row else 1 - down) * (right if step_col else 1 - right)
+            at = base + step_row * cols + step_col
+            for total, values in zip(sums, (weight, weight * (z - mean), weight * (down - step_row), weight * (right - step_col),
+                                            weight * variance, weight * weight * variance), strict=True):
+                total += np.bincount(at, values, minlength=rows * cols)
+    weight, height, off_row, off_col, spread, own = sums.reshape(6, rows, cols)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        usable = weight >= LEAST_WEIGHT
+        height, off_row, off_col, spread, own = (np.where(usable, total / weight, np.nan)
+                                                 for total in (height, off_row, off_col, spread, own))
+        spread = spread / weight  # the more points a pixel has, the less noise
+        own = own / weight
+    across, along, _ = gradients(_filled(height))
+    height = height - across * np.nan_to_num(off_col) - along * np.nan_to_num(off_row) + mean
+    share = float(np.nanmedian(own / spread)) if usable.any() else 1.0
+    kept_rows = slice(max(0, -top), min(rows, grid.rows - top))
+    kept_cols = slice(max(0, -left), min(cols, grid.cols - left))
+    return HeightPatch(max(top, 0), max(left, 0), height[kept_rows, kept_cols], spread[kept_rows, kept_cols], min(share, 1.0))
+
+
+def _filled(height: np.ndarray) -> np.ndarray:
+    """Return heights with missing ones from their neighbours: the mean of opposite ones, else of what two in a line extrapolate to."""
+    padded = np.pad(height, 2, constant_values=np.nan)
+    rows, cols = padded.shape
+
+    def at(down: int, right: int) -> np.ndarray:
+        return padded[2 + down : rows - 2 + down, 2 + right : cols - 2 + right]
+
+    steps = ((0, 1), (1, 0), (0, -1), (-1, 0))
+    between = [(at(*step) + at(-step[0], -step[1])) / 2 for step in steps[:2]]
+    beyond = [2 * at(*step) - at(2 * step[0], 2 * step[1]) for step in steps]
+    out = height
+    for guesses in (between, beyond):
+        known = [np.isfinite(guess) for guess in guesses]
+        count = np.sum(known, axis=0)
+        total = np.sum([np.where(there, guess, 0) for there, guess in zip(known, guesses, strict=True)], axis=0)
+        out = np.where(np.isfinite(out) | (count == 0), out, total / np.maximum(count, 1))
+    return out
 
 
 class Blender:
     """Sums of patches over a grid."""
 
     def __init__(self, grid: BoardGrid, *, centre: tuple[float, float], length_m: float, noise_factor: float) -> None:
-        """Start with nothing.
-
-        Args:
-            centre, length_m: of the motions.
-            noise_factor: by which the noise of patches is larger than they say.
-        """
+        """Start with nothing; centre and length are those of the motions, and the noise of patches is larger than they say by a factor."""
         self.grid, self.centre, self.length_m, self.noise = grid, centre, length_m, noise_factor**2
         shape = (grid.rows, grid.cols)
         self.weight, self.height, self.square, self.spread, self.systematic = (np.zeros(shape) for _ in range(5))
         self.tiles = np.zeros(shape, dtype=np.uint8)
 
-    def add(self, patch: HeightPatch, errors: TileErrors) -> None:
-        """Add the patch of one tile."""
+    def add(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> None:
+        """Add the patch of one tile.
+
+        Args:
+            covariance: [6, 6] m² of the tile's motion, as in Motions.
+            shared_m: standard deviation of the error that the pixels of a block share.
+        """
         rows = slice(patch.row, patch.row + patch.height.shape[0])
         cols = slice(patch.col, patch.col + patch.height.shape[1])
         there = patch.measured
         if not there.any():
             return
         variance = np.where(there, patch.variance * self.noise, 1.0)
-        systematic = self._systematic(patch, errors)
+        systematic = self._systematic(patch, covariance, shared_m)
         weight = np.where(there, 1 / (variance + systematic**2), 0)
         height = np.where(there, patch.height, 0)
         self.weight[rows, cols] += weight
@@ -64,14 +125,14 @@ class Blender:
             apart = np.where((self.tiles > 1) & (scatter > DISAGREE * (self.tiles - 1.0)), scatter / self.weight, 0)
         return HeightMap(self.grid, height, variance, np.sqrt(systematic**2 + apart))
 
-    def _systematic(self, patch: HeightPatch, errors: TileErrors) -> np.ndarray:
+    def _systematic(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> np.ndarray:
         """Return σ in metres of the errors that neighbouring pixels of a tile share: its offset and tilt, its shift on slopes."""
         row, col = np.mgrid[patch.row : patch.row + patch.height.shape[0], patch.col : patch.col + patch.height.shape[1]]
         x, y = self.grid.coordinates(row, col)
         basis = np.stack([np.ones_like(x), (x - self.centre[0]) / self.length_m, (y - self.centre[1]) / self.length_m], axis=-1)
-        plane = np.einsum("...i,ij,...j->...", basis, errors.covariance[3:, 3:], basis)
+        plane = np.einsum("...i,ij,...j->...", basis, covariance[3:, 3:], basis)
         to_middle = np.array([[1, 0, -basis[..., 2].mean()], [0, 1, basis[..., 1].mean()]])
-        shift = np.diag(to_middle @ errors.covariance[:3, :3] @ to_middle.T) / self.grid.pixel_m**2 + LEAST_SHIFT_PX**2
+        shift = np.diag(to_middle @ covariance[:3, :3] @ to_middle.T) / self.grid.pixel_m**2 + LEAST_SHIFT_PX**2
         right, up = (float(value) for value in np.sqrt(shift))
         slopes = shift_error(patch.height, (right, up), float(np.sqrt(np.nanmedian(patch.variance))))
-        return np.asarray(np.sqrt(np.maximum(plane, 0) + errors.shared_m**2 + slopes**2))
+        return np.asarray(np.sqrt(np.maximum(plane, 0) + shared_m**2 + slopes**2))

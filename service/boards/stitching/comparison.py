@@ -54,7 +54,6 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     of the shift between the maps, and a part of the second difference.
 
     Args:
-        measured, nominal: on the same grid.
         shift_sigma_m: standard deviation along x and y of the registration of the measured map.
     """
     deviation = measured.height - nominal.height
@@ -73,16 +72,8 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
 
 
 def fit_form(grid: BoardGrid, height: np.ndarray, *, quadratic: bool) -> Form:
-    """Fit a plane or a quadratic surface to the medians of blocks by Tukey's weights, so that defects do not move it.
-
-    Args:
-        grid: of the heights.
-        height: [rows, cols] metres, NaN where missing.
-        quadratic: bow and twist too.
-
-    Returns:
-        The form.
-    """
+    """Fit a plane, or a quadratic surface with bow and twist, to the medians of blocks of heights by Tukey's weights, so that defects do
+    not move it; heights are NaN where missing."""
     side = max(1, min(BLOCK_PX, *(length // 6 for length in height.shape)))
     x, y = _unit(grid)
     blocks = blocks_of(height, side)

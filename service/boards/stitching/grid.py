@@ -106,10 +106,7 @@ class HeightMap(NamedTuple):
 
 
 def gradients(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the slopes of a height map by Sobel's differences over 3 × 3 pixels.
-
-    Args:
-        height: [rows, cols] in any unit, NaN where not measured.
+    """Return the slopes of a height map, NaN where not measured, by Sobel's differences over 3 × 3 pixels.
 
     Returns:
         Slope along columns and along rows, per pixel and 0 where a neighbour is missing, and the factor by which each multiplies the

@@ -53,11 +53,7 @@ def solve_motions(overlaps: Mapping[tuple[int, int], Overlap], middles: np.ndarr
         overlaps: by the tiles that they join; those whose evidence is DIFFERS are left out.
         middles: [tiles, 2] the middle of each tile relative to the centre about which motions turn, metres.
         length_m: L, metres.
-        pixel_m: of the grid.
         shift_sigma_m, turn_sigma: standard deviations of the stage's position along x and y, metres, and rotation, radians.
-
-    Returns:
-        The motions.
     """
     tiles = len(middles)
     used = {pair: overlap for pair, overlap in overlaps.items() if overlap.evidence is not Evidence.DIFFERS}

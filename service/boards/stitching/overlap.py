@@ -99,7 +99,7 @@ def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
         search_px: the largest shift that is looked at; 0 refines only.
 
     Returns:
-        What was found, or None where fewer than LEAST_PIXELS are common.
+        None where fewer than LEAST_PIXELS are common.
     """
     common = _common(first, second, (0, 0))
     if common is None:
@@ -136,9 +136,7 @@ def choose_candidate(overlap: Overlap, expected: np.ndarray, covariance: np.ndar
     """Return an overlap that REPEATS with the one candidate that the other overlaps and the stage leave; None if they leave several.
 
     Args:
-        overlap: with candidates.
-        expected: [2] the difference of the shifts that is expected without it, metres.
-        covariance: [2, 2] of the expected difference, m².
+        expected: [2] the difference of the shifts that is expected without this overlap, metres, with its covariance [2, 2].
     """
     away = np.array([candidate.difference[:2] - expected for candidate in overlap.candidates])
     cost = np.einsum("ni,ni->n", away, np.linalg.solve(covariance, away.T).T) / 2

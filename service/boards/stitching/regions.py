@@ -39,12 +39,8 @@ class RegionResult(NamedTuple):
 
 
 def pixels_of(region: Region, grid: BoardGrid, *, grow: float = 0.0) -> tuple[tuple[slice, slice], np.ndarray]:
-    """Return the rows and columns around a region, and within them the pixels whose centres it holds.
-
-    Args:
-        grid: of the pixels.
-        grow: by how much of its size the region is made larger.
-    """
+    """Return the rows and columns around a region, made larger by the part `grow` of its size, and within them the pixels whose centres it
+    holds."""
     (x, y), (width, height) = region.centre_m, (size * (1 + grow) for size in region.size_m)
     top, left = grid.place(np.array(x - width / 2), np.array(y + height / 2))
     bottom, right = grid.place(np.array(x + width / 2), np.array(y - height / 2))
@@ -72,13 +68,7 @@ def check_regions(deviation: Deviation, regions: Sequence[Region], *, false_alar
 
     With k the threshold of as many one-sided tests as there are limits, a region fails if its mean deviation is more than k σ outside of
     a limit, and passes if it is more than k σ inside of both. So the probability that any region of a good board fails, and the
-    probability that any region outside its tolerance passes, are both at most `false_alarm`.
-
-    Args:
-        false_alarm: above 0 and below 1.
-
-    Returns:
-        A result for each region, and k.
+    probability that any region outside its tolerance passes, are both at most `false_alarm`. The results come with k.
     """
     k = threshold(false_alarm, 2 * len(regions), sides=1)
     taken = np.zeros((deviation.grid.rows, deviation.grid.cols), dtype=bool)

@@ -19,7 +19,7 @@ def find_shifts(first: HeightPatch, second: HeightPatch, rows: slice, cols: slic
     """Return the shifts of whole pixels at which the mean squared difference has a minimum, the most probable first, and no shift.
 
     Args:
-        first, second: the patches; the second is the one that moves.
+        second: the patch that moves.
         rows, cols: of the grid: what both have in common where the stage says that they are.
         pixels: how many of these are measured in both.
         sigma_px: standard deviation of the shift, pixels.

@@ -75,15 +75,12 @@ def mean_of(deviation: Deviation, pixels: np.ndarray) -> Mean | None:
 
 
 def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
-    """Look for significant windows over a whole board.
+    """Look for significant windows over a whole board; pixels of significant windows do not count in larger ones.
 
     Args:
         tolerance_m: deviations up to this are no defect; one number, or one for each pixel, [rows, cols].
         false_alarm: the probability of any false alarm on a board without defects.
         smallest_px: side of the smallest window.
-
-    Returns:
-        What was found. Pixels of significant windows do not count in larger ones.
     """
     known = deviation.known.copy()
     shape = known.shape

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from service.boards.stitching.blending import Blender, TileErrors
+from service.boards.stitching.blending import Blender, grid_points
 from service.boards.stitching.grid import BoardGrid, HeightMap, HeightPatch
-from service.boards.stitching.gridding import grid_points
 from service.boards.stitching.motions import Motions, displace, solve_motions
 from service.boards.stitching.overlap import UNKNOWNS, Evidence, Overlap, choose_candidate, measure_overlap
 from stage.errors import BoardError
@@ -80,7 +79,6 @@ def stitch(tiles: Sequence[TilePoints], *, shift_sigma_m: float | None = None, t
     """Find where every tile lies.
 
     Args:
-        tiles: one or more.
         shift_sigma_m: standard deviation of the stage's positions, metres; None: SHIFT_SIGMA_PX pixels.
         turn_sigma_degrees: standard deviation of the rotation of tiles; None: TURN_SIGMA_DEGREES.
         pixel_m: side of the grid's pixels; None: the largest distance of neighbouring points of a tile.
@@ -140,7 +138,7 @@ def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, m
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
         patch = _patch(tile, stitched.motions.values[number] + whole, grid, stitched.centre, stitched.length_m)
-        blender.add(patch, TileErrors(stitched.motions.of_tile(number), stitched.shared_m))
+        blender.add(patch, stitched.motions.of_tile(number), stitched.shared_m)
         progress(number + 1)
     return blender.result()
 

@@ -23,11 +23,7 @@ class LitFrame(NamedTuple):
 
 
 def lit_frames(capture: Capture) -> list[LitFrame]:
-    """Return the frames whose lights can be calibrated, which are distant and point lights, in manifest order.
-
-    Raises:
-        ManifestError: there is none.
-    """
+    """Return the frames whose lights can be calibrated, which are distant and point lights, in manifest order; one or more."""
     found = [LitFrame(index, frame, frame.light) for index, frame in enumerate(capture.manifest.frames)
              if isinstance(frame.light, DistantLight | PointLight)]
     if not found:
@@ -37,15 +33,7 @@ def lit_frames(capture: Capture) -> list[LitFrame]:
 
 
 def check_same_setup(source: Capture, target: Capture) -> None:
-    """Check that the lights of one capture may be written into another, because both were taken in the same setup.
-
-    Args:
-        source: the capture in which the lights were measured.
-        target: the capture whose manifest gets the lights.
-
-    Raises:
-        ManifestError: the count of lit frames, the projection, the resolution or the camera position differs.
-    """
+    """Check that lights that were measured in `source` may be written into `target`, because both were taken in the same setup."""
     where = target.folder / FILE_NAME
     measured, wanted = len(lit_frames(source)), len(lit_frames(target))
     if measured != wanted:
@@ -62,12 +50,7 @@ def check_same_setup(source: Capture, target: Capture) -> None:
 
 
 def with_lights(target: Capture, lights: Sequence[SingleLight | None]) -> Manifest:
-    """Return the manifest of a capture with its distant and point lights replaced, in manifest order.
-
-    Args:
-        target: a capture with as many distant and point lights.
-        lights: the new lights; None removes the frame.
-    """
+    """Return the manifest of a capture with its distant and point lights replaced, in manifest order; None removes the frame."""
     by_index: Mapping[int, SingleLight | None] = dict(zip((lit.number for lit in lit_frames(target)), lights, strict=True))
     frames = []
     for index, frame in enumerate(target.manifest.frames):

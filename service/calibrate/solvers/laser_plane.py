@@ -57,11 +57,7 @@ def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, ca
     Args:
         corners: [across × down, 2] image coordinates, row by row.
         board: inner corners across and down.
-        square_m: side of a square in metres.
         camera: a calibrated perspective camera.
-
-    Raises:
-        CalibrationError: the corners have no pose.
     """
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
     points = np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m
@@ -89,10 +85,7 @@ def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, 
 
 
 def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
-    """Fit a plane to the points of a stripe on several boards.
-
-    Args:
-        poses: [n, 3] metres each, the stripe on one board.
+    """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each.
 
     Raises:
         CalibrationError: there are too few points, or they lie along one line.

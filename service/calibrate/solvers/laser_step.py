@@ -51,8 +51,6 @@ class StepFit(NamedTuple):
     planes: list[StepPlane]
     distances_m: list[float]
     """Distance of the base from the camera's centre in each pose."""
-    spread: float
-    """Root of χ² by its degrees of freedom: 1 where lines miss their places by their noise."""
 
 
 def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixel: float) -> StepFit:
@@ -60,7 +58,6 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
 
     Args:
         poses: for each pose the stripe of each laser plane; None where it does not cross the block.
-        height_m: height of the step, metres.
         pixel: width of a pixel in normalised coordinates.
 
     Raises:
@@ -92,7 +89,7 @@ def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixe
         told = "hardly" if lost or worst.sigma > 1 else f"to {100 * worst.sigma:.1f} % of the depth and {worst.sigma_degrees:.1f}° alone"
         raise CalibrationError(f"the step tells the planes {told}: look at it from 30 to 60 degrees above its base, let it fill more of "
                                "the image, take a higher one, or photograph it in several poses")
-    return StepFit(lasers, [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))], spread)
+    return StepFit(lasers, [1 / float(np.linalg.norm(values[NUMBERS * pose:NUMBERS * pose + 3])) for pose in range(len(poses))])
 
 
 class _Data(NamedTuple):

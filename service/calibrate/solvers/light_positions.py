@@ -14,8 +14,6 @@ MIN_CONVERGENCE_DEGREES = 1.0
 """The least angle between two rays: below it an error of one pixel moves the light by as much as its distance."""
 MISS_DEGREES = 1.0
 """The angle between a ray and the direction to the nearest point, seen from the ball, above which the light is flagged."""
-
-
 MISSES = "rays miss"
 """The flag of a light whose rays do not meet."""
 

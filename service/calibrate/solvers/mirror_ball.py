@@ -7,7 +7,6 @@ Source: the law of reflection, r = 2(n·v)n - v; Debevec, "Rendering synthetic o
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -35,17 +34,6 @@ SMALL_SPOT = 4
 """The count of pixels below which a spot is flagged, because its centroid is inaccurate."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SpotOptions:
-    """The options of the search for the spot."""
-
-    level: float = 0.1
-    """The level relative to the peak: pixels of the spot are brighter than it and than the noise of the ball, and connected to the peak.
-
-    It is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
-    """
-
-
 class Spot(NamedTuple):
     """The reflection of one light in a mirror ball."""
 
@@ -60,8 +48,7 @@ class Spot(NamedTuple):
     flags: tuple[str, ...]
 
 
-def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView,
-              options: SpotOptions = SpotOptions()) -> Spot:
+def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, view: BallView, *, level: float = 0.1) -> Spot:
     """Find the bright spot on a mirror ball, and the direction of the light that it reflects.
 
     Each pixel of the spot measures the light from its own reflected direction. The result is the mean of these directions, weighted
@@ -71,10 +58,11 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     Args:
         radiance: [h, w, 3] scene-linear, the box of `view`.
         saturated: [h, w] bool, or None.
-        ball, view: the ball, and the normals and lines of sight of its pixels.
+        level: relative to the peak: pixels of the spot are brighter than it and than the noise of the ball, and connected to the peak. It
+            is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
 
     Raises:
-        CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the message does not name the frame.
+        CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the caller names the frame.
     """
     facing = (view.normal * view.to_viewer).sum(axis=-1)
     looked_at = view.inside & (facing > RIM_COSINE)
@@ -83,7 +71,7 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
     if clipped.any():
         value[clipped] = value.max()
     peak = float(value.max())
-    floor = max(options.level * peak, _noise_ceiling(value[looked_at]))
+    floor = max(level * peak, _noise_ceiling(value[looked_at]))
     rise = np.maximum(value - floor, 0)
     spot, rival = _brightest(rise, value == peak)
     count, ball_pixels = int(spot.sum()), int(view.inside.sum())

@@ -137,16 +137,7 @@ def board_points(board: tuple[int, int], square_m: float) -> np.ndarray:
 
 def calibrate(views: Sequence[BoardView], board: tuple[int, int], square_m: float, camera_size: tuple[int, int],
               projector_size: tuple[int, int]) -> ProCam:
-    """Calibrate projector and camera from the corners of several views.
-
-    Args:
-        views: three views or more.
-        square_m: the side of a square in metres.
-        camera_size, projector_size: width and height in pixels.
-
-    Raises:
-        CalibrationError: there are too few views, or the poses do not determine the devices.
-    """
+    """Calibrate projector and camera from the corners of three views or more; sizes are width and height in pixels."""
     if len(views) < LEAST_VIEWS:
         raise CalibrationError(f"{len(views)} of the views can be used: give {LEAST_VIEWS} or more, the board tilted differently in each")
     every = board_points(board, square_m)

@@ -42,23 +42,12 @@ def alike_order(first: np.ndarray, other: np.ndarray) -> np.ndarray:
 
     A board of two odd or two even counts looks the same upside down, and each camera's corners may begin at either end. Cameras that are
     turned against each other by less than a quarter turn see the first and the last corner in the same direction.
-
-    Args:
-        first, other: [corners, 2] image coordinates.
     """
     return other if (first[-1] - first[0]) @ (other[-1] - other[0]) >= 0 else other[::-1]
 
 
 def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square_m: float, size: Resolution, name: str) -> Lens:
-    """Calibrate one camera.
-
-    Args:
-        corners: [corners, 2] image coordinates of each view, all of the board.
-        square_m: the side of a square in metres.
-
-    Raises:
-        CalibrationError: there are too few views, or the poses do not determine the camera.
-    """
+    """Calibrate one camera from the image coordinates of all corners of the board in each view, [corners, 2]."""
     if len(corners) < LEAST_VIEWS:
         raise CalibrationError(f"{name}: {len(corners)} of the views show the board: give {LEAST_VIEWS} or more, the board tilted "
                                "differently in each")
@@ -77,16 +66,7 @@ def calibrate_lens(corners: Sequence[np.ndarray], board: tuple[int, int], square
 
 def calibrate_pose(views: Sequence[SharedView], board: tuple[int, int], square_m: float, first: Lens, other: Lens, size: Resolution,
                    name: str) -> StereoPose:
-    """Find where another camera stands.
-
-    Args:
-        views: three or more, all of the board.
-        square_m: the side of a square in metres.
-        size: width and height of the images of the first camera.
-
-    Raises:
-        CalibrationError: there are too few views that both cameras share.
-    """
+    """Find where another camera stands, from three views or more of the whole board; `size` is that of the first camera's images."""
     if len(views) < LEAST_VIEWS:
         raise CalibrationError(f"{name}: {len(views)} of the views show the board to it and to the first camera: give {LEAST_VIEWS} or "
                                "more")

@@ -37,7 +37,6 @@ SMALLEST_HOLE_DEGREES = 20.0
 LARGEST_FACE_DEGREES = 80.0
 """Largest radius of a face's circle, degrees. At 90 degrees the centre would lie in the face; the faces of a regular tetrahedron have 70.5
 degrees."""
-
 REMEMBERED = 4
 """Number of sets of lights whose triangles are kept in memory."""
 CHUNK = 4096
@@ -45,13 +44,10 @@ CHUNK = 4096
 
 
 def triangulate_sphere(directions: np.ndarray) -> SphereTriangles:
-    """Return the spherical Delaunay triangles of the lights.
+    """Return the spherical Delaunay triangles of the lights; the centre lies inside their hull.
 
     Args:
         directions: [lights, 3] unit vectors, no two of them closer than a ten-thousandth of a radian.
-
-    Returns:
-        The triangles; the centre lies inside their hull.
 
     Raises:
         ArrayError: fewer than four lights, or all in one plane.
@@ -103,12 +99,7 @@ def find_faces(triangles: SphereTriangles, directions: np.ndarray) -> tuple[np.n
 
 
 def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share the energy of a few samples out over the lights, each to the three around it.
-
-    Args:
-        samples: [n, 3] unit vectors to the samples.
-        energy: [n, channels] of each.
-        directions: [lights, 3] unit vectors to the lights, all in different places.
+    """Share the energy [n, channels] of a few samples out over the lights, all in different places, each to the three around it.
 
     Returns:
         [lights, channels] float64; its sum is that of the samples.
@@ -121,11 +112,7 @@ def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
 
 
 def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the three lights whose triangle each sample lies in.
-
-    Args:
-        directions: [lights, 3] unit vectors, four or more not in one plane.
-        samples: [n, 3] unit vectors.
+    """Return the three lights, of four or more not in one plane, whose triangle each sample lies in.
 
     Returns:
         [n, 3] int32 lights and [n, 3] float32 shares that sum to one; where lights are missing the nearest stand for the corners.
@@ -175,9 +162,6 @@ def _faces(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Returns:
         [faces, 3] corners, counterclockwise seen from outside; [faces, 3] unit normals; and [faces] the angular radius of the circle of
         the corners, radians.
-
-    Raises:
-        ArrayError: fewer than four points, or all in one plane.
     """
     if len(points) < 4:
         raise ArrayError(f"smooth weighting needs lights in four different places, got {len(points)}: choose cells")

@@ -1,6 +1,8 @@
 """Light of an environment, of discs or of samples → energies and weights of the captured lights.
 
-Light is shared out over the captured lights by one of three weightings; the weight of a light of irradiance E is the energy that it was
+Light is shared out over the captured lights by one of three weightings: `kernel` has the least expected error of the frame; with `cells`,
+shadows and highlights are as sharp as a light's own, and a moving sun steps from light to light; with `smooth`, and with `kernel`, it fades
+from light to light, and with `smooth` shadows of three lights show at once. The weight of a light of irradiance E is the energy that it was
 given divided by E. Few samples are shared out in NumPy, because they are too few for a launch.
 
 Source: Debevec et al., SIGGRAPH 2000, section 3.3.
@@ -8,7 +10,6 @@ Source: Debevec et al., SIGGRAPH 2000, section 3.3.
 
 import math
 from collections.abc import Iterator
-from enum import Enum, auto
 
 import numpy as np
 
@@ -21,20 +22,10 @@ from kernels.relight.weights.smooth import locate
 from kernels.relight.weights.turned_sums import LightEnergy, gather
 from service.relight.weights.quadrature import integrate_kernel, share_kernel
 from service.relight.weights.triangulation import share_smooth, triangles_between
+from service.requests.relight import LightWeights
 
 
-class Weighting(Enum):
-    """Ways to share the environment out over the lights."""
-
-    KERNEL = auto()
-    """As `integrate_kernel` does: the least expected error of the frame; a moving sun fades from light to light."""
-    CELLS = auto()
-    """As `integrate_cells` does: shadows and highlights are as sharp as a light's own, and a moving sun steps from light to light."""
-    SMOOTH = auto()
-    """As `integrate_smooth` does: a moving sun fades from light to light, and shadows of three lights show at once."""
-
-
-def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, weighting: Weighting,
+def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, weighting: LightWeights,
               device: str) -> np.ndarray:
     """Share a lat-long map out over the lights, for several rotations of the map.
 
@@ -42,7 +33,6 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
         environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
         directions: [lights, 3] unit vectors from the object to the lights (without padding).
         rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
-        weighting: how.
         device: where nearest lights or triangles are found; sums are taken on the host in float64.
 
     Returns:
@@ -51,9 +41,9 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
     Raises:
         ArrayError: as latlong.check; for smooth weighting also as triangulate_sphere.
     """
-    if weighting is Weighting.KERNEL:
+    if weighting is LightWeights.KERNEL:
         return integrate_kernel(environment, directions, rotations)
-    chosen = {Weighting.CELLS: integrate_cells, Weighting.SMOOTH: integrate_smooth}[weighting]
+    chosen = {LightWeights.CELLS: integrate_cells, LightWeights.SMOOTH: integrate_smooth}[weighting]
     return chosen(environment, directions, rotations, device=device).energy
 
 
@@ -80,23 +70,22 @@ def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations:
     return LightEnergy(energy, solid_angle)
 
 
-def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
+def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray, *, weighting: LightWeights) -> np.ndarray:
     """Share the energy of samples out over the captured lights, as whole environments are.
 
     Args:
         samples: [n, 3] unit vectors to the samples.
         energy: [n, channels] of each.
         directions: [lights, 3] unit vectors to the lights; of several in one place the first gets all.
-        weighting: how.
 
     Returns:
         [lights, channels] float64; its sum is that of the samples.
     """
-    if weighting is Weighting.KERNEL:
+    if weighting is LightWeights.KERNEL:
         return share_kernel(samples, energy, directions)
     kept = first_of_equals(directions)
     given = np.zeros((len(directions), energy.shape[1]))
-    if weighting is Weighting.SMOOTH:
+    if weighting is LightWeights.SMOOTH:
         given[kept] = share_smooth(samples, energy, directions[kept])
         return given
     nearest = (samples @ directions[kept].T).argmax(axis=1)
@@ -105,14 +94,13 @@ def share_samples(samples: np.ndarray, energy: np.ndarray, directions: np.ndarra
     return given
 
 
-def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions: np.ndarray, *, weighting: Weighting) -> np.ndarray:
+def integrate_discs(middles: np.ndarray, angles_degrees: np.ndarray, directions: np.ndarray, *, weighting: LightWeights) -> np.ndarray:
     """Share discs of even radiance out over the lights.
 
     Args:
         middles: [discs, 3] unit vectors to the middle of each disc.
         angles_degrees: [discs] diameter of each as seen from the object, 0…180.
         directions: [lights, 3] unit vectors from the object to the lights (without padding).
-        weighting: how, as for a map.
 
     Returns:
         [discs, lights] float64: ∫ w L dω, for discs that give a surface facing them an irradiance of 1: ∫ L cosθ dω = 1, so that the

@@ -14,10 +14,10 @@ from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.shadows.bounce import subtract_bounce
 from kernels.photometric.shadows.shadowing import exclude_shadows
+from service.solve.base.solution import SolveInput
 from service.solve.height.height import integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
 from service.solve.height.parts import Material, numbered, place_parts
-from service.solve.sharing.solution import SolveInput
 from stage.colour.colour import GREY_WEIGHTS
 
 LARGEST_ALBEDO = 0.98
@@ -54,12 +54,8 @@ class DirectLight(NamedTuple):
         return self._replace(solved=solved, height=height)
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
-        """Mark readings in cast shadow as none, and subtract the light that the object threw on itself from the others.
-
-        Args:
-            pixels: [n] row-major positions in the image.
-            samples: their readings; changed in place.
-        """
+        """Change readings in place: mark those in cast shadow as none, and subtract the light that the object threw on itself from the
+        others."""
         if self.shadows:
             exclude_shadows(samples, pixels, self.height, self.solved, projection_of(self.given.camera),
                             None if self.field is None else self.field.places)
@@ -70,12 +66,7 @@ class DirectLight(NamedTuple):
                             None if self.field is None else self.field.at(pixels))
 
     def under(self, lights: Lights, factor: np.ndarray) -> "DirectLight":
-        """Return the same under lights of other strength.
-
-        Args:
-            lights: the same lights with another irradiance.
-            factor: [lights] their irradiance over that so far.
-        """
+        """Return the same under the same lights of another irradiance, which is that so far times `factor` [lights]."""
         arriving = self.arriving
         if arriving is not None:
             arriving = arriving._replace(light=(arriving.light / factor).astype(np.float32))
@@ -88,10 +79,7 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
 
     Args:
         normal: [3, pixels] float32, found so far.
-        material: of the same.
         bouncing: [3, pixels] albedo of the light that other surfaces send.
-        shadows: whether cast shadows are taken out.
-        interreflection: whether interreflection is taken out.
         parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.
     """
     surface = integrate(given, normal, solved, stage="surface")

@@ -16,13 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
-from service.light_estimation.near_fit import NearFit, NearLamps, fit_near
+from service.light_estimation.lambertian import CAUCHY, LEAST_SPREAD, SHADOW, bright_readings, median_of
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.manifest import FILE_NAME
 from stage.capture.point_lights import light_places
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import ManifestError
+from stage.spread import MAD_TO_SIGMA
 from stage.stack.stack import Stack
 
 ACROSS = 32
@@ -58,6 +59,10 @@ LEAST_LIGHTS = 5
 """The fewest lights: one can then be left out, and a reading to spare remains."""
 AROUND = 0.5
 """Depths that are tried without a group of lights, on either side of the best in the logarithm."""
+FIT_ROUNDS = 3
+"""Rounds of re-weighting of a fit."""
+LARGEST_RESIDUAL = 1e6
+"""Residuals are cut here: where all lights are in one line of sight, normals that cannot be found leave anything."""
 
 
 class NotTold(ManifestError):
@@ -75,6 +80,22 @@ class Distance(NamedTuple):
     """Standard error of the normals for that of the depth."""
 
 
+class _Lamps(NamedTuple):
+    """Lights as `stage.capture.point_lights.PlacedLights` has them, of one strength for all channels."""
+
+    place: np.ndarray  # [lights, 4] metres and 1, or unit direction and 0
+    strength: np.ndarray  # [lights] intensity, or irradiance
+    lobe: np.ndarray  # [lights, 4] axis and exponent
+
+
+class _Fit(NamedTuple):
+    """The normals of pixels, and what they leave."""
+
+    normal: np.ndarray  # [3, pixels] float64, unit
+    residual: np.ndarray  # [lights, pixels] float64, over the bright readings of the pixel; 0 where not lit
+    lit: np.ndarray  # [lights, pixels] bool: readings that are compared, the same wherever the points are
+
+
 class _Sample(NamedTuple):
     """Readings of a grid of pixels."""
 
@@ -83,7 +104,7 @@ class _Sample(NamedTuple):
     y: np.ndarray
     readings: np.ndarray  # [lights, pixels of the mask]
     usable: np.ndarray
-    lamps: NearLamps
+    lamps: _Lamps
     perspective: bool
     top: float
     """The z from which depths count: 0, or that of the light nearest to an orthographic camera."""
@@ -101,11 +122,6 @@ class _Sample(NamedTuple):
 
 def find_distance(capture: Capture, stack: Stack, device: str) -> Distance:
     """Return a capture with the depth of the surface that its images tell; an orthographic camera whose images do not keeps z = 0.
-
-    Args:
-        capture: for which `distance_is_missing`.
-        stack: its frames.
-        device: where normals are integrated.
 
     Raises:
         ManifestError: the images of a perspective camera do not tell the depth, or the lights are not usable.
@@ -204,7 +220,7 @@ def _sample(capture: Capture, stack: Stack) -> _Sample:
     placed = light_places(capture)
     perspective = camera.projection == "perspective"
     top = 0.0 if perspective else float(placed.place[placed.place[:, 3] == 1, 2].max())
-    return _Sample(inside, x, y, readings, usable, NearLamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe),
+    return _Sample(inside, x, y, readings, usable, _Lamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe),
                    perspective, top)
 
 
@@ -216,10 +232,10 @@ def _cost(sample: _Sample, depth: float, device: str) -> np.ndarray:
     return np.where(lit >= LEAST_LIT, cost, np.log1p(1 / NOISE**2))
 
 
-def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
+def _surface(sample: _Sample, depth: float, device: str) -> _Fit:
     """Return the normals of a surface with this mean depth, and what they leave."""
     mask, z, sight = sample.mask, sample.top - depth, sample.sight()
-    fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(np.full(mask.shape, z))[mask])
+    fit = _fit_near(sample.readings, sample.usable, sample.lamps, sample.points(np.full(mask.shape, z))[mask])
     for _ in range(ROUNDS - 1):
         normal = np.zeros((3, *mask.shape), np.float32)
         normal[:, mask] = fit.normal
@@ -230,7 +246,7 @@ def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
                                   perspective=sample.perspective, mean_z=z, options=INTEGRATION,
                                   device=device).height.numpy()
         height = np.where(solved & np.isfinite(found) & (found < sample.top), found, z)
-        fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(height)[mask])
+        fit = _fit_near(sample.readings, sample.usable, sample.lamps, sample.points(height)[mask])
     return fit
 
 
@@ -242,7 +258,7 @@ def _spread_by_lights(sample: _Sample, best: float, device: str) -> float:
     found = []
     for group in np.unique(groups):
         kept = groups != group
-        lamps = NearLamps(*(values[kept] for values in sample.lamps))
+        lamps = _Lamps(*(values[kept] for values in sample.lamps))
         part = sample._replace(readings=sample.readings[kept], usable=sample.usable[kept], lamps=lamps)
         found.append(_lowest(depths, np.array([_cost(part, depth, device).mean() for depth in depths])))
     return float((len(found) - 1) / len(found) * ((np.array(found) - np.mean(found)) ** 2).sum())
@@ -260,3 +276,31 @@ def _lowest(depths: np.ndarray, cost: np.ndarray) -> float:
     x, y = np.log(depths[at - 1:at + 2]), cost[at - 1:at + 2]
     a, b, _ = np.polyfit(x - x[1], y, 2)
     return float(x[1] + (np.clip(-b / (2 * a), x[0] - x[1], x[2] - x[1]) if a > 0 else 0.0))
+
+
+def _fit_near(readings: np.ndarray, usable: np.ndarray, lamps: _Lamps, points: np.ndarray) -> _Fit:
+    """Fit E b·l robustly to the readings of each pixel, where E is the irradiance that each light has at its point [pixels, 3].
+
+    What the fit leaves is relative to the bright readings of the pixel, which do not depend on where the point is thought to be, so that
+    places can be compared by it.
+    """
+    way = lamps.place[:, None, :3] - lamps.place[:, None, 3:] * points  # [lights, pixels, 3]
+    distance = np.maximum(np.linalg.norm(way, axis=2), 1e-12)
+    direction = way / distance[..., None]
+    shining = np.maximum(-np.einsum("lc,lpc->lp", lamps.lobe[:, :3], direction), 0) ** lamps.lobe[:, 3:]
+    irradiance = lamps.strength[:, None] * shining / np.where(lamps.place[:, 3:] == 1, distance**2, 1.0)
+    # one factor a pixel: only the ratios of the lights count
+    lit_by = direction * (irradiance / np.maximum(irradiance.mean(axis=0), 1e-300))[..., None]
+    bright = np.maximum(bright_readings(readings, usable), 1e-300)
+    relative = readings / bright
+    lit = usable & (relative > SHADOW)
+    weight = lit.astype(np.float64)
+    for _ in range(FIT_ROUNDS):
+        weighted = lit_by * weight[..., None]
+        gram = np.einsum("lpa,lpb->pab", weighted, lit_by)
+        gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-200)[:, None, None] * np.eye(3)
+        vector = np.linalg.solve(gram, np.einsum("lpa,lp->pa", weighted, relative)[:, :, None])[:, :, 0]
+        residual = np.where(lit, np.clip(relative - np.einsum("lpa,pa->lp", lit_by, vector), -LARGEST_RESIDUAL, LARGEST_RESIDUAL), 0)
+        spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
+        weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
+    return _Fit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)).T, residual, lit)

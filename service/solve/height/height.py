@@ -7,7 +7,7 @@ from scipy import ndimage
 from kernels.surface.integrate import Integration, IntegrationOptions, integrate_normals
 from kernels.surface.shadows import Projection
 from service.requests.solve import Method
-from service.solve.sharing.solution import SolveInput
+from service.solve.base.solution import SolveInput
 from stage.capture.camera import Camera
 
 OPTIONS = IntegrationOptions(discontinuities=True)
@@ -25,7 +25,6 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
     """Integrate the normals of the solved pixels.
 
     Args:
-        given: the camera and the device.
         normal: [3, pixels] float32.
         sigma: [pixels] standard errors of the normals, degrees; None: all are sure.
         stage: what the progress calls this work.
@@ -44,22 +43,13 @@ def integrate(given: SolveInput, normal: np.ndarray, solved: np.ndarray, *, sigm
 
 
 def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:
-    """Return the part of the surface whose height rests on normals that are hardly known; 0 without a surface.
-
-    Args:
-        sigma: [pixels] standard errors of the normals, degrees.
-        estimated: [rows, cols] bool, the surface.
-    """
+    """Return the part of the surface whose height rests on normals that are hardly known, by their standard errors in degrees [pixels]; 0
+    without a surface."""
     return float((sigma.reshape(estimated.shape)[estimated] > GUESSED_SIGMA).mean()) if estimated.any() else 0.0
 
 
 def height_warnings(guessed: float, method: Method) -> list[str]:
-    """Return a sentence where much of the height is a guess.
-
-    Args:
-        guessed: that part, of guessed_part.
-        method: that of the normals.
-    """
+    """Return a sentence where much of the height is a guess, by the part that guessed_part returns."""
     if guessed <= GUESSED_PART:
         return []
     cure = "try --method svbrdf, which knows highlights and metals" if method in (Method.LAMBERT, Method.ROBUST) else "try more lights"
@@ -147,11 +137,7 @@ def _around(values: np.ndarray) -> np.ndarray:
 
 
 def _fill_by_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return the mean where a height is known; elsewhere that of the smallest block of 2, 4, 8, … pixels that holds one.
-
-    Args:
-        total, count: [rows, cols] float64, sum and number of the heights known at each place; count is above 0 somewhere.
-    """
+    """Return the mean, total / count, where a height is known; elsewhere that of the smallest block of 2, 4, 8, … pixels that holds one."""
     if (count > 0).all():
         return total / count
     rows, cols = total.shape

@@ -37,7 +37,6 @@ def doubt(sigma: np.ndarray, normal: np.ndarray, height: np.ndarray, solved: np.
         normal: [rows, cols, 3] unit.
         height: [rows, cols] camera-frame z, integrated from them.
         solved: [rows, cols] bool: where there are both.
-        camera: of the image.
 
     Returns:
         [rows, cols] 0…1: 1 where the normals around a pixel are those of a surface to within sigma; below that, so that the confidence is
@@ -47,14 +46,8 @@ def doubt(sigma: np.ndarray, normal: np.ndarray, height: np.ndarray, solved: np.
 
 
 def misfit(normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the standard deviation, in degrees, of which the misfit of normals to a surface would be the trace.
-
-    Args:
-        normal, height, solved, camera: as for doubt.
-
-    Returns:
-        [rows, cols] float32; 0 where too few neighbours are solved to say.
-    """
+    """Return the standard deviation, in degrees, of which the misfit of normals to a surface would be the trace, [rows, cols] float32; 0
+    where too few neighbours are solved to say. Parameters are as for `doubt`."""
     found, reach = np.empty(height.shape, dtype=np.float32), int(REACHES * REACH) + 1
     step = max(1, BAND_PIXELS // height.shape[1])
     for first in range(0, len(height), step):
@@ -66,12 +59,7 @@ def misfit(normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: C
 
 
 def _misfit_of_rows(normal: np.ndarray, points: np.ndarray, solved: np.ndarray) -> np.ndarray:
-    """Return `misfit` of some rows; all but the outermost REACHES · REACH + 1 are those of the whole image.
-
-    Args:
-        normal, solved: as for doubt.
-        points: [rows, cols, 3] float64, camera frame.
-    """
+    """Return `misfit` of some rows, from camera-frame points; all but the outermost REACHES · REACH + 1 are those of the whole image."""
     right, left, above, below = _sides(points)
     inside = np.ones_like(solved)
     for side in _sides(solved[..., None].astype(np.float64)):

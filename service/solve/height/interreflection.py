@@ -17,8 +17,8 @@ import warp as wp
 
 from kernels.photometric.lambertian.readings import Lights
 from kernels.surface.interreflection import gather_light
+from service.solve.base.solution import SolveInput
 from service.solve.height.height import projection_of
-from service.solve.sharing.solution import SolveInput
 from stage.stack.stack import Stack
 
 PATCHES = 20_000
@@ -40,13 +40,9 @@ class ArrivingLight(NamedTuple):
     """Pixels along a side of a patch."""
 
     def at(self, rows: np.ndarray, cols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the four patches around each pixel and their bilinear shares; a missing patch gives its share to the others.
+        """Return the four patches around each of n pixels, [n, 4] int, and their bilinear shares, [n, 4] float32.
 
-        Args:
-            rows, cols: [n] pixel positions.
-
-        Returns:
-            [n, 4] int and [n, 4] float32; shares are 0 where no patch is near.
+        A missing patch gives its share to the others; shares are 0 where no patch is near.
         """
         v, u = (rows + 0.5) / self.side - 0.5, (cols + 0.5) / self.side - 0.5
         r, c = np.floor(v).astype(int), np.floor(u).astype(int)

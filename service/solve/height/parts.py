@@ -17,9 +17,9 @@ from kernels.photometric.shadows.shadow_evidence import shadow_odds
 from kernels.surface.offsets import GROUPS, Offset, choose_offset, march_part, weigh_offsets
 from kernels.surface.shadows import Projection
 from kernels.surface.slopes import STEEPEST
+from service.solve.base.batches import View, pick_pixels, view_directions
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.height import mean_height, projection_of
-from service.solve.sharing.batches import View, pick_pixels, view_directions
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour import GREY_WEIGHTS
 
@@ -118,7 +118,6 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
 
     Args:
         normal: [3, pixels] float32.
-        material: of every pixel.
         height: [rows, cols] float32, camera-frame z, 0 outside.
         part: [rows, cols] int, the part of each pixel, -1 outside.
     """
@@ -152,11 +151,7 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
 
 
 def place_solution(given: SolveInput, lights: DistantLights, solution: Solution) -> Placement | None:
-    """Return the surface of a solution with its parts in depth, or None where there is none.
-
-    Args:
-        solution: with a height.
-    """
+    """Return the surface of a solution with its parts in depth, or None where it has no height or no parts."""
     if solution.integration is None or solution.height is None or solution.integration.part is None:
         return None
     given.timings.stage("parts", 1)

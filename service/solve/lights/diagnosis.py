@@ -11,10 +11,9 @@ import numpy as np
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
-from service.light_estimation.explanations import PIXELS, Cause, Sample, better_explanation, fit_manifest
-from service.light_estimation.sentences import explanation_sentence
+from service.light_estimation.explanations import PIXELS, Cause, Sample, better_explanation, explanation_sentence, fit_manifest
+from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, suspect_lights
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
-from service.solve.sharing.solution import PIXELS_AT_ONCE, Solution, SolveInput, suspect_lights
 from stage.capture.capture import Capture
 from stage.capture.extended_lights import ExtendedLights
 from stage.capture.gradients import GradientFrames
@@ -34,7 +33,6 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
     Args:
         lights: the lights with which the normals were solved; readings are examined under distant ones.
         declared: the lights of the manifest, which may have other intensities.
-        solution: its warnings, standard errors, confidence and suspect lights are changed.
     """
     field = FIELDS.get(type(lights), "the capture of the reference ball")
     fit = None
@@ -76,12 +74,8 @@ def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sampl
 
 
 def raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
-    """Add an independent error to the standard error of every normal; the confidence falls as 1 / (1 + standard error / 1°).
-
-    Args:
-        solution: its standard errors and confidence are changed.
-        degrees: the error of all normals, or [pixels] of each.
-    """
+    """Add an independent error, of all normals or [pixels] of each, to their standard error; the confidence falls as
+    1 / (1 + standard error / 1°)."""
     before = solution.standard_error()
     after = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before)
     solution.confidence = (solution.confidence.astype(np.float32) * (1 + before) / (1 + after)).astype(np.float16)

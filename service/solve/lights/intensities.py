@@ -20,7 +20,7 @@ from kernels.photometric.search.untold_factors import untold
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import fit_lambertian
 from service.light_estimation.semi_calibrated import fit_grey_intensities
-from service.solve.sharing.solution import SolveInput
+from service.solve.base.solution import SolveInput
 from stage.capture.point_lights import DistantLights
 from stage.errors import CalibrationError
 

@@ -1,8 +1,8 @@
 """Test whether the axes of the lights are those of the camera, from the surface that was solved with them.
 
 Mirrored or turned lights explain the images as well as the right ones. What tells them apart: a visible surface faces the camera, its
-slopes are those of one height (service.light_estimation.axes), and the outline and the cast shadows of what is not hollow
-(service.light_estimation.object_outline).
+slopes are those of one height (service.solve.lights.axes), and the outline and the cast shadows of what is not hollow
+(service.solve.lights.object_outline).
 """
 
 from typing import NamedTuple
@@ -12,11 +12,11 @@ import numpy as np
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
-from service.light_estimation.axes import Axes, sites, wrong_axes
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import Fit, fit_lambertian, median_of
-from service.light_estimation.object_outline import EDGE, Outline, cast_shadows, outline
-from service.solve.sharing.solution import Solution, SolveInput
+from service.solve.base.solution import Solution, SolveInput
+from service.solve.lights.axes import Axes, sites, wrong_axes
+from service.solve.lights.object_outline import EDGE, Outline, cast_shadows, outline
 from stage.capture.camera import Camera
 from stage.capture.point_lights import DistantLights
 
@@ -87,11 +87,8 @@ def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | Non
 
 
 def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights | None) -> LightAxes | None:
-    """Say whether the surface is inverted, as by lights that are turned by 180 degrees about the view axis.
-
-    Args:
-        lights: the distant lights; None: other lights, whose shadows are not compared.
-    """
+    """Say whether the surface is inverted, as by lights that are turned by 180 degrees about the view axis; shadows are compared under
+    distant lights alone."""
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
     if not estimated.any():
         return None
@@ -114,10 +111,7 @@ def find_inversion(given: SolveInput, solution: Solution, lights: DistantLights 
 def _is_inverted(shadows: "_Shadows", many: bool, *, alone: bool) -> bool | None:
     """Return whether cast shadows say that a surface is inverted; None where they do not decide.
 
-    Args:
-        shadows: of the surface and its inverse.
-        many: whether there are enough lights for the first to contradict the surface.
-        alone: whether there is no outline that speaks for the inversion.
+    Many lights can contradict the surface by its own shadows; `alone`, no outline speaks for the inversion.
     """
     count, lit = shadows.of_surface()
     if count < (LEAST_SHADOWS_ALONE if alone else LEAST_SHADOWS):

@@ -6,11 +6,11 @@ import numpy as np
 
 from kernels.photometric.model.samples import evenly
 from service.errors import RequestError
-from service.light_estimation.bas_relief import Relief, resolve_relief
-from service.light_estimation.factorisation import factorise, fit_surface, integrable
-from service.light_estimation.object_outline import outline
+from service.solve.base.solution import PIXELS_AT_ONCE, SolveInput
+from service.solve.lights.bas_relief import Relief, resolve_relief
+from service.solve.lights.factorisation import factorise, fit_surface, integrable
+from service.solve.lights.object_outline import outline
 from service.solve.lights.orientation import INVERSE
-from service.solve.sharing.solution import PIXELS_AT_ONCE, SolveInput
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError
@@ -47,11 +47,7 @@ class UnknownLights(NamedTuple):
     warnings: tuple[str, ...]
 
     def doubt(self, normal: np.ndarray) -> np.ndarray:
-        """Return the standard error of normals for not knowing the lights, [pixels] degrees.
-
-        Args:
-            normal: [3, pixels] unit.
-        """
+        """Return the standard error of normals [3, pixels] for not knowing the lights, [pixels] degrees."""
         squares = np.full(normal.shape[1], self.least_degrees**2)
         for first in range(0, len(squares), PIXELS_AT_ONCE):
             part = normal[:, first : first + PIXELS_AT_ONCE]
@@ -64,12 +60,7 @@ class UnknownLights(NamedTuple):
 
 
 def find_lights(given: SolveInput) -> UnknownLights:
-    """Find the lights of a capture from its images.
-
-    Raises:
-        RequestError: the camera is perspective, or there are too few lights.
-        CalibrationError: the images do not determine the lights.
-    """
+    """Find the lights of a capture from its images, which an orthographic camera took."""
     count = given.stack.light_count
     if given.camera.projection != "orthographic":
         raise RequestError("--lights unknown: needs an orthographic camera: declare one if the object is far away against its size")

@@ -4,16 +4,23 @@ from collections.abc import Callable
 
 import numpy as np
 
+from kernels import packs
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit
-from kernels.photometric.lambertian.near import NearField
-from kernels.photometric.lambertian.readings import Lights
-from kernels.photometric.model.misfit import uncertainty_of
+from kernels.photometric.lambertian.near import NearField, see_near
+from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
+from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit, uncertainty_of
+from kernels.photometric.model.samples import evenly
 from kernels.status import Status
-from service.solve.methods.misfit import object_misfit
-from service.solve.sharing.batches import ReadBand, each_band
+from service.solve.base.batches import ReadBand, each_band
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import Solution, SolveInput
+from stage.colour.colour import GREY_WEIGHTS
+
+PAIRS = 1024
+"""Number of pairs, spread over the object."""
+APART = 2
+"""Pixels from the first to the second of a pair, in a row: the noise of neighbours is alike where colours are interpolated."""
 
 
 def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Solution:
@@ -25,7 +32,7 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
     result.sigma = np.zeros(given.stack.pixel_count, np.float16)
-    misfit = object_misfit(given, lights, field, fit_normals=fit_normals)
+    misfit = _object_misfit(given, lights, field, fit_normals=fit_normals)
     sigma = result.sigma
 
     def solve(read: ReadBand) -> None:
@@ -42,3 +49,36 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     each_band(given, lights, field, solve,
               Results((result.normal, result.albedo, result.confidence, result.residual, result.status, sigma), misfit))
     return result
+
+
+def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Misfit:
+    """Return the misfit of an object, from fits to pairs of its pixels.
+
+    Args:
+        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
+    """
+    first = np.zeros(given.mask.shape, dtype=bool)
+    first[:, :-APART] = given.mask[:, :-APART] & given.mask[:, APART:]
+    start = np.flatnonzero(first)
+    if not len(start):
+        return Misfit()
+    start = start[evenly(len(start), PAIRS)]
+    pixels = np.concatenate([start, start + APART])
+    band = packs.upload(*given.stack.pick(pixels), device=given.device)
+    readings = grey_readings(band, grey_factors(lights, GREY_WEIGHTS))
+    near = None if field is None else see_near(band, readings, field.at(pixels))
+    values = readings.on_host(readings.values, len(pixels))
+    fit = fit_normals(band, readings, lights.direction, near)
+    if near is None:
+        toward = np.broadcast_to(lights.direction.T[:, :, None], (3, *values.shape))
+    else:
+        toward = readings.on_host(near.toward, len(pixels))
+    solved = (fit.status.numpy()[: len(pixels)] == Status.OK).reshape(2, -1).all(axis=0)
+    # the fit has put its weights in place of the values
+    weights = readings.on_host(readings.values, len(pixels))
+
+    def pairs(array: np.ndarray) -> np.ndarray:
+        return array[..., : len(pixels)].reshape(*array.shape[:-1], 2, -1)[..., solved]
+
+    return measure_misfit(PairFits(pairs(values), pairs(weights), np.moveaxis(pairs(toward), 0, 1), pairs(fit.normal.numpy()),
+                                   pairs(fit.squares.numpy()), pairs(fit.freedom.numpy())))

@@ -18,10 +18,10 @@ from kernels.photometric.reference.modes import GRID_FLOATS, angle_degrees
 from kernels.photometric.reference.sampling import Found, Regime, SamplingTables, sampling_tables, search_sampling, solve_sampling
 from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
+from service.solve.base.batches import Batch, View, each_batch, readable, view_directions
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.open_sources import OpenSources, open_sources
-from service.solve.sharing.batches import Batch, View, each_batch, readable, view_directions
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.capture.camera import Camera
 from stage.capture.extended_lights import ExtendedLights
 

@@ -15,9 +15,9 @@ from kernels.photometric.gradient.highlight import fit_highlights, specular_norm
 from kernels.photometric.gradient.moments import Moments, fit_moments
 from kernels.photometric.gradient.separation import separate_by_colour, separate_polarised
 from kernels.status import Status
-from service.solve.sharing.batches import each_span, view_directions
+from service.solve.base.batches import each_span, view_directions
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.capture.camera import Camera
 from stage.capture.gradients import GradientFrames
 from stage.colour.colour import GREY_WEIGHTS
@@ -34,11 +34,7 @@ METAL_CONFIDENCE = 0.2
 
 
 def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
-    """Solve every pixel of the mask from gradient frames.
-
-    Args:
-        frames: which frames of the stack measure what.
-    """
+    """Solve every pixel of the mask from gradient frames."""
     stack, inside = given.stack, given.mask.reshape(-1)
     given.timings.stage("normals", stack.shape[2])
     pixels = stack.pixel_count
@@ -152,14 +148,9 @@ LEAST = 3
 
 
 def neighbours_doubt(doubt: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Return the largest doubt in the neighbourhood of each pixel that LEAST pixels beside each other share.
+    """Return the largest doubt in the neighbourhood of each pixel that LEAST pixels beside each other share, [rows, cols] float32.
 
-    Args:
-        doubt: [rows, cols] not negative, 0 outside the mask.
-        inside: [rows, cols] bool, the mask.
-
-    Returns:
-        [rows, cols] float32, at least `doubt`; 0 outside the mask.
+    It is `doubt` at least, which is not negative, and 0 outside the mask.
     """
     if not inside.any():
         return np.zeros(doubt.shape, np.float32)

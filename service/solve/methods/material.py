@@ -27,13 +27,13 @@ from kernels.photometric.search.survey import QUICK
 from kernels.photometric.shadows.bounce import bounce_albedo
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
+from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.parts import Material
 from service.solve.methods.settling import settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
-from service.solve.sharing.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.colour.colour import GREY_WEIGHTS
 
 SPREAD_PIXELS = 384
@@ -76,11 +76,7 @@ WHOLE_SOLVER = MaterialOptions()
 
 def solve_material(given: SolveInput, lights: Lights, field: NearField | None = None,
                    options: MaterialOptions = WHOLE_SOLVER) -> Solution:
-    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness.
-
-    Args:
-        options: the steps that are left out.
-    """
+    """Solve every pixel of the mask for normal, diffuse albedo, F0 and roughness."""
     walk = _Walk(given, lights, field, options)
     walk.start()
     walk.choose_shape()
@@ -91,12 +87,8 @@ def solve_material(given: SolveInput, lights: Lights, field: NearField | None = 
 
 
 def refine_material(given: SolveInput, lights: Lights, field: NearField, before: Solution) -> Solution:
-    """Solve again from a solution: shadows and interreflection follow from its surface, and no first search is needed.
-
-    Args:
-        field: where the lights are, and the surface point of each pixel.
-        before: of `solve_material`, or of this function.
-    """
+    """Solve again from a solution of `solve_material`, or of this function: shadows and interreflection follow from its surface, and no
+    first search is needed."""
     walk = _Walk(given, lights, field, WHOLE_SOLVER)
     walk.start()
     walk.resume(before)
@@ -149,11 +141,7 @@ class _Walk:
         self._bouncing[:, solved] = before.albedo[:, solved]
 
     def choose_shape(self, light: DirectLight | None = None) -> None:
-        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all.
-
-        Args:
-            light: what the object does to its own light, as far as it is known.
-        """
+        """Choose the shape of the diffuse lobe, and find out whether few lights support the lobes at all."""
         self._given.timings.stage("shape", 1)
         if not len(self._spread):
             return
@@ -256,8 +244,7 @@ class _Walk:
             light_on[samples.device].keep(pixels, samples)
             roughness = self._roughness[pixels].astype(np.float32) if self._interreflection else None
             found = solve_svbrdf(samples, result.normal[:, pixels].T, shape=self._shape, lobe=self._lobe, shared=materials,
-                                 pairs=self._pairs,
-                                 metals=self._metals, roughness=roughness, prior=self._prior(pixels),
+                                 pairs=self._pairs, metals=self._metals, roughness=roughness, prior=self._prior(pixels),
                                  beside=self._beside(pixels))
             result.normal[:, pixels] = found.normal.T
             material = fit_given(samples, found.normal, MATT, shape=self._lobe) if self._matt else found

@@ -9,10 +9,10 @@ from kernels.photometric.lambertian.near import NearField
 from kernels.photometric.lambertian.readings import Lights, pad_lights
 from kernels.photometric.lambertian.robust import solve_robust
 from service.requests.solve import SVBRDF_LIGHTS, Method
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.diffuse import solve_diffuse
 from service.solve.methods.near import MATERIAL_ROUNDS, NormalSolver, Rounds, solve_near
 from service.solve.methods.reference_ball import ReferenceBall, reference_ball
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.capture.capture import Capture
 from stage.capture.extended_lights import ExtendedLights
 from stage.capture.gradients import GradientFrames, gradient_frames, has_gradients

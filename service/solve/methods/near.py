@@ -15,8 +15,8 @@ from kernels.photometric.lambertian.near import NearField, pad_places
 from kernels.photometric.lambertian.readings import Lights, pad_lights
 from kernels.status import Status
 from service.requests.solve import Method
+from service.solve.base.solution import Solution, SolveInput, mark_not_facing
 from service.solve.height.height import integrate, mean_height, whole_surface
-from service.solve.sharing.solution import Solution, SolveInput, mark_not_facing
 from stage.capture.point_lights import PlacedLights
 
 SETTLED = 1e-3
@@ -55,7 +55,6 @@ def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Roun
     """Solve every pixel of the mask under lights of which some are near, and its height with it.
 
     Args:
-        lights: lights of the stack, distant and near.
         series: the rounds of each solver; a solver begins with the surface on which the one before it has settled.
 
     Returns:

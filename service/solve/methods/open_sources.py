@@ -21,11 +21,11 @@ from kernels.photometric.shadows.bounce import subtract_bounce
 from kernels.photometric.shadows.shadowing import LEAST_PART, divide_by_visible
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.status import Status
+from service.solve.base.batches import View
+from service.solve.base.solution import SolveInput
 from service.solve.height.direct_light import LARGEST_ALBEDO
 from service.solve.height.height import integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
-from service.solve.sharing.batches import View
-from service.solve.sharing.solution import SolveInput
 from stage.capture.extended_lights import ExtendedLights
 from stage.colour.colour import GREY_WEIGHTS
 from stage.transforms import fibonacci_sphere
@@ -66,12 +66,8 @@ class OpenSources(NamedTuple):
         return np.maximum((self.part >= 255 * LEAST_PART).mean(axis=1), 1 / self.part.shape[1])
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
-        """Subtract from readings what the object threw on itself, and divide them by the visible part of their source.
-
-        Args:
-            pixels: [m] ascending row-major positions in the image; those that are not touched keep their readings.
-            samples: their readings; changed in place.
-        """
+        """Subtract from readings, in place, what the object threw on itself, and divide them by the visible part of their source; those of
+        pixels that are not touched stay."""
         row = np.minimum(np.searchsorted(self.touched, pixels), len(self.touched) - 1)
         changed = self.touched[row] == pixels
         if self.arriving is not None:
@@ -89,7 +85,6 @@ def open_sources(given: SolveInput, lights: ExtendedLights, padded: Lights, stat
         padded: the lights, padded, with their irradiance.
         status: [pixels] of kernels.status.
         found: normals and materials of all pixels of the image.
-        view: directions to the viewer.
     """
     solved = (status == Status.OK).reshape(given.mask.shape)
     surface = integrate(given, np.ascontiguousarray(found.normal.T), solved, stage="surface")

@@ -21,10 +21,10 @@ from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.hypotheses import Diffuse
 from kernels.status import ESTIMATED
-from service.light_estimation.pairs import PairFindings, examine_pairs
-from service.solve.sharing.batches import Batch, each_batch, pick_pixels, view_directions
+from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
+from service.solve.base.solution import SeparatedPairs, Solution, SolveInput
+from service.solve.methods.pairs import PairFindings, examine_pairs
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import SeparatedPairs, Solution, SolveInput
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.manifest import FILE_NAME
@@ -57,12 +57,6 @@ class Separated(NamedTuple):
 def separate_pairs(stack: Stack, capture: Capture, lights: DistantLights | PlacedLights, mask: np.ndarray) -> Separated:
     """Take the images of polarised pairs apart.
 
-    Args:
-        stack: of all images.
-        capture: their manifest.
-        lights: of all images.
-        mask: [rows, cols] bool, the object.
-
     Raises:
         ManifestError: the images of a pair are swapped, shifted, or not of the same light; names them.
     """
@@ -82,15 +76,9 @@ def separate_pairs(stack: Stack, capture: Capture, lights: DistantLights | Place
     return Separated(diffuse, kept, SeparatedPairs(part(Component.SPECULAR), part(Component.WHOLE), facts, _leak_warnings(leak, found)))
 
 
-def solve_pairs(given: SolveInput, lights: Lights, field: NearField | None, diffuse: Solution,
-                solver: Any) -> Solution:
-    """Complete what was solved from diffuse images: specular lobes from the specular ones, and metals from the sum.
-
-    Args:
-        given: the diffuse images, and the others as its `pairs`.
-        diffuse: solution of the diffuse images; completed in place.
-        solver: `solve_material`, which solves the sums at metals.
-    """
+def solve_pairs(given: SolveInput, lights: Lights, field: NearField | None, diffuse: Solution, solver: Any) -> Solution:
+    """Complete in place what was solved from diffuse images: specular lobes from the specular ones, and metals from the sum, by `solver`,
+    which is `solve_material`."""
     pairs = given.pairs
     assert pairs is not None
     diffuse.abundance = diffuse.pair = diffuse.pairs = None

@@ -16,17 +16,17 @@ import warp as wp
 from kernels.errors import ArrayError
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.misfit import LARGEST_ERROR
-from kernels.photometric.model.response_table import GRID, SEARCH_LOBES, nodes
+from kernels.photometric.model.response_table import SEARCH_LOBES, nodes
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.reference.modes import GRID_FLOATS, find_modes, weigh
 from kernels.photometric.reference.posterior import Group, bounded, measure_noise, normal_posterior
 from kernels.photometric.reference.sampling import AROUND, AROUND_OPTIONS, FINE, OPTIONS
 from kernels.photometric.search.hypotheses import Diffuse, search_normals
 from kernels.status import Status
+from service.solve.base.batches import Batch, each_batch, readable, view_directions
+from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.reference_ball import ReferenceBall
-from service.solve.sharing.batches import Batch, each_batch, readable, view_directions
 from service.solve.sharing.sharing import Results
-from service.solve.sharing.solution import Solution, SolveInput
 from stage.colour.colour import GREY_WEIGHTS
 from stage.stack.ingest import open_stack
 from stage.stack.stack import Stack
@@ -42,37 +42,12 @@ class ReferenceFit(NamedTuple):
     excess: np.ndarray  # [n] float32: the square of what the ball leaves unexplained over the noise of the object's readings
 
 
-def reference_table(readings: np.ndarray, device: str) -> wp.array:
-    """Return a table of the readings of the ball at each of response_table.nodes.
-
-    Args:
-        readings: [GRID², lights] not negative.
-
-    Returns:
-        [GRID², lights, 1] float32 on the device.
-
-    Raises:
-        ArrayError: readings at other nodes, or none above zero.
-    """
-    if readings.ndim != 2 or len(readings) != GRID * GRID:
-        raise ArrayError(f"readings are {readings.shape}: give one row for each of the {GRID * GRID} nodes")
-    if not (readings >= 0).all() or not readings.any():
-        raise ArrayError("readings of the ball must not be negative, and some must be above zero")
-    return wp.array(readings[..., None], dtype=wp.float32, device=device)
-
-
 def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> ReferenceFit:
-    """Estimate the normals of sampled pixels.
+    """Estimate the normals of sampled pixels, whose readings are in the units of the ball's; waits for the device.
 
     Args:
-        samples: their readings, in the units of the ball's.
+        table: [nodes, lights, 1] float32, the readings of the ball at each of response_table.nodes.
         view: [n, 3] unit directions to the viewer.
-
-    Returns:
-        The fit. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     model = bounded(table, samples)
     starts = find_modes(samples, model, view)
@@ -95,18 +70,16 @@ right ball under noise of 0 to 10 %, 1.3 with a metal ball whose roughness is 0.
 
 
 def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
-    """Solve every pixel of the mask for its normal alone.
-
-    Args:
-        ball: the ball under the same lights.
-    """
+    """Solve every pixel of the mask for its normal alone, from a ball under the same lights."""
     stack, timings, count = given.stack, given.timings, given.stack.light_count
     timings.stage("reference", count)
     ball_stack = open_stack(ball.capture, cache=None if given.cache is None else given.cache / CACHE_FOLDER,
                             progress=lambda done, _: timings.advance(done))
     readings = ball_readings(ball_stack, ball)
     strength = np.maximum(readings.mean(axis=0), 1e-20)  # lights in units of what the ball returns on average
-    tables = {device: reference_table(readings / strength, device) for device in given.devices}
+    if not readings.any():
+        raise ArrayError("readings of the ball must not be negative, and some must be above zero")
+    tables = {device: wp.array((readings / strength)[..., None], dtype=wp.float32, device=device) for device in given.devices}
     padded = pad_lights(np.tile([0.0, 0.0, 1.0], (count, 1)), np.repeat(strength[:, None], 3, axis=1), stack.scale)
     view = view_directions(given.camera)
     inside = np.flatnonzero(given.mask.reshape(-1))

@@ -49,11 +49,7 @@ class ReferenceBall(NamedTuple):
 
 
 def reference_ball(capture: Capture, reference: Capture) -> ReferenceBall:
-    """Check that a capture of a reference ball fits a capture, and find the ball in it.
-
-    Args:
-        capture: the capture that is solved.
-        reference: the capture of the ball.
+    """Check that the capture of a reference ball fits the capture that is solved, and find the ball in it.
 
     Raises:
         ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is

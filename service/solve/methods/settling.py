@@ -132,13 +132,7 @@ def fit_albedo_scale(ratio: np.ndarray, arriving: np.ndarray, cosine: np.ndarray
 
 
 def _variance(score: np.ndarray, inverse: np.ndarray, label: np.ndarray) -> float:
-    """Return the variance of the scale where readings of one label err alike.
-
-    Args:
-        score: [readings, 2] derivatives of the cost.
-        inverse: [2, 2] of the normal equations.
-        label: [readings] int.
-    """
+    """Return the variance of the scale where readings of one label err alike; `score` [readings, 2] are derivatives of the cost."""
     numbers = np.unique(label, return_inverse=True)[1]
     sums = np.stack([np.bincount(numbers, weights=column) for column in score.T], axis=1)
     count = len(sums)
@@ -180,8 +174,7 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
     """Find the light that an object throws on itself from the surface without it.
 
     Args:
-        light: of the first search, with arriving light.
-        normal: [3, pixels] of the first search.
+        light: of the first search, with arriving light, as `normal` [3, pixels] is.
         pick: gives the readings of a few pixels by their positions.
         relative: whether the scale of the lights, and so of albedo, is unknown.
     """
@@ -206,12 +199,7 @@ def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callabl
 
 
 def _blocks(pixels: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return [n] the number of the square block that each pixel lies in, and [blocks] the pixel of each that is nearest its middle.
-
-    Args:
-        pixels: [n] row-major positions in the image, one or more.
-        width: of the image.
-    """
+    """Return [n] the number of the square block that each pixel lies in, and [blocks] the pixel of each that is nearest its middle."""
     side = max(1, math.ceil(math.sqrt(len(pixels) / BLOCKS)))
     rows, cols = np.divmod(pixels, width)
     number = rows // side * width + cols // side

@@ -15,7 +15,7 @@ from kernels.photometric.model.samples import Samples, device_values, host_value
 from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
-from service.solve.sharing.solution import Solution
+from service.solve.base.solution import Solution
 
 PARTS = 12
 """Number of parts into which the lights are divided, each left out once; fewer lights are left out singly."""
@@ -43,9 +43,6 @@ def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     Args:
         samples: some hundreds of pixels, spread over the object, under four lights or more.
         start: [n, 3] unit normals to begin from.
-
-    Returns:
-        Costs of both predictions. Waits for the device.
     """
     lights = samples.light_count
     readings = host_values(samples, samples.grey).astype(np.float64)
@@ -90,13 +87,7 @@ its normals are better, real and path-traced, 0.9 and above where they follow er
 
 
 def supports_lobes(result: Solution, samples: Samples, start: np.ndarray) -> bool:
-    """Return whether few lights support the general solver, and say in the solution what speaks against it.
-
-    Args:
-        result: whose facts and warnings are added to.
-        samples: some hundreds of pixels, spread over the object.
-        start: [n, 3] unit normals to begin from.
-    """
+    """Return whether few lights support the general solver, and say in the solution what speaks against it; parameters as of leave_out."""
     count = samples.light_count
     fallback = ("normals are drawn to those of lambert and no specular lobe is estimated; capture 32 lights or more, "
                 "spread over the hemisphere, or take --method robust")

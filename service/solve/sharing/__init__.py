@@ -1,1 +1,1 @@
-"""Batches of pixels over devices and workers, and the solution that they fill."""
+"""The pieces of a solve over devices and workers."""

@@ -28,7 +28,6 @@ def agree(store: PieceStore, name: str, follows_from: str, *, leads: bool, is_be
     """Record what a pass over the pieces follows from, or compare it with what the worker that leads has recorded.
 
     Args:
-        store: that of all workers.
         name: of the pass.
         follows_from: a digest of all that the pass follows from.
         leads: whether this worker has the job.

@@ -80,10 +80,7 @@ class SharedSolve:
     """The part of one worker in a solve."""
 
     def __init__(self, store: PieceStore, *, leads: bool, invite: Callable[[int], None] = lambda pieces: None) -> None:
-        """Create the part of a worker.
-
-        Args:
-            store: that of all workers.
+        """Args:
             leads: whether this worker has the job; it alone says what a pass follows from.
             invite: called with the number of pieces before each pass that can be shared.
         """
@@ -102,10 +99,6 @@ class SharedSolve:
             names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
             waiting: called now and then while pieces of other workers are waited for.
             pixels_of: returns the place of a piece on the last axis of the arrays.
-            results: where the work stores what it finds.
-
-        Raises:
-            DivergedError: this worker does not lead, and the pass follows from something else than that of the worker that leads.
         """
         self._passes += 1
         if len(pieces) < LEAST_PIECES:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import service
+from service.relight.opened_capture import open_capture
 from service.relight.outputs import RESOLVED, frame_hashes
 from service.relight.plan import make_plan
-from service.relight.sequence import open_capture
 from service.requests.base.base import Role
 from service.requests.base.options import role_of
 from service.requests.relight import RelightRequest

@@ -64,7 +64,7 @@ def test_one_capture_is_open_at_a_time(relit, sequence, tmp_path, monkeypatch):
         return open_capture(path, *choices)
 
     open_capture = Capture.open
-    monkeypatch.setattr("service.relight.sequence.Capture.open", opened)
+    monkeypatch.setattr("service.relight.opened_capture.Capture.open", opened)
     assert relit("relight", sequence, "--environment", tmp_path / "sky.exr", "--out", tmp_path / "f" / "a.##.exr").code == 0
     assert written[0] == 0 and len(written) == 3 and written[2] >= 1
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service.light_estimation.pairs import examine_pairs
+from service.solve.methods.pairs import examine_pairs
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights, has_placeholders
 from stage.capture.polarised_pairs import Component

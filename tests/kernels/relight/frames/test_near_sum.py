@@ -9,7 +9,8 @@ from kernels.relight.frames.near_sum import sum_near
 from kernels.relight.model import sources
 from kernels.relight.model.captured import Captured
 from service.relight.weights.triangulation import triangles_between, triangulate_sphere
-from service.relight.weights.weighting import Weighting, integrate_discs
+from service.relight.weights.weighting import integrate_discs
+from service.requests.relight import LightWeights
 from tests.kernels.relight.lights import AXES, CUBE, icosahedron, ring, scattered, turn
 from tests.kernels.relight.surfaces import FLOAT, LOBE, pack_bytes, scattered_pixels, stored, upload
 from tests.kernels.scenes import cap, colours, store
@@ -84,7 +85,7 @@ def test_a_light_far_away_is_shared_out_as_smooth_weighting_does(direction, devi
     places, a millionth of the distance, and the thousandth of an imaginary light that goes to others."""
     holes = len(triangulate_sphere(direction).vertex) > len(direction)
     pixels, readings, toward = scattered_pixels(3), images(direction, 3, seed=2), scattered(14, 6)
-    shares = integrate_discs(toward, np.zeros(14), direction, weighting=Weighting.SMOOTH)
+    shares = integrate_discs(toward, np.zeros(14), direction, weighting=LightWeights.SMOOTH)
     for i, share in enumerate(shares):
         given = (sources.point(1e6 * toward[i], 1e12 * np.array([1, 2, 3])) if i % 2 else
                  sources.far(toward[[i]], np.array([[1, 2, 3.0]])))

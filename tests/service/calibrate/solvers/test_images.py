@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from service.calibrate.solvers.flat_field import make_flat, mean_image, recorded_values
-from service.calibrate.solvers.saturation import ChannelSaturation, TopHistogram, capture_saturation
+from service.calibrate.images import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr

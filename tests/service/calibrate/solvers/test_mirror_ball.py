@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.calibrate.solvers.mirror_ball import SpotOptions, find_spot
+from service.calibrate.solvers.mirror_ball import find_spot
 from service.light_estimation.ball import Ball, project, view_ball
 from service.light_estimation.ball_outline import ball_from_mask
 from stage.errors import CalibrationError
@@ -82,7 +82,7 @@ def test_the_noise_of_a_ball_is_no_part_of_the_spot():
     direction = unit(0.2, 0.1, 1)
     image, _ = seen(mirror_of_far(direction, degrees=3, floor=0.05), geometry)
     noisy = image + 0.02 * np.random.default_rng(3).standard_normal(image.shape)
-    spot = find_spot(box(noisy, view), None, ball, view, SpotOptions(level=0.01))
+    spot = find_spot(box(noisy, view), None, ball, view, level=0.01)
     assert spot.pixels < 60 and angles_degrees(spot.direction, direction) < 0.2
 
 

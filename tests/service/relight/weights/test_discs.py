@@ -5,12 +5,13 @@ import pytest
 
 from kernels.errors import ArrayError
 from kernels.relight.model.sources import disc_samples
-from service.relight.weights.weighting import Weighting, integrate, integrate_discs
+from service.relight.weights.weighting import integrate, integrate_discs
+from service.requests.relight import LightWeights
 from tests.reference.relight import texel_directions, texel_solid_angles
 
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 """Six lights whose cells are the faces of a cube."""
-BOTH = pytest.mark.parametrize("weighting", list(Weighting))
+BOTH = pytest.mark.parametrize("weighting", list(LightWeights))
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.53, 10.0, 90.0, 180.0])
@@ -77,7 +78,7 @@ def test_a_disc_that_moves_changes_lights_without_a_jump(weighting):
 ])
 def test_bad_calls(middles, angles, directions, words):
     with pytest.raises(ArrayError, match=words):
-        integrate_discs(middles, angles, directions, weighting=Weighting.CELLS)
+        integrate_discs(middles, angles, directions, weighting=LightWeights.CELLS)
 
 
 def test_the_lat_long_map_of_the_reference_has_the_axes_of_openexr():

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from kernels.relight.directions.latlong import shared_turns
-from service.relight.weights.weighting import Weighting, integrate
+from service.relight.weights.weighting import integrate
+from service.requests.relight import LightWeights
 from stage.transforms import rotation_about, rotation_about_y
 from tests.kernels.scenes import cap
 
@@ -31,7 +32,7 @@ def test_turns_by_whole_columns_are_found_once(rotations, searches):
             assert np.allclose(rotation_about_y(columns * 0.5) @ turn.rotation, rotations[frame], atol=1e-8)
 
 
-@pytest.mark.parametrize("weighting", list(Weighting))
+@pytest.mark.parametrize("weighting", list(LightWeights))
 def test_shared_turns_give_the_sums_of_single_ones(weighting, device):
     rotations, lights = spin(48), cap(40, 180)
     whole = integrate(SKY, lights, rotations, weighting=weighting, device=device)

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from kernels.errors import ArrayError
 from kernels.relight.weights.cells import integrate_cells
 from service.relight.weights.quadrature import integrate_kernel
-from service.relight.weights.weighting import Weighting, integrate, light_weights
+from service.relight.weights.weighting import integrate, light_weights
+from service.requests.relight import LightWeights
 from tests.kernels.relight.lights import AXES, STILL, turn
 from tests.kernels.scenes import cap
 from tests.reference.relight import texel_solid_angles
@@ -14,7 +15,7 @@ from tests.reference.relight import texel_solid_angles
 
 def test_the_weightings_differ_and_agree_in_sum(device):
     environment = np.random.default_rng(0).random((9, 18, 3))
-    kernel, cells, smooth = (integrate(environment, cap(20, 180), STILL, weighting=w, device=device)[0] for w in Weighting)
+    kernel, cells, smooth = (integrate(environment, cap(20, 180), STILL, weighting=w, device=device)[0] for w in LightWeights)
     np.testing.assert_array_equal(kernel, integrate_kernel(environment, cap(20, 180), STILL)[0])
     np.testing.assert_array_equal(cells, integrate_cells(environment, cap(20, 180), STILL, device=device).energy[0])
     for one, other in ((kernel, cells), (cells, smooth), (smooth, kernel)):
@@ -23,7 +24,7 @@ def test_the_weightings_differ_and_agree_in_sum(device):
 
 
 @settings(max_examples=15, deadline=None)
-@given(count=st.integers(4, 20), seed=st.integers(0, 100), weighting=st.sampled_from(Weighting))
+@given(count=st.integers(4, 20), seed=st.integers(0, 100), weighting=st.sampled_from(LightWeights))
 def test_weights_place_the_whole_energy(count, seed, weighting):
     """Σ w E = ∫ L dω in each channel, whatever the lights' colours and the scales of their images."""
     rng = np.random.default_rng(seed)
@@ -52,7 +53,7 @@ def spotted(value, count):
     return environment
 
 
-@pytest.mark.parametrize("weighting", Weighting)
+@pytest.mark.parametrize("weighting", LightWeights)
 @pytest.mark.parametrize("environment, directions, rotations, message", [
     (np.ones((4, 8)), AXES, STILL, r"environment is \(4, 8\): give \[rows, cols, 3\]"),
     (np.ones((4, 8, 4)), AXES, STILL, r"environment is \(4, 8, 4\)"),

@@ -15,7 +15,7 @@ from service.requests.jobs import SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
 from service.server.database import jobs, workers
 from service.server.storage import layout
-from service.solve.sharing import batches
+from service.solve.base import batches
 from service.solve.solve import solve
 from stage.stack import stack
 from tests.scenes.captures import make_scene, write_capture, write_exr

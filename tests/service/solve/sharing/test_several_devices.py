@@ -10,8 +10,8 @@ import pytest
 from kernels import device as devices
 from kernels.errors import DeviceError
 from service.requests.solve import SolveRequest
+from service.solve.base import batches
 from service.solve.methods import material
-from service.solve.sharing import batches
 from service.solve.sharing.sharing import deal
 from service.solve.solve import solve
 from stage.stack import stack

@@ -9,7 +9,8 @@ import pytest
 
 from service.errors import DivergedError
 from service.requests.solve import SolveRequest
-from service.solve.sharing import batches, sharing
+from service.solve.base import batches
+from service.solve.sharing import sharing
 from service.solve.sharing.sharing import Results, SharedSolve, digest
 from service.solve.solve import help_solve, solve
 from stage.stack import stack

@@ -58,7 +58,7 @@ if is_worker and "PIECES" in os.environ:
     import random
     from pathlib import Path
 
-    import service.solve.sharing.batches as batches
+    import service.solve.base.batches as batches
     import stage.stack.stack as stack
     from service.server.jobs.pieces import JobPieces
 

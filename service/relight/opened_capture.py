@@ -1,5 +1,4 @@
-"""The captures that are relit: one, or a sequence with one capture for each time step, in order of name. Each is opened only while its
-frame is made."""
+"""A capture that is relit, the only one or that of a time step; of a sequence, each is opened only while its frame is made."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,10 +35,6 @@ def open_capture(folder: Path, request: RelightRequest, captures: int, frames: S
     """Open the capture of a time step, from which frames will be made; no image is read.
 
     The caches and maps of several `captures` lie in folders named as theirs.
-
-    Raises:
-        StageError: bad input; names file and field.
-        RequestError: its maps are not there, or light keys name an image that it has not.
     """
     capture = Capture.open(folder, request.pixels)
     images = {frame.image for frame in capture.sources()}

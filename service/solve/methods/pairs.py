@@ -50,14 +50,7 @@ class PairFindings(NamedTuple):
 
 
 def examine_pairs(cross: Stack, parallel: Stack, partners: list[tuple[str, str]], mask: np.ndarray) -> PairFindings:
-    """Compare the images of every pair.
-
-    Args:
-        cross: the cross-polarised image of every light.
-        parallel: the parallel-polarised image of every light, in the same order.
-        partners: names of both images of every light.
-        mask: [rows, cols] bool, the object.
-    """
+    """Compare the cross-polarised and the parallel-polarised image of every light, whose names are `partners`, over the mask."""
     block = _block(mask)
     inside = np.flatnonzero(mask)
     spread = inside[np.unique(np.linspace(0, len(inside) - 1, min(PIXELS, len(inside))).astype(int))]

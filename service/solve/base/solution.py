@@ -23,7 +23,6 @@ LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
 """Confidence of a normal whose standard error is five degrees."""
 PIXELS_AT_ONCE = 1 << 16
 """Number of pixels that are looked at in one piece: it bounds the memory."""
-
 SUSPECT_PIXELS = 512
 """Number of pixels, spread over the object, on which the lights are compared."""
 
@@ -119,13 +118,7 @@ class Solution:
                    np.zeros(pixels, np.float16), np.zeros(pixels, np.uint8))
 
     def place(self, span: slice, inside: np.ndarray, fit: NormalFit) -> None:
-        """Store the normals of a band.
-
-        Args:
-            span: its pixels.
-            inside: [n] bool, which of them are inside the mask.
-            fit: normals of the band, with padding.
-        """
+        """Store the normals of a band, which have padding, at those of its pixels that are inside the mask, [n] bool."""
         count = len(inside)
         self.normal[:, span] = np.where(inside, fit.normal.numpy()[:, :count], 0)
         self.residual[span] = np.where(inside, fit.residual.numpy()[:count], 0)
@@ -150,12 +143,7 @@ def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_c
     """Say why pixels have too few lights, and which normals are uncertain, by the status of these pixels.
 
     Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED. Solved pixels with a confidence
-    under 1/6 become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values.
-
-    Args:
-        solution: of the whole image; its status is changed.
-        max_sigma: largest standard error of a solved normal, degrees.
-        least_confidence: least confidence of a solved normal.
+    under 1/6 become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values. `max_sigma` is in degrees.
     """
     few = np.flatnonzero(solution.status == Status.TOO_FEW_LIGHTS)
     for first in range(0, len(few), PIXELS_AT_ONCE):
@@ -169,11 +157,7 @@ def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_c
 
 
 def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[SuspectLight]:
-    """Return the lights whose direction or strength in the manifest the images contradict, worst first.
-
-    Args:
-        solution: normals that were solved under these lights.
-    """
+    """Return the lights, under which the normals were solved, whose direction or strength the images contradict, worst first."""
     solved = np.flatnonzero(solution.status == Status.OK)
     if len(solved) < 2 * LEAST_PIXELS:
         return []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.boards.stitching.gauge import gauge_study
+from service.boards.gauge_board import gauge_study
 
 AIAG = np.array([
     [[0.29, -0.56, 1.34, 0.47, -0.80, 0.02, 0.59, -0.31, 2.26, -1.36], [0.41, -0.68, 1.17, 0.50, -0.92, -0.11, 0.75, -0.20, 1.99, -1.25],

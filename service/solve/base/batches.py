@@ -10,8 +10,8 @@ from kernels.photometric.lambertian.near import NearField, NearLights, see_near
 from kernels.photometric.lambertian.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.model.samples import Samples, gather
 from kernels.status import Status
+from service.solve.base.solution import SolveInput
 from service.solve.sharing.sharing import Results, deal
-from service.solve.sharing.solution import SolveInput
 from stage.capture.camera import Camera
 from stage.colour.colour import GREY_WEIGHTS
 from stage.stack.stack import PIXEL_PAD, Stack
@@ -57,7 +57,6 @@ def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int,
     Args:
         bytes_per_pixel: what the work allocates for each pixel beside the stack.
         work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
-        results: where it stores it.
     """
     inside, total = given.mask.reshape(-1), given.stack.shape[2]
     spans = [(start, stop) for start, stop in given.stack.bands(bytes_per_pixel) if inside[start:stop].any()]
@@ -86,8 +85,7 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
     """Do the image band by band on the devices, without the bands that lie outside the mask, and say how far it is.
 
     Args:
-        work: stores what it finds in a band.
-        results: where it stores it, and what it follows from besides the arguments.
+        results: where the work stores what it finds, and what that follows from besides the arguments.
     """
     stack, inside = given.stack, given.mask.reshape(-1)
     factors = grey_factors(lights, GREY_WEIGHTS)
@@ -108,10 +106,8 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
     """Do pixels of the images batch by batch on the devices, and say how far it is.
 
     Args:
-        view: directions to the viewer.
         pixels: [n] positions, ascending.
-        work: stores what it finds at the pixels of a batch.
-        results: where it stores it, and what it follows from besides the arguments.
+        results: where the work stores what it finds, and what that follows from besides the arguments.
         lobes: values that the solver keeps for each light and pixel.
         done: pixels of the stage that are done before.
     """
@@ -140,12 +136,7 @@ def _cut(stack: Stack, pixels: np.ndarray, size: int) -> list[slice]:
 
 
 def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, field: NearField | None = None) -> Samples:
-    """Return the readings of a few pixels, wherever they lie in the image.
-
-    Args:
-        view: directions to the viewer.
-        pixels: [n] positions.
-    """
+    """Return the readings of a few pixels, [n] positions, wherever they lie in the image."""
     band = packs.upload(*given.stack.pick(pixels), device=given.device)
     return gather(band, np.arange(len(pixels)), view(pixels), lights, grey_factors(lights, GREY_WEIGHTS), given.stack.light_count,
                   None if field is None else field.at(pixels))

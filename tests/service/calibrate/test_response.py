@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.calibrate.solvers.response import fit_response
+from service.calibrate.response import fit_response
 from stage.errors import CalibrationError
 
 RNG = np.random.default_rng(4)

@@ -53,7 +53,7 @@ def factorise(readings: np.ndarray, usable: np.ndarray, start: np.ndarray | None
     Args:
         readings: [lights, pixels] scene-linear grey readings of pixels that are spread over the object.
         usable: [lights, pixels] bool, True for unsaturated readings.
-        start: [lights, 3] lights to begin from; None: the singular vectors of the pixels that most lights reach.
+        start: [lights, 3] to begin from; None: the singular vectors of the pixels that most lights reach.
 
     Raises:
         CalibrationError: a light is shown by too few pixels, or no lights explain the images.
@@ -88,13 +88,7 @@ def factorise(readings: np.ndarray, usable: np.ndarray, start: np.ndarray | None
 
 
 def fit_surface(readings: np.ndarray, usable: np.ndarray, lights: np.ndarray) -> np.ndarray:
-    """Return b of each pixel under some lights, [3, pixels] float64, by a robust fit.
-
-    Args:
-        readings: [lights, pixels] scene-linear grey readings.
-        usable: [lights, pixels] bool.
-        lights: [lights, 3] of `factorise`, times any 3×3 matrix.
-    """
+    """Return b of each pixel, [3, pixels] float64, by a robust fit under the lights of `factorise` times any 3×3 matrix."""
     strength = np.linalg.norm(lights, axis=1, keepdims=True)
     return fit_lambertian(readings / strength, usable, lights / strength).vector
 

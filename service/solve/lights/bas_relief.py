@@ -83,18 +83,18 @@ def resolve_relief(readings: np.ndarray, usable: np.ndarray, lights: np.ndarray,
     return Relief(_matrix(point) @ base, by, told)
 
 
-class _Pixels:
+class _Pixels(NamedTuple):
     """Pixels with what Lambert's law leaves of their readings."""
 
-    def __init__(self, residual: np.ndarray, compared: np.ndarray, lights: np.ndarray, b: np.ndarray) -> None:
-        self.residual, self.compared, self.lights, self.b = residual, compared, lights, b
-
-    def chosen(self, which: np.ndarray) -> "_Pixels":
-        return _Pixels(self.residual[:, which], self.compared[:, which], self.lights, self.b[:, which])
+    residual: np.ndarray  # [lights, pixels]
+    compared: np.ndarray  # [lights, pixels] bool
+    lights: np.ndarray  # [lights, 3]
+    b: np.ndarray  # [3, pixels]
 
     def thinned(self, most: int) -> "_Pixels":
         count = self.b.shape[1]
-        return self.chosen(np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)))
+        which = np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+        return self._replace(residual=self.residual[:, which], compared=self.compared[:, which], b=self.b[:, which])
 
 
 def _centred(b: np.ndarray) -> np.ndarray:
