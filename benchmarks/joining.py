@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.file_mutations import write_between
-from kernels.surface.joined import join_depth
+from service.joining.depth_and_normals import join_depth
 from tests.scenes.joined import MM, degrees_between, drifting, see
 
 CASES = ((0.5, 0.0, 0.5), (0.5, 2.0, 0.5), (0.2, 4.0, 2.0), (2.0, 3.0, 0.1))

@@ -95,11 +95,7 @@ def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], b
     """Find the blocks of a brick that come near a measured surface; waits for the device.
 
     Args:
-        views: the range images.
-        voxel: side of a voxel, metres.
         corner: lattice coordinates of the lowest voxel of the brick; voxel (0, 0, 0) lies at the origin of the views' coordinates.
-        blocks: along each side of the brick, 1…BRICK.
-        device: where the views are.
     """
     side = blocks + 1
     marked = wp.zeros((side, side, side), dtype=wp.uint8, device=device)

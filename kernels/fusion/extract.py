@@ -12,7 +12,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, VOXELS
 from kernels.fusion.cube_cases import EDGE_CORNER, MOST_TRIANGLES, cube_table
-from kernels.fusion.integrate import SURFACE, Volume, voxel_number, voxel_position
+from kernels.fusion.integrate import SURFACE, Volume, Voxels, voxel_number, voxel_position
 
 SMALLEST = 1.0e-4
 """Least distance of a vertex from the ends of its edge, as a part of its length: triangles keep an area in single precision."""
@@ -28,44 +28,43 @@ class Triangles(NamedTuple):
 
 
 @wp.func
-def _known(x: int, y: int, z: int, index: wp.array3d(dtype=int), state: wp.array(dtype=wp.uint8)) -> int:
+def _known(x: int, y: int, z: int, voxels: Voxels) -> int:
     """Return the number of a voxel that is measured surface, else −1."""
-    number = voxel_number(x, y, z, index)
+    number = voxel_number(x, y, z, voxels.index)
     if number < 0:
         return -1
-    if int(state[number]) != SURFACE:
+    if int(voxels.state[number]) != SURFACE:
         return -1
     return number
 
 
 @wp.kernel(enable_backward=False)
-def _count_kernel(first: int, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int), value: wp.array(dtype=float),
-                  state: wp.array(dtype=wp.uint8), triangles: wp.array(dtype=int),
+def _count_kernel(first: int, voxels: Voxels, triangles: wp.array(dtype=int),
                   # outputs
                   crossed: wp.array(dtype=wp.uint8), vertices: wp.array(dtype=int), cases: wp.array(dtype=wp.uint8),
                   faces: wp.array(dtype=int)):
     i = first + wp.tid()
-    at = voxel_position(i, place)
-    here = _known(at[0], at[1], at[2], index, state)
+    at = voxel_position(i, voxels.place)
+    here = _known(at[0], at[1], at[2], voxels)
     bits = wp.int32(0)
     count = wp.int32(0)
     case = wp.int32(0)
     if here >= 0:
-        inside = value[here] < 0.0
+        inside = voxels.value[here] < 0.0
         for axis in range(3):
             there = _known(at[0] + wp.where(axis == 0, 1, 0), at[1] + wp.where(axis == 1, 1, 0), at[2] + wp.where(axis == 2, 1, 0),
-                           index, state)
+                           voxels)
             if there >= 0:
-                flips = wp.where((value[there] < 0.0) != inside, 1, 0)
+                flips = wp.where((voxels.value[there] < 0.0) != inside, 1, 0)
                 bits = bits | (flips << axis)
                 count += flips
-        if wp.max(wp.max(at[0], at[1]), at[2]) < (index.shape[0] - 1) * BLOCK:
+        if wp.max(wp.max(at[0], at[1]), at[2]) < (voxels.index.shape[0] - 1) * BLOCK:
             for corner in range(8):
                 if case >= 0:
-                    number = _known(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), index, state)
+                    number = _known(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), voxels)
                     if number < 0:
                         case = wp.int32(-1)
-                    elif value[number] < 0.0:
+                    elif voxels.value[number] < 0.0:
                         case = case | (1 << corner)
     case = wp.max(case, 0)
     crossed[i] = wp.uint8(bits)
@@ -75,47 +74,46 @@ def _count_kernel(first: int, place: wp.array(dtype=wp.vec3i), index: wp.array3d
 
 
 @wp.kernel(enable_backward=False)
-def _vertex_kernel(first: int, voxel: float, corner: wp.vec3i, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int),
-                   value: wp.array(dtype=float), variance: wp.array(dtype=float), crossed: wp.array(dtype=wp.uint8),
-                   start: wp.array(dtype=int),
+def _vertex_kernel(first: int, voxels: Voxels, crossed: wp.array(dtype=wp.uint8), start: wp.array(dtype=int),
                    # outputs
                    points: wp.array(dtype=wp.vec3), sigma: wp.array(dtype=float), edge: wp.array(dtype=wp.vec4i)):
     i = first + wp.tid()
     bits = int(crossed[i])
+    corner = voxels.corner
     if bits != 0:
-        at = voxel_position(i, place)
+        at = voxel_position(i, voxels.place)
         out = start[i]
         for axis in range(3):
             if (bits & (1 << axis)) != 0:
                 dx = wp.where(axis == 0, 1, 0)
                 dy = wp.where(axis == 1, 1, 0)
                 dz = wp.where(axis == 2, 1, 0)
-                there = voxel_number(at[0] + dx, at[1] + dy, at[2] + dz, index)
-                t = wp.clamp(value[i] / (value[i] - value[there]), SMALLEST, 1.0 - SMALLEST)
-                points[out] = voxel * wp.vec3(float(at[0] + corner[0]) + t * float(dx), float(at[1] + corner[1]) + t * float(dy),
+                there = voxel_number(at[0] + dx, at[1] + dy, at[2] + dz, voxels.index)
+                t = wp.clamp(voxels.value[i] / (voxels.value[i] - voxels.value[there]), SMALLEST, 1.0 - SMALLEST)
+                points[out] = voxels.size * wp.vec3(float(at[0] + corner[0]) + t * float(dx), float(at[1] + corner[1]) + t * float(dy),
                                               float(at[2] + corner[2]) + t * float(dz))
-                sigma[out] = (1.0 - t) * wp.sqrt(variance[i]) + t * wp.sqrt(variance[there])
+                sigma[out] = (1.0 - t) * wp.sqrt(voxels.variance[i]) + t * wp.sqrt(voxels.variance[there])
                 edge[out] = wp.vec4i(at[0] + corner[0], at[1] + corner[1], at[2] + corner[2], axis)
                 out += 1
 
 
 @wp.kernel(enable_backward=False)
-def _face_kernel(first: int, place: wp.array(dtype=wp.vec3i), index: wp.array3d(dtype=int), crossed: wp.array(dtype=wp.uint8),
-                 vertex_start: wp.array(dtype=int), cases: wp.array(dtype=wp.uint8), face_start: wp.array(dtype=int),
-                 triangles: wp.array(dtype=int), edges: wp.array(dtype=int), corners: wp.array(dtype=int),
+def _face_kernel(first: int, voxels: Voxels, crossed: wp.array(dtype=wp.uint8), vertex_start: wp.array(dtype=int),
+                 cases: wp.array(dtype=wp.uint8), face_start: wp.array(dtype=int), triangles: wp.array(dtype=int),
+                 edges: wp.array(dtype=int), corners: wp.array(dtype=int),
                  # outputs
                  faces: wp.array(dtype=int)):
     i = first + wp.tid()
     case = int(cases[i])
     count = triangles[case]
     if count > 0:
-        at = voxel_position(i, place)
+        at = voxel_position(i, voxels.place)
         out = 3 * face_start[i]
         for k in range(3 * count):
             edge = edges[case * 3 * MOST_TRIANGLES + k]
             axis = edge // 4
             corner = corners[edge]
-            number = voxel_number(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), index)
+            number = voxel_number(at[0] + (corner & 1), at[1] + ((corner >> 1) & 1), at[2] + ((corner >> 2) & 1), voxels.index)
             bits = int(crossed[number])
             before = bits & ((1 << axis) - 1)
             faces[out + k] = vertex_start[number] + (before & 1) + ((before >> 1) & 1)
@@ -128,7 +126,7 @@ def extract(volume: Volume) -> Triangles:
         Waits for the device. Vertices that no triangle has are left out. The cells are those of the brick itself; their vertices on the
         layer behind its last voxel belong to the neighbouring brick, which has them too.
     """
-    blocks = volume.blocks
+    blocks, voxels = volume.blocks, volume.voxels()
     device, count = blocks.device, blocks.count * VOXELS
     none = Triangles(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 4), np.int32), np.zeros((0, 3), np.int32))
     if count == 0:
@@ -136,8 +134,7 @@ def extract(volume: Volume) -> Triangles:
     triangles, edges = (wp.array(table, dtype=int, device=device) for table in cube_table())
     crossed, cases = (wp.empty(count, dtype=wp.uint8, device=device) for _ in range(2))
     vertices, faces = (wp.empty(count, dtype=int, device=device) for _ in range(2))
-    devices.launch(_count_kernel, count, [blocks.place, blocks.index, volume.value, volume.state, triangles],
-                   [crossed, vertices, cases, faces], device=device)
+    devices.launch(_count_kernel, count, [voxels, triangles], [crossed, vertices, cases, faces], device=device)
     vertex_start, vertex_count = _starts(vertices, device)
     face_start, face_count = _starts(faces, device)
     if face_count == 0:
@@ -146,10 +143,8 @@ def extract(volume: Volume) -> Triangles:
     sigma = wp.empty(vertex_count, dtype=float, device=device)
     edge = wp.empty(vertex_count, dtype=wp.vec4i, device=device)
     corner_numbers = wp.empty(3 * face_count, dtype=int, device=device)
-    devices.launch(_vertex_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), blocks.place, blocks.index, volume.value,
-                                           volume.variance,
-                                           crossed, vertex_start], [points, sigma, edge], device=device)
-    devices.launch(_face_kernel, count, [blocks.place, blocks.index, crossed, vertex_start, cases, face_start, triangles, edges,
+    devices.launch(_vertex_kernel, count, [voxels, crossed, vertex_start], [points, sigma, edge], device=device)
+    devices.launch(_face_kernel, count, [voxels, crossed, vertex_start, cases, face_start, triangles, edges,
                                          wp.array(EDGE_CORNER, dtype=int, device=device)], [corner_numbers], device=device)
     corners = corner_numbers.numpy()
     used = np.zeros(vertex_count, dtype=bool)

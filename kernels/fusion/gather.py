@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.fusion.projection import View, image_point, in_front, to_camera, toward_camera, turned_back
-from kernels.fusion.views import Cell, ViewArrays, read_view
+from kernels.fusion.projection import image_point, in_front, to_camera, toward_camera, turned_back
+from kernels.fusion.views import Measured, ViewArrays, read_view
 
 SHARPNESS = 4.0
 """Power of the weights: the best views win where they differ, and blend where they are about alike."""
@@ -39,25 +39,26 @@ def _bilinear(plane: wp.array2d(dtype=float), place: int, cols: int, fu: float, 
 
 
 @wp.kernel(enable_backward=False)
-def _gather_kernel(first: int, slack: float, vectors: int, views: wp.array(dtype=View), count: int, cell: wp.array(dtype=int),
-                   cells: wp.array(dtype=Cell), layers: wp.array2d(dtype=float), feather: wp.array2d(dtype=float), channels: int,
-                   points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3), uncertainty: wp.array(dtype=float),
+def _gather_kernel(first: int, slack: float, vectors: int, images: Measured, layers: wp.array2d(dtype=float),
+                   feather: wp.array2d(dtype=float), points: wp.array(dtype=wp.vec3), normals: wp.array(dtype=wp.vec3),
+                   uncertainty: wp.array(dtype=float),
                    # outputs
                    values: wp.array2d(dtype=float), weight: wp.array(dtype=float), best: wp.array(dtype=int), seen: wp.array(dtype=int)):
     i = first + wp.tid()
     point = points[i]
+    channels = layers.shape[1]
     total = float(0.0)
     largest = float(0.0)
     chosen = wp.int32(-1)
     number_seen = wp.int32(0)
     for c in range(channels):
         values[i, c] = 0.0
-    for number in range(count):
-        view = views[number]
+    for number in range(images.views.shape[0]):
+        view = images.views[number]
         there = to_camera(view, point)
         if in_front(view, there):
             uv = image_point(view, there)
-            reading = read_view(view, there, uv, cell, cells)
+            reading = read_view(view, there, uv, images)
             # the angle to the surface of all views, whose normals are surer than those of one
             toward = wp.transpose(view.rotation) * toward_camera(view, there)
             cosine = wp.dot(normals[i], toward) / wp.length(toward)
@@ -102,7 +103,6 @@ def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: A
     """Blend what views show at points; returns before the device is done. Means of vectors are not of unit length.
 
     Args:
-        views: the range images, which decide what hides what.
         layers: wp.array [P, C] float, values of all pixels of the views, one view after another.
         feather: wp.array [P, 1] float, 0…1, how much each pixel counts.
         points, normals: wp.array [n] of vec3, metres in the coordinates of the views, and unit vectors of the world frame.
@@ -114,6 +114,6 @@ def gather(views: ViewArrays, layers: Any, feather: Any, points: Any, normals: A
     values = wp.empty((count, channels), dtype=float, device=device)
     weight = wp.empty(count, dtype=float, device=device)
     best, seen = (wp.empty(count, dtype=int, device=device) for _ in range(2))
-    devices.launch(_gather_kernel, count, [slack, vectors, views.views, views.count, views.cell, views.cells, layers, feather, channels,
-                                           points, normals, sigma], [values, weight, best, seen], device=device, uneven=True)
+    devices.launch(_gather_kernel, count, [slack, vectors, views.measured(), layers, feather, points, normals, sigma],
+                   [values, weight, best, seen], device=device, uneven=True)
     return Gathered(values, weight, best, seen)

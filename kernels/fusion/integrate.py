@@ -21,7 +21,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.fusion.bricks import BLOCK, VOXELS, Blocks, find_watching
 from kernels.fusion.projection import View, image_point, in_front, to_camera, turned_back
-from kernels.fusion.views import ALONG, Cell, ViewArrays, read_view, truncation
+from kernels.fusion.views import ALONG, Measured, ViewArrays, read_view, truncation
 
 AGREEING = 0.85
 """Length of the weighted mean of the normals from which on all of them count: they then lie within some 45° of each other."""
@@ -36,6 +36,19 @@ UNKNOWN, SURFACE, EMPTY = 0, 1, 2
 """States of a voxel: not measured; near a measured surface; inside of one, and measured by fewer views than saw it to be empty."""
 
 
+@wp.struct
+class Voxels:
+    """The voxels of the blocks of a brick, as kernels read them."""
+
+    size: float  # side of a voxel, metres
+    corner: wp.vec3i  # lattice coordinates of the lowest voxel
+    place: wp.array(dtype=wp.vec3i)  # of `Blocks`
+    index: wp.array3d(dtype=int)
+    value: wp.array(dtype=float)  # of `Volume`
+    variance: wp.array(dtype=float)
+    state: wp.array(dtype=wp.uint8)
+
+
 class Volume(NamedTuple):
     """The voxels of the blocks of a brick."""
 
@@ -43,6 +56,14 @@ class Volume(NamedTuple):
     value: Any  # wp.array [VOXELS B] metres, signed distance, positive outside; 0 where there is none
     variance: Any  # wp.array [VOXELS B] square metres
     state: Any  # wp.array [VOXELS B] uint8
+
+    def voxels(self) -> Any:
+        """Return the `Voxels` of this volume."""
+        voxels = Voxels()
+        voxels.size, voxels.corner = self.blocks.voxel, wp.vec3i(*self.blocks.corner)
+        voxels.place, voxels.index = self.blocks.place, self.blocks.index
+        voxels.value, voxels.variance, voxels.state = self.value, self.variance, self.state
+        return voxels
 
 
 @wp.func
@@ -84,15 +105,14 @@ def is_clear(view: View, point: wp.vec3, at: wp.vec2, reach: float, clear: wp.ar
 
 
 @wp.kernel(enable_backward=False)
-def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, place: wp.array(dtype=wp.vec3i),
-                      watched: wp.array2d(dtype=wp.int16), views: wp.array(dtype=View), cell: wp.array(dtype=int),
-                      cells: wp.array(dtype=Cell), clear: wp.array(dtype=float),
+def _integrate_kernel(first: int, count: int, watched: wp.array2d(dtype=wp.int16), images: Measured,
                       # outputs
-                      value: wp.array(dtype=float), variance: wp.array(dtype=float), state: wp.array(dtype=wp.uint8)):
+                      voxels: Voxels):
     i = first + wp.tid()
     block = i // VOXELS
-    at = voxel_position(i, place)
-    at = at + corner
+    voxel = voxels.size
+    at = voxel_position(i, voxels.place)
+    at = at + voxels.corner
     point = voxel * wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     weights = float(0.0)
     total = float(0.0)
@@ -107,11 +127,11 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
         number = int(watched[block, k])
         if number < 0:
             break
-        view = views[number]
+        view = images.views[number]
         there = to_camera(view, point)
         if in_front(view, there):
             uv = image_point(view, there)
-            reading = read_view(view, there, uv, cell, cells)
+            reading = read_view(view, there, uv, images)
             reach = truncation(reading.sigma, voxel)
             if reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach:
                 w = reading.weight
@@ -128,7 +148,7 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
             elif reading.known:
                 if reading.distance > reach:
                     empty += 1
-            elif is_clear(view, there, uv, truncation(0.0, voxel), clear):
+            elif is_clear(view, there, uv, truncation(0.0, voxel), images.clear):
                 empty += 1
     if measured > 0 and wp.length(normals) < AGREEING * weights:
         weights = float(0.0)
@@ -139,10 +159,10 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
             number = int(watched[block, k])
             if number < 0:
                 break
-            view = views[number]
+            view = images.views[number]
             there = to_camera(view, point)
             if in_front(view, there):
-                reading = read_view(view, there, image_point(view, there), cell, cells)
+                reading = read_view(view, there, image_point(view, there), images)
                 reach = truncation(reading.sigma, voxel)
                 if (reading.known and wp.abs(reading.distance) <= reach and reading.along >= -ALONG * reach
                         and wp.dot(turned_back(view, reading.normal), reference) >= TURNED):
@@ -154,11 +174,11 @@ def _integrate_kernel(first: int, voxel: float, corner: wp.vec3i, count: int, pl
     known = wp.int32(UNKNOWN)
     if measured > 0:
         known = wp.int32(SURFACE)
-        value[i] = total / weights
-        variance[i] = spread / (weights * weights)
+        voxels.value[i] = total / weights
+        voxels.variance[i] = spread / (weights * weights)
     if empty > 0 and empty >= near and total <= 0.0:
         known = wp.int32(EMPTY)
-    state[i] = wp.uint8(known)
+    voxels.state[i] = wp.uint8(known)
 
 
 def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
@@ -166,8 +186,8 @@ def integrate(blocks: Blocks, views: ViewArrays) -> Volume:
     count, device = blocks.count * VOXELS, blocks.device
     value, variance = (wp.zeros(count, dtype=float, device=device) for _ in range(2))
     state = wp.zeros(count, dtype=wp.uint8, device=device)
+    volume = Volume(blocks, value, variance, state)
     if count:
-        devices.launch(_integrate_kernel, count, [blocks.voxel, wp.vec3i(*blocks.corner), views.count, blocks.place,
-                                                  find_watching(blocks, views), views.views, views.cell, views.cells, views.clear],
-                       [value, variance, state], device=device, uneven=True)
-    return Volume(blocks, value, variance, state)
+        devices.launch(_integrate_kernel, count, [views.count, find_watching(blocks, views), views.measured()], [volume.voxels()],
+                       device=device, uneven=True)
+    return volume

@@ -45,7 +45,6 @@ def rasterise(texture: np.ndarray, faces: np.ndarray, rows: int, cols: int, *, d
     Args:
         texture: [V, 2] u and v of the vertices in texels, from the top-left corner of the image.
         faces: [F, 3] vertex numbers.
-        rows, cols: of the image.
 
     Returns:
         [rows, cols] int32, the face with the largest number that covers the centre, −1 where none does; and [n, 3] float64, the barycentric

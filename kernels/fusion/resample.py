@@ -172,8 +172,7 @@ def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: 
     Args:
         places: [n, 2] u and v of the points in pixels, from the top-left corner of the image; those outside of it do not count.
         depths, sigmas: [n] metres, above 0; the errors of points are independent.
-        shape: rows and columns of the image.
-        focal: of the camera, pixels.
+        focal: in pixels.
     """
     rows, cols = shape
     col, row = np.floor(places).astype(np.int64).T

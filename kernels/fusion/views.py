@@ -82,6 +82,16 @@ class Cell:
     largest: float  # metres, largest standard deviation along the line of sight
 
 
+@wp.struct
+class Measured:
+    """What all views measured, as kernels read it; the fields are those of `ViewArrays`."""
+
+    views: wp.array(dtype=View)
+    cell: wp.array(dtype=int)
+    cells: wp.array(dtype=Cell)
+    clear: wp.array(dtype=float)
+
+
 class ViewArrays(NamedTuple):
     """The range images of several views, one after another, on the device."""
 
@@ -96,18 +106,19 @@ class ViewArrays(NamedTuple):
     first: tuple[int, ...]
     first_cell: tuple[int, ...]  # of each view, and the number of all cells
 
+    def measured(self) -> Any:
+        """Return the `Measured` of these views."""
+        measured = Measured()
+        measured.views, measured.cell, measured.cells, measured.clear = self.views, self.cell, self.cells, self.clear
+        return measured
+
 
 def upload_views(images: Sequence[RangeImage], origin: np.ndarray, *, device: str) -> ViewArrays:
     """Copy range images to a device.
 
     Args:
-        images: at least one.
         origin: [3] world point, metres, that coordinates on the device count from: near the middle of the scene, so that they are short in
             single precision, and one for all bricks, whose values are the same to the last bit only then.
-        device: where to.
-
-    Raises:
-        ArrayError: arrays of one image differ in shape, or a depth or standard deviation inside a cell is not above 0.
     """
     structs, planes = [], {name: [] for name in ("depth", "sigma", "normal", "clear", "farthest", "place", "owner")}
     first = first_tile = 0
@@ -258,29 +269,29 @@ def cell_at(view: View, at: wp.vec2, cell: wp.array(dtype=int)) -> int:
 
 
 @wp.func
-def read_view(view: View, point: wp.vec3, at: wp.vec2, cell: wp.array(dtype=int), cells: wp.array(dtype=Cell)) -> Reading:
+def read_view(view: View, point: wp.vec3, at: wp.vec2, measured: Measured) -> Reading:
     """Return what a view measured on the line of sight through a camera-frame point that falls on `at` of its image."""
     found = Reading()
     found.known = False
-    i = cell_at(view, at, cell)
+    i = cell_at(view, at, measured.cell)
     if i < 0:
         return found
-    found.weight = cells[i].weight
+    found.weight = measured.cells[i].weight
     if found.weight == 0.0:
         return found
     fu = at[0] - 0.5 - wp.floor(at[0] - 0.5)
     fv = at[1] - 0.5 - wp.floor(at[1] - 0.5)
-    four = cells[i].linear
+    four = measured.cells[i].linear
     upper = four[0] + fu * (four[1] - four[0])
     lower = four[2] + fu * (four[3] - four[2])
     found.along = depth_of(view, upper + fv * (lower - upper)) + point[2]
-    found.normal = cells[i].normal
+    found.normal = measured.cells[i].normal
     if view.orthographic:
         found.distance = found.along * found.normal[2]
     else:
         found.distance = found.along * wp.dot(found.normal, point) / point[2]
-    found.sigma = cells[i].sigma
+    found.sigma = measured.cells[i].sigma
     share = (1.0 - 2.0 * fu * (1.0 - fu)) * (1.0 - 2.0 * fv * (1.0 - fv))  # sum of the squares of the weights of the four pixels
-    found.variance = share * cells[i].along + cells[i].lateral
+    found.variance = share * measured.cells[i].along + measured.cells[i].lateral
     found.known = True
     return found

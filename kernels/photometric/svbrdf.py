@@ -68,7 +68,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
                  shared: np.ndarray | None = None, pairs: np.ndarray = NO_PAIRS,
                  metals: Metals | None = None, roughness: np.ndarray | None = None, single_lobe: bool = True, prior: Prior | None = None,
                  beside: np.ndarray | None = None) -> SvbrdfFit:
-    """Estimate the normal and the material of sampled pixels.
+    """Estimate the normal and the material of sampled pixels; waits for the device.
 
     Args:
         start: [n, 3] unit normals to begin from, within some 50° of the truth.
@@ -80,13 +80,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         single_lobe: False leaves the joint fit of one lobe out, to see what it buys.
         prior: normals to which the search is drawn, because the readings do not support the lobes; then the joint fit, which knows no
             prior, is left out, and the surface is taken as Lambertian.
-        beside: [steps, n] of propagation.neighbours; None: no pixel is another's neighbour.
-
-    Returns:
-        The fit. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
+        beside: [steps, n] of normal_search.neighbours; None: no pixel is another's neighbour.
     """
     lobe = shape if lobe is None else lobe
     found = find_normals(samples, start, shape=shape, beside=beside, prior=prior)
@@ -134,16 +128,14 @@ def nearby_shapes(shape: Diffuse) -> list[Diffuse]:
 
 def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float,
                     spreads: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of a pixel's normals under several models, each weighted by exp(-(cost - best) / (temperature · best)).
+    """Return the mean of a pixel's normals under several models, and their weighted RMS spread in degrees.
+
+    The weights are exp(-(cost - best) / (temperature · best)).
 
     Args:
         normals: [models, n, 3] unit.
         costs: [models, n].
-        temperature: relative to the best cost.
         spreads: [models, n] RMS spread, in degrees, of the normals that each model's normal is the mean of; None: of none.
-
-    Returns:
-        [n, 3] unit normals, and [n] their weighted RMS spread in degrees.
     """
     best = costs.min(axis=0)
     weights = np.exp(-(costs - best) / np.maximum(temperature * best, 1e-6))
@@ -172,7 +164,6 @@ def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared
     It is 0 where F0 is not far above the shared ones, and where no such normal was found.
 
     Args:
-        normal: [n, 3] unit normals.
         material: of material.fit_material.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
     """

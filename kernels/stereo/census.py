@@ -20,10 +20,6 @@ def sliding(array: wp.array, pack: int | None = None) -> wp.array:
 
     The packs of neighbouring columns overlap. The last `pack - 1` columns have no pack: pad the rows. The caller keeps the array, because
     the view does not own the memory.
-
-    Args:
-        array: [..., cols] scalars without gaps.
-        pack: values of an element; None: the pack width of the device.
     """
     kind = array.dtype
     pack = devices.pack_width(str(array.device)) if pack is None else pack
@@ -46,14 +42,11 @@ BITS = (2 * REACH_X + 1) * (2 * REACH_Y + 1) - 1
 
 
 def census(images: np.ndarray, *, before: int = 0, after: int = 0, device: str) -> wp.array:
-    """Return the census of each pixel of several images.
+    """Return the census of each pixel of several images, [images, rows, before + cols + after or more] uint64.
 
     Args:
         images: [images, rows, cols] float32; pixels beyond the border are those at the border.
         before, after: columns without a meaning that are put before the first column and after the last.
-
-    Returns:
-        [images, rows, before + cols + after or more] uint64.
     """
     count, rows, cols = images.shape
     padded = padded_columns(cols, device)

@@ -68,16 +68,15 @@ def census_pair(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: L
 
 
 def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, device: str) -> wp.array:
-    """Return the cost of each label at each pixel.
+    """Return the cost of each label at each pixel: `SCALE` units for each differing bit, the mean over the frames.
 
     Args:
         left: [frames, rows, cols] float32, rectified.
         right: [frames, rows, right cols] float32.
         seen: [rows, right cols] bool, False where the right camera sees nothing.
-        labels: the disparities.
 
     Returns:
-        [rows, cols, packs] packs of uint8: `SCALE` units for each differing bit, the mean over the frames.
+        [rows, cols, packs] packs of uint8.
     """
     frames, rows, cols = left.shape
     bits = census_pair(left, right, seen, labels, device=device)

@@ -38,14 +38,7 @@ wrong pixels nor the error, and take as long again."""
 
 
 def gather(volume: wp.array) -> wp.array:
-    """Return the sum over all directions of the least costs of paths.
-
-    Args:
-        volume: [rows, cols, packs] packs of uint8, of `matching_cost`.
-
-    Returns:
-        [rows, cols, packs] packs of int16, on the device of the volume.
-    """
+    """Return the sum over all directions of the least costs of paths, [rows, cols, packs] packs of int16, from those of `matching_cost`."""
     rows, cols, packs = volume.shape
     device = str(volume.device)
     pack = devices.pack_width(device)

@@ -56,15 +56,12 @@ class Refined(NamedTuple):
 
 
 def refine(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, *, device: str) -> Refined:
-    """Refine the disparities of a band of rows.
+    """Refine the disparities of a band of rows; not synchronised on CUDA.
 
     Args:
         left: [frames, rows, cols] float32, rectified.
         right: [frames, rows, right cols] float32.
         disparity: [rows, cols] float32, good to a pixel or so; NaN where there is none.
-
-    Returns:
-        Arrays on the device, not synchronised on CUDA.
     """
     _frames, rows, cols = left.shape
     lanes = LANES_CPU if device == "cpu" else LANES_CUDA

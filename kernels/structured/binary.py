@@ -52,7 +52,10 @@ MAX_BITS = 24
 
 def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | None = None, *, white: int | None = None,
                   black: int | None = None, extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
-    """Decode a plain binary code.
+    """Decode a plain binary code to stripe centres; not synchronised on CUDA.
+
+    SATURATED: a frame that decides a bit is. SHADOWED: the contrast is not above noise. UNDECIDED: doubtful bits leave stripes far apart.
+    MULTIPATH: light of other ways may have decided them. OUT_OF_RANGE: a code beyond the projector.
 
     Args:
         frames: linear images of one channel.
@@ -61,11 +64,6 @@ def decode_binary(frames: Band, bits: Sequence[int], inverses: Sequence[int] | N
         white, black: frames of the projector full on and black.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
-
-    Returns:
-        Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame that decides a bit is. SHADOWED: the contrast
-        is not above noise. UNDECIDED: doubtful bits leave stripes far apart. MULTIPATH: light of other ways may have decided them.
-        OUT_OF_RANGE: a code beyond the projector.
 
     Raises:
         ArrayError: a frame is missing, does not exist or is given twice; a value that cannot be.

@@ -40,7 +40,9 @@ _UNDECIDED, _MULTIPATH = int(Status.UNDECIDED), int(Status.MULTIPATH)
 
 def confirm_stripes(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: Sequence[int], *, columns: int, stripe_px: float = 1.0,
                     noise: NoiseModel) -> Decoded:
-    """Decide doubtful pixels of a code with inverses whose reading agrees with the surface around them.
+    """Decide doubtful pixels of a code with inverses whose reading agrees with the surface around them; not synchronised on CUDA.
+
+    UNDECIDED and MULTIPATH pixels that are confirmed become OK with a deviation of their own; coordinate and amplitude are those given.
 
     Args:
         decoded: of a binary, Gray or XOR code of three bits or more from these frames.
@@ -49,10 +51,6 @@ def confirm_stripes(decoded: Decoded, frames: Band, bits: Sequence[int], inverse
         inverses: frame of each inverse in the same order.
         columns: pixels of an image row.
         stripe_px: width of the finest stripe.
-
-    Returns:
-        A new result, in which UNDECIDED and MULTIPATH pixels that are confirmed are OK with a deviation of their own; coordinate and
-        amplitude are those given; not synchronised on CUDA.
 
     Raises:
         ArrayError: no inverses, too few bits, or pixels that are not whole rows or not those decoded.

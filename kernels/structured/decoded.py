@@ -36,11 +36,7 @@ def unwritten_decoded(pixels: int, device: str) -> Decoded:
 
 
 def cropped(decoded: Decoded, first: int, count: int, *, device: str) -> Decoded:
-    """Return a copy of `count` pixels from `first` on, padded to whole packs.
-
-    Raises:
-        ArrayError: there are not as many.
-    """
+    """Return a copy of `count` pixels from `first` on, padded to whole packs."""
     have = decoded.coordinate.shape[0]
     if first < 0 or count < 1 or first + count > have:
         raise ArrayError(f"pixels {first} to {first + count} are asked for, there are {have}")

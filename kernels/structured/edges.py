@@ -32,7 +32,7 @@ smaller. Both edges of a stripe count with the same error, as they have where st
 
 def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: Sequence[int], *, columns: int, down: bool,
                  extent: float, stripe_px: float = 1.0, noise: NoiseModel) -> Decoded:
-    """Interpolate a decoded Gray code between the edges of its stripes.
+    """Interpolate a decoded Gray code between the edges of its stripes; not synchronised on CUDA.
 
     Args:
         decoded: of decode_gray from these frames.
@@ -43,9 +43,6 @@ def refine_edges(decoded: Decoded, frames: Band, bits: Sequence[int], inverses: 
         down: whether the coordinate changes from row to row (a row code) rather than along a row.
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
-
-    Returns:
-        A new result; amplitude and status are those given; not synchronised on CUDA.
 
     Raises:
         ArrayError: no inverses, or pixels that are not whole rows or not those decoded.

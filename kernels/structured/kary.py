@@ -11,11 +11,6 @@ is the result; where about as well, and it lies elsewhere, the pixel is UNDECIDE
 Sources: Er (reflected k-ary), The Computer Journal 1984; Horn and Kiryati, "Toward optimal structured light patterns", Image and
 Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging with adaptive color structured light", TPAMI 1998
 (crosstalk, equations 1 to 5).
-
-Where digit j of a plain code grows by one, all finer digits fall from k - 1 to 0. A pixel that sees both stripes reads all of them at one
-mixture t; levels in between look like other digits, and the number that they spell may lie far away. So every such carry is fitted to
-the readings (t by least squares over the finer digits, the best pair of levels of digit j, the nearest levels of the coarser ones), and the
-best is weighed against the nearest levels. In a reflected code one digit changes by one at every edge, and no carry exists.
 """
 
 from collections.abc import Sequence
@@ -28,121 +23,9 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
+from kernels.structured.carries import EMPTY_CHI2, LEVEL_ERROR, NO_EDGE, Code, carry_kernel, weight_of_reading
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
 from kernels.structured.pattern_frames import NoiseModel, check_noise, check_stripes, cut_in, require_frames, saturation_masks
-
-EMPTY_CHI2 = 1.0e30
-"""Sentinel χ² where there is no carry."""
-NO_EDGE = -2
-"""Number of the stripe behind an edge where there is none."""
-LEVEL_ERROR = 0.02
-"""Error of a level beyond noise, as a part of white minus black: the camera's and projector's responses and light from other surfaces cause
-it."""
-FINEST_ERROR = 0.15
-"""The same for the finest digit where carries are fitted: a pixel as wide as a stripe mixes in stripes beyond the two of the edge."""
-
-
-@wp.func
-def weight_of_reading(on: float, off: float, reading: float, level_error: float, read_variance: float, gain: float) -> float:
-    """Return 1 / variance of a reading minus the level that black and white of the pixel let expect."""
-    contrast = wp.max(on - off, 0.0)
-    return 1.0 / (3.0 * read_variance + level_error * level_error * contrast * contrast
-                  + gain * (wp.max(on, 0.0) + wp.max(off, 0.0) + wp.max(reading, 0.0)))
-
-
-@cache
-def carry_kernel(pack: int, channels: Literal[1, 3]) -> Any:
-    """Return the kernel that fits levels and carries."""
-    float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def fit_kernel(first: int,
-                   values: wp.array2d(dtype=float_pack),  # [F · channels, P]
-                   order: wp.array(dtype=int),  # [digits] frames, finest first
-                   white: int,
-                   black: int,
-                   expected: wp.array2d(dtype=float),  # [k, channels]
-                   reflected: int,
-                   read_variance: float,
-                   gain: float,
-                   # outputs
-                   misfit: wp.array(dtype=float_pack),  # [P] χ² of the nearest levels
-                   carry_misfit: wp.array(dtype=float_pack),  # [P] χ² of the best carry
-                   edge: wp.array(dtype=int_pack)):  # [P] number of the stripe behind it; NO_EDGE
-        p = first + wp.tid()
-        base = expected.shape[0]
-        total, chosen, place, below, unit = float_pack(), float_pack(EMPTY_CHI2), int_pack(), int_pack(), int_pack()
-        xx, xr, rr, number, chosen_total = float_pack(), float_pack(), float_pack(), int_pack(), float_pack()
-        chosen_unit = int_pack()
-        for k in range(pack):
-            unit[k] = 1
-            place[k] = NO_EDGE
-        for digit in range(order.shape[0]):
-            frame = order[digit]
-            own = wp.where(digit == 0, FINEST_ERROR, LEVEL_ERROR)
-            best, nearest, carried, pair = float_pack(EMPTY_CHI2), int_pack(), float_pack(EMPTY_CHI2), int_pack()
-            for level in range(base):
-                cost, mixed = float_pack(), float_pack()
-                for channel in range(channels):
-                    on = values[white * channels + channel, p]
-                    off = values[black * channels + channel, p]
-                    reading = values[frame * channels + channel, p]
-                    here = float(expected[level, channel])
-                    there = float(expected[wp.min(level + 1, base - 1), channel])
-                    for k in range(pack):
-                        contrast = wp.max(on[k] - off[k], 0.0)
-                        w = weight_of_reading(on[k], off[k], reading[k], own, read_variance, gain)
-                        miss = reading[k] - off[k] - here * contrast
-                        cost[k] = cost[k] + w * miss * miss
-                        t = wp.clamp(xr[k] / wp.max(xx[k], 1.0e-20), 0.0, 1.0)
-                        miss = miss - t * (there - here) * contrast
-                        mixed[k] = mixed[k] + w * miss * miss
-                for k in range(pack):
-                    nearest[k] = wp.where(cost[k] < best[k], level, nearest[k])
-                    best[k] = wp.min(best[k], cost[k])
-                    if level + 1 < base:
-                        pair[k] = wp.where(mixed[k] < carried[k], level, pair[k])
-                        carried[k] = wp.min(carried[k], mixed[k])
-            for k in range(pack):
-                if digit > 0 and reflected == 0:
-                    # coarser digits are the same under both: their cost is added to either later
-                    t = wp.clamp(xr[k] / wp.max(xx[k], 1.0e-20), 0.0, 1.0)
-                    rarity = 2.0 * float(digit) * wp.log(float(base))
-                    cost_of = rr[k] - 2.0 * t * xr[k] + t * t * xx[k] + carried[k] + rarity
-                    if cost_of - total[k] - best[k] < chosen[k] - chosen_total[k]:
-                        chosen[k] = cost_of
-                        chosen_total[k] = total[k] + best[k]
-                        below[k] = (pair[k] + 1) * unit[k]
-                        chosen_unit[k] = unit[k] * base
-                number[k] = number[k] + nearest[k] * unit[k]
-                unit[k] = unit[k] * base
-                total[k] = total[k] + best[k]
-            for channel in range(channels):
-                on = values[white * channels + channel, p]
-                off = values[black * channels + channel, p]
-                reading = values[frame * channels + channel, p]
-                top = float(expected[base - 1, channel])
-                step = float(expected[0, channel]) - top
-                for k in range(pack):
-                    contrast = wp.max(on[k] - off[k], 0.0)
-                    w = weight_of_reading(on[k], off[k], reading[k], own, read_variance, gain)
-                    rest = reading[k] - off[k] - top * contrast
-                    x = step * contrast
-                    xx[k] = xx[k] + w * x * x
-                    xr[k] = xr[k] + w * x * rest
-                    rr[k] = rr[k] + w * rest * rest
-        carry = float_pack()
-        for k in range(pack):
-            found = chosen_unit[k] > 0 and chosen[k] < EMPTY_CHI2
-            carry[k] = wp.where(found, total[k] - chosen_total[k] + chosen[k], EMPTY_CHI2)
-            if found:
-                place[k] = number[k] / chosen_unit[k] * chosen_unit[k] + below[k]
-        misfit[p] = total
-        carry_misfit[p] = carry
-        edge[p] = place
-
-    return fit_kernel
-
 
 SHADOW_SIGMAS = 5.0
 """Least white minus black, in its standard deviations over all channels; a pixel with less is not reached by the projector."""
@@ -163,7 +46,10 @@ LARGEST = 1.0e15
 
 def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, levels: np.ndarray, reflected: bool,
                 extent: float, stripe_px: float = 1.0, crosstalk: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
-    """Decode a base-k code in grey levels or colours.
+    """Decode a base-k code in grey levels or colours to stripe centres; not synchronised on CUDA.
+
+    SATURATED: a frame of the code is. SHADOWED: white is not above black. UNDECIDED: doubtful digits leave stripes apart. OUT_OF_RANGE: a
+    code beyond the projector.
 
     Args:
         frames: linear images: one channel for levels, three for colours.
@@ -174,10 +60,6 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
         extent: projector pixels along the axis.
         stripe_px: width of the finest stripe.
         crosstalk: [3, 3] camera channels from projector channels, for colours; None: each channel sees its own.
-
-    Returns:
-        Stripe centres on the device; not synchronised on CUDA. SATURATED: a frame of the code is. SHADOWED: white is not above
-        black. UNDECIDED: doubtful digits leave stripes apart. OUT_OF_RANGE: a code beyond the projector.
 
     Raises:
         ArrayError: a frame is missing, does not exist or is given twice; levels that are the same; a value that cannot be.
@@ -196,20 +78,19 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
     result = unwritten_decoded(pixels, device)
     fitted = [unwritten(pixels, dtype, device) for dtype in (wp.float32, wp.float32, wp.int32)]
     fits = [as_packs(array, device) for array in fitted]
-    order, table = wp.array(digits, dtype=wp.int32, device=device), wp.array(expected, dtype=wp.float32, device=device)
-    code = [order, white, black, table, 1 if reflected else 0, noise.read**2, noise.gain]
-    devices.launch(carry_kernel(pack, channels), frames.packs, [frames.values, *code], fits, device=device)
+    code = Code()
+    code.order, code.expected = wp.array(digits, dtype=wp.int32, device=device), wp.array(expected, dtype=wp.float32, device=device)
+    code.white, code.black, code.reflected = white, black, 1 if reflected else 0
+    code.read_variance, code.gain = noise.read**2, noise.gain
+    devices.launch(carry_kernel(pack, channels), frames.packs, [frames.values, code], fits, device=device)
     devices.launch(_kary_kernel(pack, channels), frames.packs,
-                   [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]), *code, *fits, float(stripe_px),
+                   [frames.values, frames.saturated, saturation_masks(frames, [*digits, white, black]), code, *fits, float(stripe_px),
                     float(extent)], [as_packs(array, device) for array in result], device=device)
     return result
 
 
 def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndarray:
-    """Return the reading of each digit value, as a part of white minus black.
-
-    Returns:
-        [k, channels] float64.
+    """Return the reading of each digit value, as a part of white minus black, [k, channels] float64.
 
     Raises:
         ArrayError: shapes that cannot be, or levels that look the same.
@@ -250,13 +131,7 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                     values: wp.array2d(dtype=float_pack),  # [F · channels, P]
                     saturated: wp.array2d(dtype=byte_pack),  # [F / 8, P] bits
                     masks: wp.array(dtype=int),  # [F / 8]
-                    order: wp.array(dtype=int),  # [digits] frames, finest first
-                    white: int,
-                    black: int,
-                    expected: wp.array2d(dtype=float),  # [k, channels]
-                    reflected: int,
-                    read_variance: float,
-                    gain: float,
+                    code: Code,
                     misfit: wp.array(dtype=float_pack),  # [P] of carry_kernel
                     carry_misfit: wp.array(dtype=float_pack),  # [P]
                     edge: wp.array(dtype=int_pack),  # [P]
@@ -271,37 +146,37 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
         cut = cut_of(saturated, masks, p)
         lit, signal = float_pack(), float_pack()
         for channel in range(channels):
-            on = values[white * channels + channel, p]
-            off = values[black * channels + channel, p]
+            on = values[code.white * channels + channel, p]
+            off = values[code.black * channels + channel, p]
             for k in range(pack):
                 contrast = wp.max(on[k] - off[k], 0.0)
-                lit[k] = lit[k] + contrast * contrast / (2.0 * read_variance + gain * (wp.max(on[k], 0.0) + wp.max(off[k], 0.0)))
+                lit[k] = lit[k] + contrast * contrast / (2.0 * code.read_variance + code.gain * (wp.max(on[k], 0.0) + wp.max(off[k], 0.0)))
                 signal[k] = signal[k] + wp.static(0.5 / channels) * contrast
 
         # the number under every choice of up to two doubtful digits, most significant digit first
-        base = expected.shape[0]
+        base = code.expected.shape[0]
         doubts = int_pack()
         poor = misfit[p]
         carried = carry_misfit[p]
         carry = edge[p]
         scale = float_pack()
         for k in range(pack):
-            scale[k] = wp.max(wp.min(poor[k], carried[k]) / float(order.shape[0] * channels), 1.0)
+            scale[k] = wp.max(wp.min(poor[k], carried[k]) / float(code.order.shape[0] * channels), 1.0)
         code0, code1, code2, code3 = int_pack(), int_pack(), int_pack(), int_pack()
         sum0, sum1, sum2, sum3 = int_pack(), int_pack(), int_pack(), int_pack()
-        for back in range(order.shape[0]):
-            frame = order[order.shape[0] - 1 - back]
+        for back in range(code.order.shape[0]):
+            frame = code.order[code.order.shape[0] - 1 - back]
             best, second, nearest, next_nearest = float_pack(EMPTY_CHI2), float_pack(EMPTY_CHI2), int_pack(), int_pack()
             for digit in range(base):
                 cost = float_pack()
                 for channel in range(channels):
-                    on = values[white * channels + channel, p]
-                    off = values[black * channels + channel, p]
+                    on = values[code.white * channels + channel, p]
+                    off = values[code.black * channels + channel, p]
                     reading = values[frame * channels + channel, p]
-                    level = expected[digit, channel]
+                    level = code.expected[digit, channel]
                     for k in range(pack):
                         miss = reading[k] - off[k] - level * wp.max(on[k] - off[k], 0.0)
-                        cost[k] = cost[k] + miss * miss * weight_of_reading(on[k], off[k], reading[k], LEVEL_ERROR, read_variance, gain)
+                        cost[k] = cost[k] + miss * miss * weight_of_reading(on[k], off[k], reading[k], LEVEL_ERROR, code)
                 for k in range(pack):
                     first_is = wp.where(cost[k] < best[k], 1, 0)
                     second_is = (1 - first_is) * wp.where(cost[k] < second[k], 1, 0)
@@ -319,17 +194,17 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                 d1 = nearest[k] + one * other
                 d2 = nearest[k] + two * other
                 d3 = nearest[k] + (one + two) * other
-                append_digit(d0, base, reflected, code0[k], sum0[k])
-                append_digit(d1, base, reflected, code1[k], sum1[k])
-                append_digit(d2, base, reflected, code2[k], sum2[k])
-                append_digit(d3, base, reflected, code3[k], sum3[k])
+                append_digit(d0, base, code.reflected, code0[k], sum0[k])
+                append_digit(d1, base, code.reflected, code1[k], sum1[k])
+                append_digit(d2, base, code.reflected, code2[k], sum2[k])
+                append_digit(d3, base, code.reflected, code3[k], sum3[k])
         u, error, result = float_pack(), float_pack(), byte_pack()
         for k in range(pack):
             reached = lit[k] >= wp.static(SHADOW_SIGMAS**2) and signal[k] < LARGEST  # False for NaN too
             least = wp.min(wp.min(code0[k], code1[k]), wp.min(code2[k], code3[k]))
             most = wp.max(wp.max(code0[k], code1[k]), wp.max(code2[k], code3[k]))
             settled = doubts[k] <= 2
-            reach = wp.where(reflected == 1, MAX_SPREAD, base)  # a plain code's next digit is at most so far
+            reach = wp.where(code.reflected == 1, MAX_SPREAD, base)  # a plain code's next digit is at most so far
             if carry[k] != NO_EDGE:
                 away = wp.max(wp.abs(carry[k] - code0[k]), wp.abs(carry[k] - 1 - code0[k]))
                 margin = wp.where(away > reach, DOUBT_CHI2, NEAR_CHI2) * scale[k]
@@ -341,12 +216,12 @@ def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
                     least = wp.min(least, carry[k] - 1)
                     most = wp.max(most, carry[k])
             loose = wp.min(wp.static(DOUBT_CHI2) / wp.sqrt(wp.max(lit[k], 1.0)), 1.0)
-            code, place, deviation = place_stripe(cut[k], reached, settled, False, wp.clamp(code0[k], least, most), least, most, most, 1,
+            outcome, place, deviation = place_stripe(cut[k], reached, settled, False, wp.clamp(code0[k], least, most), least, most, most, 1,
                                                   reach, loose, most - least + 1, stripe, extent)
             u[k] = place
             error[k] = deviation
             signal[k] = wp.where(deviation > 0.0, signal[k], 0.0)
-            result[k] = wp.uint8(code)
+            result[k] = wp.uint8(outcome)
         coordinate[p] = u
         sigma[p] = error
         amplitude[p] = signal

@@ -15,11 +15,11 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.elementary import TURN, cosine_of_turns, sine_of_turns
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading
 from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.angles import TURN, cosine_of_turns, sine_of_turns
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.pattern_frames import NoiseModel, cut_in, require_frames, saturation_masks
 from kernels.structured.phase import decode_phase
@@ -42,7 +42,9 @@ _SATURATED, _MULTIPATH, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.MULTIP
 def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, extent: float, response: Sequence[float] | None = None,
                  wave_error_px: float = 0.0, noise: NoiseModel) -> Decoded:
-    """Decode the coordinate from frames of several close periods that share offset and amplitude.
+    """Decode the coordinate from frames of several close periods that share offset and amplitude; not synchronised on CUDA.
+
+    UNDECIDED: another wrap fits about as well. MULTIPATH: none fits; both keep what fits best. Else as decode_phase.
 
     Args:
         frames: linear images of one channel.
@@ -53,11 +55,6 @@ def decode_micro(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         extent: projector pixels along the axis.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
         wave_error_px: error of the place beyond noise, added to its deviation.
-
-    Returns:
-        The coordinate on the device; not synchronised on CUDA. UNDECIDED: another wrap fits about as well. MULTIPATH: none fits;
-        both keep what fits best.
-        Else as decode_phase.
 
     Raises:
         ArrayError: no period has three shifts, or none has fewer frames than that; two places of the projector look alike.

@@ -25,16 +25,14 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
                      response: Sequence[float] | None = None, noise: NoiseModel) -> WrappedPhase:
     """Decode the wrapped phase of one period from direct light alone.
 
+    The phase is as decode_phase gives it; amplitude and offset are those of the direct light; ambient light has cancelled. SHADOWED: no
+    direct light. LOW_MODULATION: it does not follow the phase.
+
     Args:
         frames: linear images of one channel.
         numbers: [steps][carrier steps] frames; both even over a turn.
-        period_px: of the phase.
         offset_rad: phase of the wave at place 0 in the first step.
         response: the projector's light at even levels from 0 to 1, rising; None: linear.
-
-    Returns:
-        The phase as decode_phase gives it; amplitude and offset are those of the direct light; ambient light has cancelled.
-        SHADOWED: no direct light. LOW_MODULATION: it does not follow the phase.
 
     Raises:
         ArrayError: a frame is missing, does not exist or is given twice; a period that is not above zero.

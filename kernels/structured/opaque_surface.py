@@ -54,7 +54,7 @@ class Agreement(NamedTuple):
 
 def check_surface(depth: np.ndarray, sigma: np.ndarray, amplitude: np.ndarray, solved: np.ndarray, x: np.ndarray, y: np.ndarray,
                   projector_from_camera: np.ndarray, *, device: str) -> Agreement:
-    """Test decoded depths against each other.
+    """Test decoded depths against each other; pixels that are not solved have 0. Not synchronised on CUDA.
 
     Args:
         depth: [rows, cols] metres.
@@ -63,9 +63,6 @@ def check_surface(depth: np.ndarray, sigma: np.ndarray, amplitude: np.ndarray, s
         solved: [rows, cols] bool, which of them count.
         x, y: [rows, cols] lines of sight (x, y, -1) of the camera frame, x right, y up.
         projector_from_camera: [3, 4], x right, y down, z forward of the projector.
-
-    Returns:
-        The findings; not synchronised on CUDA. Pixels that are not solved have 0.
     """
     rows, cols = depth.shape
     flat = [wp.array(np.ascontiguousarray(values, np.float32).reshape(-1), dtype=wp.float32, device=device)

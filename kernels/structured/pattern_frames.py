@@ -21,11 +21,7 @@ class NoiseModel(NamedTuple):
 
 
 def require_frames(frames: Band, *numbers: int | None, channels: int = 1) -> None:
-    """Refuse frames that do not exist or are taken twice, or images of another number of channels.
-
-    Raises:
-        ArrayError: naming the frame or the channels.
-    """
+    """Refuse frames that do not exist or are taken twice, or images of another number of channels."""
     have = frames.values.shape[0] // frames.frame_count
     if have != channels:
         raise ArrayError(f"the frames have {have} channels, this decoder takes {channels}")
@@ -49,17 +45,11 @@ def saturation_masks(frames: Band, *sets: Sequence[int | None]) -> wp.array:
 
 
 def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: str) -> Band:
-    """Lay frames out on the device.
+    """Lay frames out on the device; on the CPU nothing is copied when the pixels divide into packs and lie without gaps.
 
     Args:
         values: [frames, pixels] or [frames, channels, pixels] float32, linear.
         saturated: [⌈frames / 8⌉, pixels] uint8 bits: frame f is bit f % 8 of byte f // 8; None when no reading saturates.
-
-    Returns:
-        The frames. On the CPU nothing is copied when the pixels divide into packs and lie without gaps.
-
-    Raises:
-        ArrayError: wrong type or shape, no frame, or too many pixels.
     """
     if values.ndim not in (2, 3) or values.dtype != np.float32 or 0 in values.shape:
         raise ArrayError(f"values are {values.dtype} {values.shape}: give [frames, pixels] or [frames, channels, pixels] float32")
@@ -73,17 +63,7 @@ def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: s
 
 
 def stack(images: Sequence[np.ndarray]) -> np.ndarray:
-    """Return images as `upload` takes them.
-
-    Args:
-        images: [rows, cols] or [rows, cols, channels] each, linear, of one size.
-
-    Returns:
-        [frames, pixels] or [frames, channels, pixels] float32.
-
-    Raises:
-        ArrayError: no image, or images of different sizes.
-    """
+    """Return images of one size, [rows, cols] or [rows, cols, channels], as `upload` takes them: [frames, (channels,) pixels] float32."""
     if not images:
         raise ArrayError("there are no images: give one a frame")
     for index, image in enumerate(images):
@@ -117,20 +97,12 @@ def cut_in(pack: int) -> Any:
 
 
 def check_noise(noise: NoiseModel) -> None:
-    """Refuse a noise model without read noise: the weight of a dark reading would be infinite.
-
-    Raises:
-        ArrayError: read noise that is not above zero, or a negative gain.
-    """
+    """Refuse a noise model without read noise, with which the weight of a dark reading would be infinite, or with a negative gain."""
     if not (np.isfinite(noise).all() and noise.read > 0 and noise.gain >= 0):
         raise ArrayError(f"the noise is read {noise.read:g}, gain {noise.gain:g}: give a read noise above 0 and a gain of 0 or more")
 
 
 def check_stripes(extent: float, stripe_px: float) -> None:
-    """Refuse stripes or a projector without width.
-
-    Raises:
-        ArrayError: either is not above zero.
-    """
+    """Refuse stripes or a projector without width."""
     if not (extent > 0 and stripe_px > 0):
         raise ArrayError(f"the projector has {extent:g} px, a stripe {stripe_px:g}: give both above 0")

@@ -17,10 +17,10 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.elementary import angle_of
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
-from kernels.structured.angles import angle_of
 from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
 from kernels.structured.response import bent_wave, phase_table, straighten
 
@@ -52,7 +52,10 @@ class WrappedPhase(NamedTuple):
 def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[float], shifts: Sequence[float], *,
                  black: int | None = None, response: Sequence[float] | None = None, wave_errors: Sequence[float] | None = None,
                  noise: NoiseModel) -> WrappedPhase:
-    """Decode the wrapped phase of every period.
+    """Decode the wrapped phase of every period, in order of first appearance; not synchronised on CUDA.
+
+    SATURATED: a frame of the period is. SHADOWED: the mean is not above ambient. LOW_MODULATION: the pattern is not seen in the light that
+    there is.
 
     Args:
         frames: linear images of one channel.
@@ -63,13 +66,9 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
         response: the projector's light at even levels from 0 to 1, rising, which bends the waves; None: linear.
         wave_errors: of each period's phase beyond noise, radians, in order of first appearance; None: none.
 
-    Returns:
-        Phases on the device, periods in order of first appearance; not synchronised on CUDA. SATURATED: a frame of the period
-        is. SHADOWED: the mean is not above ambient. LOW_MODULATION: the pattern is not seen in the light that there is.
-
     Raises:
-        ArrayError: lists of different lengths, a frame that does not exist or is given twice, a period with fewer than three
-            different shifts, a response under which the phase cannot be told.
+        ArrayError: lists of different lengths, a frame that does not exist or is given twice, a period with fewer than three different
+            shifts, a response under which the phase cannot be told.
     """
     check_noise(noise)
     require_frames(frames, *numbers, black)
@@ -102,11 +101,7 @@ def decode_phase(frames: Band, numbers: Sequence[int], periods_px: Sequence[floa
 
 
 def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
-    """Return all periods of several phases of the same pixels, in the order given.
-
-    Raises:
-        ArrayError: nothing is given, or the pixels differ.
-    """
+    """Return all periods of several phases of the same pixels, in the order given."""
     if not parts:
         raise ArrayError("no phase is given: give one or more")
     first = parts[0]
@@ -125,14 +120,7 @@ def join_periods(parts: Sequence[WrappedPhase]) -> WrappedPhase:
 
 
 def weights(shifts: np.ndarray, period_px: float) -> np.ndarray:
-    """Return the weights of each reading in A, C and S: rows of the pseudo-inverse.
-
-    Args:
-        shifts: [frames] turns.
-        period_px: for the message.
-
-    Returns:
-        [frames, 3].
+    """Return the weights [frames, 3] of each reading in A, C and S, rows of the pseudo-inverse, from shifts in turns.
 
     Raises:
         ArrayError: the shifts do not determine three unknowns.

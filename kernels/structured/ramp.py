@@ -39,7 +39,10 @@ _SATURATED, _SHADOWED, _OUT_OF_RANGE = int(Status.SATURATED), int(Status.SHADOWE
 
 def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None, white: int | None = None,
                 black: int | None = None, extent: float, response: np.ndarray | None = None, noise: NoiseModel) -> Decoded:
-    """Decode the coordinate from two of a rising ramp, a falling ramp and white.
+    """Decode the coordinate from two of a rising ramp, a falling ramp and white; not synchronised on CUDA.
+
+    The amplitude is half of the light. SATURATED: a frame that is used is. SHADOWED: the light is not above noise. OUT_OF_RANGE: outside
+    the projector by more than the noise explains.
 
     Args:
         frames: linear images of one channel.
@@ -47,10 +50,6 @@ def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None,
         black: frame of the ambient light; None: the images hold none.
         extent: projector pixels along the axis.
         response: [n] the projector's light at n even levels from 0 to 1, rising; None: linear.
-
-    Returns:
-        The coordinate on the device; amplitude is half of the light; not synchronised on CUDA. SATURATED: a frame that is used
-        is. SHADOWED: the light is not above noise. OUT_OF_RANGE: outside the projector by more than the noise explains.
 
     Raises:
         ArrayError: too few frames, a frame that does not exist or is given twice, a response that does not rise.
@@ -74,11 +73,7 @@ def decode_ramp(frames: Band, *, up: int | None = None, down: int | None = None,
 
 
 def ratio_table(response: np.ndarray | None, *, pair: bool) -> np.ndarray:
-    """Return the ratio at TABLE + 1 even places of a rising ramp, from 0 to 1.
-
-    Raises:
-        ArrayError: a response that does not rise.
-    """
+    """Return the ratio at TABLE + 1 even places of a rising ramp, from 0 to 1."""
     light = light_of(response, np.linspace(0, 1, TABLE + 1))
     return light / (light + light[::-1]) if pair else light
 

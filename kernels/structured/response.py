@@ -16,10 +16,10 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.elementary import TURN
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK
-from kernels.structured.angles import TURN
 
 BINS = 1024
 """Number of steps of the table over a turn: linear between them, the phase is good to 1e-5 radians at a response of level^2.2."""
@@ -32,14 +32,10 @@ MIN_SLOPE = 0.1
 
 
 def light_of(response: Sequence[float] | np.ndarray | None, levels: np.ndarray) -> np.ndarray:
-    """Return the light of a projector at levels, as a part of its white minus its black.
+    """Return the light of a projector at levels […], 0…1, as a part of its white minus its black, float64.
 
     Args:
         response: [n] the projector's light at n even levels from 0 to 1, rising; None: linear.
-        levels: [...] 0…1.
-
-    Returns:
-        [...] float64, 0…1.
 
     Raises:
         ArrayError: a response that does not rise.
@@ -65,12 +61,7 @@ def bent_wave(response: Sequence[float] | np.ndarray | None) -> np.ndarray:
 def modulated_wave(response: Sequence[float] | np.ndarray | None, carrier_weights: np.ndarray) -> np.ndarray:
     """Return what a carrier tells of a modulated wave over one turn of the wave, as a mean over the carrier's phases.
 
-    Args:
-        response: of the projector.
-        carrier_weights: [carrier steps, 3] of `phase.weights`, at even shifts.
-
-    Returns:
-        [GRID] float64; its scale is free.
+    The wave is [GRID], its scale free; `carrier_weights` is [carrier steps, 3] of `phase.weights`, at even shifts.
     """
     steps = len(carrier_weights)
     wave = 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(BINS // 4) / (BINS // 4))
@@ -83,15 +74,12 @@ def modulated_wave(response: Sequence[float] | np.ndarray | None, carrier_weight
 
 
 def fitted_curve(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a fit of sinusoids makes of a wave at GRID even phases.
+    """Return what a fit of sinusoids makes of a wave at GRID even phases: C + iS, and A.
 
     Args:
         wave: [GRID] light over one turn.
         weights: [frames, 3] of the fit's A, C and S.
         shifts: [frames] turns.
-
-    Returns:
-        [GRID] complex, C + iS; [GRID] A.
     """
     at = (np.arange(GRID)[:, None] / GRID - shifts) % 1.0
     light = np.interp(at, np.arange(GRID + 1) / GRID, np.append(wave, wave[0]))
@@ -99,16 +87,12 @@ def fitted_curve(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray) -> t
 
 
 def phase_table(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray, period_px: float) -> np.ndarray:
-    """Return how a fitted phase is put right.
-
-    Args:
-        wave, weights, shifts: as in `fitted_curve`; the wave spans 0 to 1.
-        period_px: for the message.
+    """Return how a fitted phase is put right, from a wave that spans 0 to 1 and what `fitted_curve` takes; the period is for the message.
 
     Returns:
         [BINS + 1, 4]: at even fitted phases from 0 to 2π what is added to the phase (radians), the slope of the true over the fitted phase,
-        the factor of the amplitude, and what is added to the offset over the amplitude put right, so that it is the reading at half of
-        the light.
+        the factor of the amplitude, and what is added to the offset over the amplitude put right, so that it is the reading at half of the
+        light.
 
     Raises:
         ArrayError: the fitted phase does not rise with the true one.

@@ -41,10 +41,11 @@ class Separation(NamedTuple):
 
 def separate(frames: Band, numbers: Sequence[int], shifts: Sequence[float], *, period_px: float, black: int | None = None,
              leak: float = 0.0) -> Separation:
-    """Separate direct from global light by the amplitude and the offset of one sinusoid.
+    """Separate direct from global light by the amplitude and the offset of one sinusoid; not synchronised on CUDA.
 
     A pixel that no direct light reaches is a result, not a fault: its direct part is that of the noise, 2σ √(π / frames) on average for
-    even shifts and readings of standard deviation σ, because an amplitude cannot be below 0; the global part is less by as much.
+    even shifts and readings of standard deviation σ, because an amplitude cannot be below 0; the global part is less by as much. SATURATED,
+    with values of 0: one of the frames is.
 
     Args:
         frames: linear images, of any number of channels.
@@ -53,9 +54,6 @@ def separate(frames: Band, numbers: Sequence[int], shifts: Sequence[float], *, p
         period_px: of the sinusoid, for the message.
         black: frame of the projector's black; None: the ambient light is taken off already, or there is none.
         leak: without such a frame, light of the projector's black over that of its white, 0 to below 1.
-
-    Returns:
-        The parts on the device; not synchronised on CUDA. SATURATED, with values of 0: one of the frames is.
 
     Raises:
         ArrayError: a frame does not exist or is given twice, fewer than three different shifts, or a leak that cannot be.

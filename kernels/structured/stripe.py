@@ -71,7 +71,7 @@ class PlaneMeeting(NamedTuple):
 
 def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str, albedo: np.ndarray | None = None,
                 rival: float = RIVAL) -> Stripe:
-    """Find the stripe's centre on each row or column.
+    """Find the stripe's centre on each row or column; not synchronised on CUDA.
 
     Args:
         signal: [rows, cols] float32, the frame less its background; 0 where it is not to be looked at.
@@ -80,12 +80,6 @@ def find_stripe(signal: np.ndarray, *, along: str, noise: float, device: str, al
         albedo: [rows, cols] float32, the root of the energy Σ signal² of each pixel over a sweep that this frame is part of, in
             proportion to its albedo; 0 where it is not known; None: nowhere.
         rival: part of the peak from which a second bright place on the line makes the stripe UNDECIDED; inf: it never does.
-
-    Returns:
-        The stripe on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: another `along`, or the image is not one plane.
 
     Source:
         Steger, "An unbiased detector of curvilinear structures", TPAMI 1998, section 2: the peak of the smoothed profile; the step is
@@ -264,13 +258,12 @@ def _stripe_kernel(first: int,
 def plane_depths(x: np.ndarray, y: np.ndarray, point: np.ndarray, normal: np.ndarray, *, along: str) -> PlaneMeeting:
     """Return the depth at which lines of sight (x, y, -1) through the camera's centre meet a plane of light.
 
+    It is NaN where the line meets the plane behind the camera, or at less than 1.1 degrees.
+
     Args:
         x, y: [n] float64.
         point: [3] on the plane, metres, camera frame. normal: [3] of the plane, unit.
         along: "row" or "column": whether `per_pixel` is for x or for y.
-
-    Returns:
-        NaN where the line meets the plane behind the camera, or at less than 1.1 degrees.
     """
     normal = np.asarray(normal, float)
     facing = x * normal[0] + y * normal[1] - normal[2]

@@ -176,20 +176,16 @@ def unsure_weight(code: int, sigma: float) -> float:
 
 def triangulate(x: np.ndarray, y: np.ndarray, columns: Decoded | None, rows: Decoded | None, projector: ProjectorModel, *,
                 near_m: float, far_m: float, max_residual_px: float, device: str) -> Triangulation:
-    """Return the depth of a band from one or both projector coordinates.
+    """Return the depth of a band from one or both projector coordinates; not synchronised on CUDA.
+
+    OUT_OF_RANGE: behind camera or projector, outside the projector's image, or the axes contradict each other. ILL_POSED: the coordinate
+    hardly changes with depth. Else the decoder's status.
 
     Args:
-        x: [pixels] where each line of sight crosses z = -1 of the camera frame, lens distortion undone: (x, y, -1) is along it.
-        y: [pixels] the same, up.
-        columns: the decoded column u, or None. Where both axes are decoded both count, weighted by 1/σ²; where one is, it alone.
-        rows: the decoded row v, or None.
-        projector: size, lens and pose.
+        x, y: [pixels] where each line of sight crosses z = -1 of the camera frame, lens distortion undone, y up: (x, y, -1) is along it.
+        columns, rows: the decoded column u and row v, or None; where both axes are decoded both count, weighted by 1/σ².
         near_m, far_m: range of depths outside which a result is OUT_OF_RANGE.
         max_residual_px: with both axes, how far the decoded place may lie from the point's; beyond, it is OUT_OF_RANGE.
-
-    Returns:
-        Depth on the device; not synchronised on CUDA. OUT_OF_RANGE: behind camera or projector, outside the projector's image, or the
-        axes contradict each other. ILL_POSED: the coordinate hardly changes with depth. Else the decoder's status.
 
     Raises:
         ArrayError: neither axis is given, or the counts of pixels differ.

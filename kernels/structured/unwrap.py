@@ -16,10 +16,10 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.elementary import TURN
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import OK, Status
-from kernels.structured.angles import TURN
 from kernels.structured.decoded import Decoded, unwritten_decoded
 from kernels.structured.phase import WrappedPhase
 
@@ -48,15 +48,7 @@ _OUT_OF_RANGE, _UNDECIDED, _MULTIPATH = int(Status.OUT_OF_RANGE), int(Status.UND
 
 
 def unwrap_range(periods_px: tuple[float, ...], extent: float) -> float:
-    """Return how far apart two places must be before the periods show the same phases again.
-
-    Args:
-        periods_px: all of them.
-        extent: as far as is of interest.
-
-    Returns:
-        Projector pixels; infinity when it is beyond the extent.
-    """
+    """Return how far apart, in projector pixels, places are at which the periods show the same phases; infinity beyond the extent."""
     shortest, others = min(periods_px), np.array(periods_px)
     offsets = np.arange(1, int(np.ceil(extent / shortest))) * shortest
     turns = offsets[:, None] / others
@@ -69,16 +61,14 @@ def unwrap_range(periods_px: tuple[float, ...], extent: float) -> float:
 
 
 def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
-    """Return the coordinate that fits the phases of all periods best.
+    """Return the coordinate that fits the phases of all periods best; not synchronised on CUDA.
+
+    The amplitude is the mean over the periods. UNDECIDED: another wrap within the projector fits about as well. MULTIPATH: none fits. Both
+    keep the coordinate that fits best, and its deviation in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has
+    no phase says why.
 
     Args:
-        wrapped: phases of one or more periods.
         extent: projector pixels along the axis.
-
-    Returns:
-        The coordinate on the device; amplitude is the mean over the periods; not synchronised on CUDA. UNDECIDED: another wrap
-        within the projector fits about as well. MULTIPATH: none fits. Both keep the coordinate that fits best, and its deviation
-        in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has no phase says why.
 
     Raises:
         ArrayError: the periods repeat within less than MIN_COVER of the projector.
@@ -102,16 +92,14 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
 def unwrap_by_code(wrapped: WrappedPhase, coarse: Decoded, *, stripe_px: float, extent: float) -> Decoded:
     """Return each phase in the wrap nearest to a stripe of another code; several periods are averaged by their variance.
 
-    Args:
-        wrapped: phases of one or more periods.
-        coarse: the same pixels from a binary, Gray, XOR or k-ary code.
-        stripe_px: its finest stripe, at most the shortest period. If it is more than half of it, places farther than WRAP_MARGIN from
-            the coordinate that `coarse` gives are UNDECIDED: give edges refined (edges.py), not the stripes' centres.
-        extent: projector pixels along the axis.
+    Not synchronised on CUDA. UNDECIDED: two wraps are about as near; the nearest is kept. OUT_OF_RANGE: outside. Else the status of the
+    code, or of the first period that has no phase.
 
-    Returns:
-        The coordinate on the device; not synchronised on CUDA. UNDECIDED: two wraps are about as near; the nearest is kept.
-        OUT_OF_RANGE: outside. Else the status of the code, or of the first period that has no phase.
+    Args:
+        coarse: the same pixels from a binary, Gray, XOR or k-ary code.
+        stripe_px: its finest stripe, at most the shortest period. If it is more than half of it, places farther than WRAP_MARGIN from the
+            coordinate that `coarse` gives are UNDECIDED: give edges refined (edges.py), not the stripes' centres.
+        extent: projector pixels along the axis.
 
     Raises:
         ArrayError: stripes too wide to number the periods, or other pixels.

@@ -154,13 +154,9 @@ def place(
     spacing: float,
     mean_z: float,
 ) -> wp.array:
-    """Return the camera-frame z of every pixel, the mean of each component at mean_z.
+    """Return the camera-frame z of every pixel, the mean of each component at mean_z: [rows, cols] float32, 0 outside the runs.
 
-    Returns:
-        [rows, cols] float32, 0 outside the runs.
-
-    Convention:
-        Reads one number per run back to the host, once (orthographic) or twice (perspective).
+    Reads one number per run back to the host, once (orthographic) or twice (perspective).
     """
     device, count = grid.device, runs.row.size
     height = wp.zeros((grid.rows, grid.cols), dtype=wp.float32, device=device)

@@ -117,8 +117,7 @@ def _distrust_loops(first: int,
 def loop_noise(slopes: Slopes, *, grid: Grid) -> float:
     """Return the standard deviation of the sum of slopes around four pixels, as their median shows it.
 
-    Convention:
-        Reads a sample of the loops back to the host once.
+    Reads a sample of the loops back to the host once.
     """
     start, count = grid.pitch, grid.rows * grid.pitch
     stride = max(1, count // SAMPLES)
@@ -131,26 +130,16 @@ def loop_noise(slopes: Slopes, *, grid: Grid) -> float:
 
 
 def distrust_loops(slopes: Slopes, *, noise: float, grid: Grid) -> Slopes:
-    """Return the same slopes with lower weights for edges across contradictions.
-
-    Args:
-        slopes: of all pairs of neighbours.
-        noise: of loop_noise.
-    """
+    """Return the same slopes of all pairs of neighbours, with lower weights for edges across contradictions; `noise` is of loop_noise."""
     lowered = slopes._replace(weights=grid.no_edges())
     run(_distrust_loops, grid.cells, [*slopes, max(LEAST_LOOP, NOISE_LOOPS * noise)], [lowered.weights])
     return lowered
 
 
 def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: float) -> Breaks:
-    """Cut a surface where its normals turn abruptly or contradict each other.
+    """Cut a surface where its normals turn abruptly or contradict each other; reads slopes and weights back to the host.
 
-    Args:
-        slopes: of all pairs of neighbours.
-        spacing: distance of neighbouring pixels in the plane of x and y.
-
-    Convention:
-        Reads slopes and weights back to the host.
+    `slopes` are of all pairs of neighbours, `spacing` is their mean distance in the plane of x and y.
     """
     noise = loop_noise(slopes, grid=grid)
     lowered = distrust_loops(slopes, noise=noise, grid=grid)
@@ -160,14 +149,9 @@ def find_breaks(slopes: Slopes, surface: NormalMap, *, grid: Grid, spacing: floa
 
 
 def integrate_broken(breaks: Breaks, *, grid: Grid, solve: Solve) -> Broken:
-    """Integrate slopes, with breaks where the normals say so.
+    """Integrate slopes, with breaks where the normals say so; reads heights back to the host where the normals turn abruptly anywhere.
 
-    Args:
-        breaks: of find_breaks.
-        solve: integrates slopes, improving the heights that it is given; the last time it may overwrite the slopes.
-
-    Convention:
-        Reads heights back to the host where the normals turn abruptly anywhere.
+    `solve` integrates slopes, improving the heights that it is given; the last time it may overwrite the slopes.
     """
     lowered, noise, found, kept = breaks
     height = grid.zeros()

@@ -64,7 +64,6 @@ def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid
         slope: of the edges to the right and of those down, each [size], in units of the spacing.
         weight: of these edges before loops are looked at; 0 is no edge.
         left: weights that the loops leave.
-        grid: the layout of slope, weight and left.
         spacing: distance of neighbouring pixels in the plane of x and y.
     """
     there = np.stack([plane > 0 for plane in weight])
@@ -110,12 +109,7 @@ def _pieces(count: int) -> Iterator[slice]:
 
 
 def _turned(surface: NormalMap, there: np.ndarray, grid: Grid) -> np.ndarray:
-    """Return [2, size] bool, the edges at which the normals turn abruptly, and not as a thin round rod does.
-
-    Args:
-        there: [2, size] bool, the edges.
-        grid: the layout of the edges.
-    """
+    """Return [2, size] bool, the edges at which the normals turn abruptly, and not as a thin round rod does."""
     turn = [angle.numpy() for angle in pair_turns(surface, grid=grid)]
     stride = max(1, grid.size // TURNS)
     while math.gcd(stride, grid.pitch) > 1:  # else a few columns alone would tell
@@ -160,10 +154,7 @@ def _facing(normal: np.ndarray, ray: np.ndarray, surface: NormalMap) -> np.ndarr
 def _squared_end(facing: np.ndarray, facing_inner: np.ndarray, alike: np.ndarray) -> np.ndarray:
     """Return the squared cosine to the viewer a pixel beyond the last cell of a fragment; on a sphere it falls steadily to 0.
 
-    Args:
-        facing: cosine at the last cell.
-        facing_inner: at the cell before it.
-        alike: whether that cell belongs to the same fragment.
+    `facing` is the cosine at the last cell, `facing_inner` at the cell before it, `alike` whether that belongs to the same fragment.
     """
     here = np.maximum(facing, 0) ** 2
     return here - np.where(alike, np.maximum(np.maximum(facing_inner, 0) ** 2 - here, 0), 0)

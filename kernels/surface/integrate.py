@@ -57,25 +57,19 @@ def integrate_normals(
 ) -> Integration:
     """Integrate a normal map to a height map by weighted least squares.
 
+    Normals do not tell the distance between parts of the mask that do not touch, so the mean of each part is mean_z.
+
     Args:
         normal: unit normals, n_z > 0 towards an orthographic viewer. A pixel whose normal is not finite, or shorter
             than a half, counts as outside the mask.
         mask: where there is surface; any shape, with holes, in any number of parts.
-        x: plane coordinates of the pixels: metres (or any unit of length) for an orthographic camera, the slope of the
+        x, y: plane coordinates of the pixels: metres (or any unit of length) for an orthographic camera, the slope of the
             ray, x of (x, y, −1), for a perspective one. Lens distortion is in these numbers.
-        y: the same, upwards.
-        perspective: which of the two the camera is.
         mean_z: mean camera-frame z of the surface; negative for a perspective camera.
         sigma: standard errors of the normals; None: all are sure.
         cuts: edges between a pixel and its right neighbour, and between it and the one below, that the surface breaks along; what
             they cut off is a part.
-        options: None for the defaults.
-        device: "cpu" or "cuda:0".
         progress: told the fraction done, 0…1.
-
-    Returns:
-        Height, and how the solve went. Normals do not tell the distance between parts of the mask that do not touch, so
-        the mean of each part is mean_z.
 
     Raises:
         ArrayError: shapes do not fit, the mask is empty, or mean_z cannot be.
@@ -129,10 +123,9 @@ def integrate_normals(
 
 
 def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -> None:
-    """Take edges away.
+    """Take edges away, in place.
 
     Args:
-        weights: of the edges of a grid; changed.
         cuts: [rows, cols] bool, edges to the right and edges down.
     """
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):

@@ -18,7 +18,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.surface.shadows import Projection, between_pixels, project
+from kernels.surface.shadows import Camera, Projection, between_pixels, project
 
 OPENING = 0.25
 """Largest radius of a group over its distance at which it sends as one patch: the light in a right-angled groove is then within 3 %."""
@@ -49,11 +49,7 @@ class PatchTree(NamedTuple):
 
 
 def group_patches(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cells: np.ndarray, radiance: np.ndarray) -> PatchTree:
-    """Return the tree of patches that lie in the same square of their grid and face the same way.
-
-    Args:
-        points, normals, areas, cells, radiance: as for gather_light.
-    """
+    """Return the tree of patches that lie in the same square of their grid and face the same way, given as for gather_light."""
     sector = np.floor((np.arctan2(normals[:, 1], normals[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
     key = sector << 30 | _interleave(cells[:, 0]) | _interleave(cells[:, 1]) << 1
     order = np.argsort(key, kind="stable")
@@ -89,7 +85,7 @@ def group_patches(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, ce
 
 def gather_light(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cells: np.ndarray, radiance: np.ndarray, height: wp.array,
                  mask: wp.array, projection: Projection, *, device: str, opening: float | None = None) -> np.ndarray:
-    """Return what each patch of albedo 1 sends on of the light of all others: Σⱼ K[i, j] radianceⱼ.
+    """Return what each patch of albedo 1 sends on of the light of all others: Σⱼ K[i, j] radianceⱼ; waits for the device.
 
     K[i, j] = cosᵢ cosⱼ Aⱼ / (π r² + Aⱼ), or 0 where something stands between: the distance between neighbours is kept from vanishing by
     the size of the patch.
@@ -101,15 +97,7 @@ def gather_light(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cel
         cells: [n, 2] int, row and column of each patch in a grid of patches, each below 32768.
         radiance: [n, values], for example of each channel under each light.
         height: [rows, cols] float32 camera-frame z.
-        mask: [rows, cols] uint8.
-        projection: of the camera.
         opening: of groups, in place of OPENING; 0: every patch sends on its own.
-
-    Returns:
-        [n, values] float32. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     count = len(points)
     if points.shape != (count, 3) or normals.shape != (count, 3) or areas.shape != (count,) or count == 0:
@@ -132,7 +120,7 @@ def gather_light(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cel
                    [upload(points, wp.vec3), upload(normals, wp.vec3), upload(tree.centre, wp.vec3), upload(tree.facing, wp.vec3),
                     upload(tree.area, wp.float32), upload(tree.radius, wp.float32), upload(tree.following, wp.int32),
                     upload(tree.patch, wp.int32), upload(sent.reshape(-1, packs, VALUES), pack), float(opening), height, mask,
-                    projection.perspective, projection.scale, projection.centre], [arriving], device=device, uneven=True)
+                    projection.on_device()], [arriving], device=device, uneven=True)
     return arriving.numpy().reshape(count, -1)[:, :values]
 
 
@@ -145,18 +133,17 @@ def _interleave(number: np.ndarray) -> np.ndarray:
 
 
 @wp.func
-def _hidden(a: wp.vec3, b: wp.vec3, height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), perspective: bool,
-            scale: wp.vec2, centre: wp.vec2) -> bool:
+def _hidden(a: wp.vec3, b: wp.vec3, height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), camera: Camera) -> bool:
     between = bool(False)  # a literal could not change inside the loop
-    crossed = wp.length(project(b, perspective, scale, centre) - project(a, perspective, scale, centre))
+    crossed = wp.length(project(b, camera) - project(a, camera))
     steps = wp.min(int(wp.floor(crossed)) - 1, SIGHT_STEPS)  # below 1 between neighbours
     for step in range(steps):
         point = a + (b - a) * (float(step + 1) / float(steps + 1))
-        at = project(point, perspective, scale, centre)
+        at = project(point, camera)
         u, v = at[0] - 0.5, at[1] - 0.5
         c, r = int(wp.floor(u)), int(wp.floor(v))
         if r >= 0 and c >= 0 and r < mask.shape[0] - 1 and c < mask.shape[1] - 1:
-            margin = SIGHT_MARGIN_PIXELS * wp.where(perspective, -point[2], 1.0) / (0.5 * (scale[0] + scale[1]))
+            margin = SIGHT_MARGIN_PIXELS * wp.where(camera.perspective, -point[2], 1.0) / (0.5 * (camera.scale[0] + camera.scale[1]))
             whole = mask[r, c] * mask[r, c + 1] * mask[r + 1, c] * mask[r + 1, c + 1]
             between = between or (whole != wp.uint8(0) and between_pixels(height, u, v) > point[2] + margin)
     return between
@@ -176,9 +163,7 @@ def _gather_kernel(first: int,
                    opening: float,
                    height: wp.array2d(dtype=float),
                    mask: wp.array2d(dtype=wp.uint8),
-                   perspective: bool,
-                   scale: wp.vec2,
-                   centre: wp.vec2,
+                   camera: Camera,
                    # outputs
                    arriving: wp.array2d(dtype=pack_type(VALUES, wp.float32))):  # [n, packs]
     i = first + wp.tid()
@@ -194,7 +179,7 @@ def _gather_kernel(first: int,
                 here = wp.max(wp.dot(normal, way) / far, 0.0)
                 there = wp.max(-wp.dot(facing[node], way) / far, 0.0)
                 value = here * there / (wp.pi * far * far + areas[node])
-                if value > LEAST_FACTOR and _hidden(point, centres[node], height, mask, perspective, scale, centre):
+                if value > LEAST_FACTOR and _hidden(point, centres[node], height, mask, camera):
                     value = 0.0
                 if value > 0.0:
                     for k in range(arriving.shape[1]):

@@ -165,8 +165,6 @@ class Multigrid:
     """The hierarchy over one grid's edge weights.
 
     Args:
-        grid: the finest layout.
-        weights: of its edges.
         target: the finest right-hand side, read by `cycle`.
         value: where `cycle` leaves its answer.
         scratch: an array of the finest layout that `cycle` may overwrite, finite.

@@ -140,12 +140,10 @@ class NormalMap:
 
     Args:
         normal: [3, rows, cols] float32, camera frame.
-        mask: [rows, cols], above 0 where there is surface.
         x: [rows, cols] plane coordinates of the pixels, to the right; may be a view of one row.
         y: the same, upwards.
         sigma: [rows, cols] standard errors of the normals, degrees; None: all are sure.
         perspective: whether x and y are slopes of rays rather than positions.
-        device: where bands are sent.
     """
 
     def __init__(self, normal: np.ndarray, mask: np.ndarray, x: np.ndarray, y: np.ndarray, sigma: np.ndarray | None, *,
@@ -171,11 +169,7 @@ class NormalMap:
                 yield NormalBand(first, rows, supported.normal, usable, x, y, supported.trust)
 
     def at(self, row: np.ndarray, col: np.ndarray) -> PixelNormals:
-        """Return the unit normals of some pixels; waits for the device.
-
-        Args:
-            row, col: [n] int, which may lie outside the image.
-        """
+        """Return the unit normals of some pixels, which may lie outside the image; waits for the device."""
         inside = (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
         place = np.where(inside, row, 0), np.where(inside, col, 0)
         normal = np.stack([plane[place] for plane in self._normal]).astype(np.float32)

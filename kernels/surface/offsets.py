@@ -27,7 +27,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.surface.shadows import FIRST_STEP, MARGIN_PIXELS, MARGIN_SLOPE, Projection, project, unproject
+from kernels.surface.shadows import FIRST_STEP, MARGIN_PIXELS, MARGIN_SLOPE, Camera, Projection, pixel_span, project, surface_point
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,9 +52,7 @@ def _march(first: int,
            part: wp.array2d(dtype=wp.int32),
            thickness: wp.array2d(dtype=float),
            moving: int,
-           perspective: bool,
-           scale: wp.vec2,
-           centre: wp.vec2,
+           camera: Camera,
            # outputs
            highest: wp.array2d(dtype=float),
            lowest: wp.array2d(dtype=float),
@@ -64,8 +62,8 @@ def _march(first: int,
     row, col = pixels[n][0], pixels[n][1]
     rows, cols = part.shape[0], part.shape[1]
     moves = part[row, col] == moving
-    start = unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
-    pixel = wp.where(perspective, -start[2], 1.0) / (0.5 * (scale[0] + scale[1]))
+    start = surface_point(row, col, height, camera)
+    pixel = pixel_span(start[2], camera)
     for light in range(toward.shape[0]):
         way = toward[light]
         across = wp.sqrt(way[0] * way[0] + way[1] * way[1])
@@ -75,9 +73,9 @@ def _march(first: int,
         own = wp.uint8(0)
         for _ in range(rows + cols):
             point = start + travelled * way
-            at = project(point, perspective, scale, centre)
+            at = project(point, camera)
             c, r = int(wp.floor(at[0])), int(wp.floor(at[1]))
-            if c < 0 or r < 0 or c >= cols or r >= rows or (perspective and point[2] >= 0.0):
+            if c < 0 or r < 0 or c >= cols or r >= rows or (camera.perspective and point[2] >= 0.0):
                 break
             if part[r, c] >= 0:
                 if (part[r, c] == moving) == moves:
@@ -85,7 +83,7 @@ def _march(first: int,
                         own = wp.uint8(1)
                         break
                 else:
-                    gap = wp.where(perspective, wp.log(point[2] / height[r, c]), height[r, c] - point[2])
+                    gap = wp.where(camera.perspective, wp.log(point[2] / height[r, c]), height[r, c] - point[2])
                     top, bottom = wp.max(top, gap), wp.min(bottom, gap)
                     rear = wp.min(rear, gap - thickness[r, c])
             travelled += stride
@@ -97,7 +95,9 @@ def _march(first: int,
 
 def march_part(pixels: wp.array, toward: wp.array, height: wp.array, part: wp.array, thickness: wp.array, moving: int,
                projection: Projection) -> PartShadows:
-    """March from pixels to distant lights over a surface of which one part moves.
+    """March from pixels to distant lights over a surface of which one part moves; not synchronised on CUDA.
+
+    Gaps are in the unit of height, or for a perspective camera in log depth.
 
     Args:
         pixels: [n] vec2i, row and column of pixels of some part.
@@ -106,19 +106,12 @@ def march_part(pixels: wp.array, toward: wp.array, height: wp.array, part: wp.ar
         part: [rows, cols] int32, the part of each pixel, below 0 outside.
         thickness: [rows, cols] float32, guessed distance from front to back, in the unit of the gaps.
         moving: number of the part that moves against all others.
-        projection: of the camera; its unit is that of height.
-
-    Returns:
-        On the device of height; gaps in the unit of height, or for a perspective camera in log depth. Not synchronised on CUDA.
-
-    Raises:
-        ArrayError: height, part and thickness are of different shapes.
     """
     if not height.shape == part.shape == thickness.shape:
         raise ArrayError(f"height is {height.shape}, part {part.shape}, thickness {thickness.shape}: give one of each for every pixel")
     shape, device = (pixels.shape[0], toward.shape[0]), height.device.alias
     found = PartShadows(*(wp.empty(shape, dtype=float, device=device) for _ in range(3)), wp.empty(shape, dtype=wp.uint8, device=device))
-    inputs = [pixels, toward, height, part, thickness, moving, *projection]
+    inputs = [pixels, toward, height, part, thickness, moving, projection.on_device()]
     devices.launch(_march, shape[0], inputs, list(found), device=device, uneven=True)
     return found
 
@@ -157,7 +150,6 @@ def weigh_offsets(shadows: PartShadows, odds: np.ndarray, on_part: np.ndarray, g
     """Return the likelihood of offsets between -reach and reach. Waits for the device.
 
     Args:
-        shadows: of n pixels and some lights.
         odds: [n, lights] log odds of shadow.
         on_part: [n] bool, whether the pixel lies on the part that moves.
         group: [lights] int, the group of each light, below GROUPS.
@@ -182,12 +174,7 @@ def weigh_offsets(shadows: PartShadows, odds: np.ndarray, on_part: np.ndarray, g
 
 
 def choose_offset(evidence: Evidence, *, least_sigma: float) -> Offset:
-    """Return the offset that the evidence speaks for, and between which bounds it stays open.
-
-    Args:
-        evidence: of one part.
-        least_sigma: standard deviation below which no offset is known.
-    """
+    """Return the offset that the evidence speaks for, and its bounds; its standard deviation is `least_sigma` or more."""
     offsets, gain = evidence
     whole = gain.sum(axis=0)
     best = int(np.argmax(whole))

@@ -41,10 +41,9 @@ class Parts(NamedTuple):
 
 
 def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
-    """Connect fragments that belong together.
+    """Connect fragments that belong together; their labels become those of the parts.
 
     Args:
-        found: the fragments; their labels become those of the parts.
         height: [size] heights in units of the spacing, integrated without the cut edges: each fragment has a constant of its own.
         noise: standard deviation of the sum of slopes around four pixels.
     """
@@ -66,10 +65,7 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
 def assemble(found: Fragments, parts: Parts, height: np.ndarray) -> np.ndarray:
     """Return [count] what is to be added to the heights of each part so that parts meet along their common edges in the mean.
 
-    Args:
-        found: the fragments.
-        parts: into which they were connected.
-        height: [size] heights of the parts, each with a constant of its own, in units of the spacing.
+    `height` is [size] heights of the parts, each with a constant of its own, in units of the spacing.
     """
     edges = np.flatnonzero(parts.between)
     first, second = parts.label[found.first[edges]], parts.label[found.second[edges]]

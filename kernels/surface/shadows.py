@@ -7,7 +7,7 @@ point's own, which may be thin, only the visible front does: the line must pass 
 into the picture of that part to where it leaves passes behind the part.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -23,12 +23,27 @@ NO_REACH = 1.0e30
 """Reach of the march to a distant light: a length beyond every scene."""
 
 
+@wp.struct
+class Camera:
+    """A projection, as kernels take it."""
+
+    perspective: bool
+    scale: wp.vec2
+    centre: wp.vec2
+
+
 class Projection(NamedTuple):
     """The projection of camera-frame points to the picture, without lens distortion."""
 
     perspective: bool
     scale: wp.vec2  # perspective: focal lengths in pixels; orthographic: pixels per unit
     centre: wp.vec2  # principal point in pixels
+
+    def on_device(self) -> Any:
+        """Return the `Camera` of this projection."""
+        camera = Camera()
+        camera.perspective, camera.scale, camera.centre = self
+        return camera
 
 
 class Extent(NamedTuple):
@@ -39,12 +54,7 @@ class Extent(NamedTuple):
 
 
 def extent_of(height: np.ndarray, mask: np.ndarray) -> Extent:
-    """Return where a surface is.
-
-    Args:
-        height: [rows, cols] camera-frame z.
-        mask: [rows, cols], 0 outside the surface.
-    """
+    """Return where a surface is: height is camera-frame z, the mask 0 outside the surface."""
     inside = mask != 0
     rows, cols = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
@@ -52,18 +62,45 @@ def extent_of(height: np.ndarray, mask: np.ndarray) -> Extent:
     return Extent(wp.vec4i(int(rows[0]), int(cols[0]), int(rows[-1]), int(cols[-1])), float(height[inside].max()))
 
 
+@wp.struct
+class Relief:
+    """A surface over which lines to lights are marched."""
+
+    height: wp.array2d(dtype=float)  # [rows, cols] camera-frame z
+    mask: wp.array2d(dtype=wp.uint8)  # [rows, cols] 0 outside the surface, elsewhere the number of the part; without breaks it is one part
+    camera: Camera
+    box: wp.vec4i  # as in Extent
+    highest: float
+
+
+def relief_of(height: wp.array, mask: wp.array, projection: Projection, extent: Extent | None = None) -> Any:
+    """Return the `Relief` of a surface on the device; its extent is found where it is not given."""
+    relief = Relief()
+    relief.height, relief.mask, relief.camera = height, mask, projection.on_device()
+    relief.box, relief.highest = extent or extent_of(height.numpy(), mask.numpy())
+    return relief
+
+
 @wp.func
-def project(point: wp.vec3, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec2:
+def project(point: wp.vec3, camera: Camera) -> wp.vec2:
     """Return the continuous image coordinates of a camera-frame point."""
-    far = wp.where(perspective, wp.max(-point[2], 1.0e-9), 1.0)
-    return wp.vec2(centre[0] + scale[0] * point[0] / far, centre[1] - scale[1] * point[1] / far)
+    far = wp.where(camera.perspective, wp.max(-point[2], 1.0e-9), 1.0)
+    return wp.vec2(camera.centre[0] + camera.scale[0] * point[0] / far, camera.centre[1] - camera.scale[1] * point[1] / far)
 
 
 @wp.func
-def unproject(u: float, v: float, z: float, perspective: bool, scale: wp.vec2, centre: wp.vec2) -> wp.vec3:
-    """Return the camera-frame point of height z at continuous image coordinates."""
-    far = wp.where(perspective, -z, 1.0)
-    return wp.vec3((u - centre[0]) / scale[0] * far, (centre[1] - v) / scale[1] * far, z)
+def surface_point(row: int, col: int, height: wp.array2d(dtype=float), camera: Camera) -> wp.vec3:
+    """Return the camera-frame point of the surface in the middle of a pixel."""
+    z = height[row, col]
+    far = wp.where(camera.perspective, -z, 1.0)
+    return wp.vec3((float(col) + 0.5 - camera.centre[0]) / camera.scale[0] * far,
+                   (camera.centre[1] - (float(row) + 0.5)) / camera.scale[1] * far, z)
+
+
+@wp.func
+def pixel_span(z: float, camera: Camera) -> float:
+    """Return what a pixel spans at a camera-frame z."""
+    return wp.where(camera.perspective, -z, 1.0) / (0.5 * (camera.scale[0] + camera.scale[1]))
 
 
 @wp.func
@@ -77,44 +114,39 @@ def between_pixels(height: wp.array2d(dtype=float), u: float, v: float) -> float
 
 
 @wp.func
-def in_shadow_within(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), row: int, col: int, toward: wp.vec3,
-                     reach: float, perspective: bool, scale: wp.vec2, centre: wp.vec2, box: wp.vec4i, highest: float) -> bool:
+def in_shadow_within(relief: Relief, row: int, col: int, toward: wp.vec3, reach: float) -> bool:
     """Return whether the surface hides a light in this direction from this pixel before `reach`: what lies behind a light hides nothing.
 
     The march ends where it leaves the box of the surface, or rises above its highest point other than from behind a part.
-
-    The mask is 0 outside the surface and elsewhere the number of the part that a pixel lies on; a surface without breaks is one part.
     """
-    z = height[row, col]
-    start = unproject(float(col) + 0.5, float(row) + 0.5, z, perspective, scale, centre)
-    pixel = wp.where(perspective, -z, 1.0) / (0.5 * (scale[0] + scale[1]))  # what a pixel spans here
+    start = surface_point(row, col, relief.height, relief.camera)
+    pixel = pixel_span(start[2], relief.camera)
     across = wp.sqrt(toward[0] * toward[0] + toward[1] * toward[1])
     if across < 1.0e-4:
         return False  # along the line of sight
     stride = pixel / across
     travelled = FIRST_STEP * stride
     hidden, behind = bool(False), bool(False)  # literals could not change inside the loop
-    own = int(mask[row, col])
+    box = relief.box
+    own = int(relief.mask[row, col])
     last = own  # the part that the line met last; `behind`, whether it ran behind that part's front
-    for _ in range(mask.shape[0] + mask.shape[1]):
+    for _ in range(relief.mask.shape[0] + relief.mask.shape[1]):
         if travelled >= reach:
             break
         point = start + travelled * toward
-        if point[2] > highest and toward[2] >= 0.0 and not behind:
+        if point[2] > relief.highest and toward[2] >= 0.0 and not behind:
             break
-        at = project(point, perspective, scale, centre)
+        at = project(point, relief.camera)
         u, v = at[0] - 0.5, at[1] - 0.5
         c, r = int(wp.floor(u)), int(wp.floor(v))
         if c < box[1] - 1 or r < box[0] - 1 or c > box[3] or r > box[2]:
             break
-        if c < 0 or r < 0 or c >= mask.shape[1] - 1 or r >= mask.shape[0] - 1:
+        if c < 0 or r < 0 or c >= relief.mask.shape[1] - 1 or r >= relief.mask.shape[0] - 1:
             break
-        part = int(mask[r, c])
-        if part != 0 and int(mask[r, c + 1]) == part and int(mask[r + 1, c]) == part and int(mask[r + 1, c + 1]) == part:
-            fu, fv = u - float(c), v - float(r)
-            upper = height[r, c] * (1.0 - fu) + height[r, c + 1] * fu
-            lower = height[r + 1, c] * (1.0 - fu) + height[r + 1, c + 1] * fu
-            above = upper * (1.0 - fv) + lower * fv - point[2]
+        part = int(relief.mask[r, c])
+        if (part != 0 and int(relief.mask[r, c + 1]) == part and int(relief.mask[r + 1, c]) == part
+                and int(relief.mask[r + 1, c + 1]) == part):
+            above = between_pixels(relief.height, u, v) - point[2]
             under = above > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across
             hidden = under
             if part != own:

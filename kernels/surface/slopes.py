@@ -163,7 +163,6 @@ def pair_slopes(surface: NormalMap, *, grid: Grid, spacing: float) -> tuple[Slop
     The weight of a pair is the harmonic mean of the trust in its pixels, times the cosines.
 
     Args:
-        grid: the layout of the result.
         spacing: mean distance of neighbouring pixels in the plane of x and y.
 
     Returns:

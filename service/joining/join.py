@@ -9,8 +9,8 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status
-from kernels.surface.joined import Joined, join_depth
 from service.errors import RequestError
+from service.joining.depth_and_normals import Joined, join_depth
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.solve import JoinRequest

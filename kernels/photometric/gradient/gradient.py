@@ -12,9 +12,9 @@ from typing import NamedTuple
 import warp as wp
 
 from kernels import device as devices
+from kernels.normal_equations import CONFIDENCE_HALF
 from kernels.packs import zeros
 from kernels.photometric.gradient.moments import Moments
-from kernels.photometric.lambertian.least_squares import CONFIDENCE_HALF
 from kernels.status import DARK, ILL_POSED, OK
 
 MIN_LENGTH = 0.05
@@ -41,15 +41,11 @@ class GradientFit(NamedTuple):
 
 def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], *, gain: float, pixel_count: int,
                     device: str) -> GradientFit:
-    """Estimate normal, albedo and confidence from diffuse responses.
+    """Estimate normal, albedo and confidence from diffuse responses; not synchronised on CUDA.
 
     Args:
-        diffuse: the responses.
         grey_weights: of the channels, for the normal; they add up to one.
         gain: diffuse light over what the frames hold of it: 2 behind a crossed analyser, else 1.
-
-    Returns:
-        The fit on the device; not synchronised on CUDA.
 
     Convention:
         confidence = 1 / (1 + σ/1°) with σ² = 2 v s² (M₀/|M|)² + 2e + tilt², v the variance of M, s² the residual variance with

@@ -56,19 +56,13 @@ class Highlights(NamedTuple):
 
 def fit_highlights(parts: SeparatedMoments, grey_weights: tuple[float, float, float], view: np.ndarray, *, gain: float,
                    pixel_count: int, device: str) -> Highlights:
-    """Estimate normal, F₀ and roughness of the lobe that has the highlight's responses.
+    """Estimate normal, F₀ and roughness of the lobe that has the highlight's responses; not synchronised on CUDA.
 
     Args:
         parts: responses told apart by polarisation; radiance under a full sphere of radiance one.
         grey_weights: of the channels; they add up to one.
         view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
         gain: diffuse light over what the frames hold of it, for what counts as a highlight.
-
-    Returns:
-        The highlights on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: view has another number of pixels.
     """
     toward = upload_view(view, pixel_count, device)
     found = Highlights(zeros(pixel_count, wp.float32, device, rows=3), zeros(pixel_count, wp.float32, device, rows=3),
@@ -83,17 +77,10 @@ def specular_normals(parts: SeparatedMoments, grey_weights: tuple[float, float, 
                      pixel_count: int, device: str) -> wp.array:
     """Estimate normals halfway between the view and the centroid of the highlight: of a lobe symmetric about the mirror direction.
 
-    Args:
-        parts: responses told apart, by polarisation or by colour.
-        grey_weights: of the channels; they add up to one.
-        view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
-        gain: as for diffuse_normals.
+    `parts` may be told apart by polarisation or by colour; the rest is as for fit_highlights.
 
     Returns:
         [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from.
-
-    Raises:
-        ArrayError: view has another number of pixels.
     """
     toward = upload_view(view, pixel_count, device)
     normal = zeros(pixel_count, wp.float32, device, rows=3)

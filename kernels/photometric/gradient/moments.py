@@ -39,21 +39,15 @@ class Moments(NamedTuple):
 
 
 def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: tuple[float, float, float]) -> Moments:
-    """Fit the responses M₀ and M: least squares of radiance = mean · M₀ + dipole · M in each channel.
+    """Fit the responses M₀ and M: least squares of radiance = mean · M₀ + dipole · M in each channel; not synchronised on CUDA.
 
-    A reading of zero or below is a measurement here (a mirror that shows the dark end of a gradient reads zero); a saturated
-    one, or one that is not finite in every channel, is not.
+    A reading of zero or below is a measurement here (a mirror that shows the dark end of a gradient reads zero); a saturated one, or one
+    that is not finite in every channel, is not.
 
     Args:
         rows: [lights, 4] mean and dipole of each frame, along one axis at most; 0 for frames that do not take part.
         scale: [lights] radiance of a stored 1.0.
         grey_weights: of the channels, for the residual; they add up to one.
-
-    Returns:
-        The responses on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: rows or scale do not match the band, no frame takes part, or a gradient has several axes.
     """
     band.require_channels(3)
     if rows.shape != (band.frame_count, 4) or scale.shape != (band.frame_count,):

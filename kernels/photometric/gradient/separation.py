@@ -49,8 +49,6 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
     The diffuse responses are those of the cross frames less the part of the highlight that leaks, of half the diffuse light.
 
     Args:
-        cross: responses of the cross-polarised frames.
-        parallel: of the parallel-polarised ones.
         grey_weights: of the channels; they add up to one.
         leak: part of a highlight's light that crossed polarisers pass, 0 to below 0.5.
     """
@@ -65,15 +63,10 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
 def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, device: str) -> SeparatedMoments:
     """Separate the diffuse and specular responses of unpolarised frames, where the diffuse colour is not grey.
 
+    Where nothing is separated the diffuse responses are the mixed ones, and `tilt` is HIDDEN_TILT.
+
     Args:
-        mixed: responses of the unpolarised frames.
         view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
-
-    Returns:
-        New responses. Where nothing is separated the diffuse ones are the mixed ones, and `tilt` is HIDDEN_TILT.
-
-    Raises:
-        ArrayError: view has another number of pixels.
     """
     toward = upload_view(view, pixel_count, device)
     diffuse = Moments(*(wp.clone(array) for array in mixed))
@@ -84,11 +77,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
 
 
 def upload_view(view: np.ndarray, pixel_count: int, device: str) -> wp.array:
-    """Return view vectors on the device, [3, pixels padded to whole packs].
-
-    Raises:
-        ArrayError: view is neither [3, pixels] nor [3, 1].
-    """
+    """Return view vectors, [3, pixels] or [3, 1], on the device as [3, pixels padded to whole packs]."""
     if view.shape not in ((3, pixel_count), (3, 1)):
         raise ArrayError(f"view is {view.shape}, the band has {pixel_count} pixels: give [3, {pixel_count}], or [3, 1] for all")
     values = np.zeros((3, padded_count(pixel_count, device)), dtype=np.float32)

@@ -19,8 +19,6 @@ def fit_albedo(band: Band, weights: Readings, fit: NormalFit, lights: Lights, ne
 
     Args:
         weights: what the normal solver left in its readings: the weight of each light, 0…1.
-        fit: the normals.
-        lights: direction, irradiance and scale of each light.
         near_lights: directions and falloff per pixel, in place of the lights' directions, where some light is near.
 
     Returns:

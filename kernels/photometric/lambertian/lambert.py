@@ -8,9 +8,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
-from kernels.normal_equations import add_reading, symmetric
+from kernels.normal_equations import add_reading, fit_pixel, symmetric
 from kernels.packs import Band, pack_type, zeros
-from kernels.photometric.lambertian.least_squares import fit_pixel
 from kernels.photometric.lambertian.near import NearLights, directions_in, toward_or_none
 from kernels.photometric.lambertian.readings import Readings
 from kernels.status import OK
@@ -36,18 +35,12 @@ class NormalFit(NamedTuple):
 
 
 def solve_lambert(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
-    """Estimate normals by least squares on every light with a reading above zero.
+    """Estimate normals by least squares on every light with a reading above zero; not synchronised on CUDA.
 
     Args:
         readings: its grey readings; on return each holds the weight that the light had in the fit: 1 or 0.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
         near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
-
-    Returns:
-        Normals on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: directions do not match the band.
 
     Source:
         Woodham, "Photometric method for determining surface orientation from multiple images", Optical Engineering 1980.

@@ -72,17 +72,11 @@ def pad_places(place: np.ndarray, lobe: np.ndarray) -> Places:
 
 
 def see_near(band: Band, readings: Readings, field: NearField) -> NearLights:
-    """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff.
+    """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff; not synchronised on CUDA.
 
     Args:
         readings: radiance / strength, of readings.grey_readings; on return b·l, or 0 where the light hardly shines.
         field: places of the band's lights, and the points of its pixels.
-
-    Returns:
-        Directions and falloff on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: lights or pixels other than the band's.
     """
     places, points = field
     if len(places.place) != band.frame_count or points.shape != (3, band.pixel_count):
@@ -120,7 +114,6 @@ def directions_in(pack: int, near: bool) -> tuple[Any, int]:
     pixel to the next in them: 0 for distant lights, whose direction all pixels share.
 
     Args:
-        pack: pixels of a pack.
         near: whether the directions differ from pixel to pixel, and are read from `toward`.
     """
     float_pack, shared = pack_type(pack, wp.float32), pack_type(1, wp.float32)

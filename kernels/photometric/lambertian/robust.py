@@ -16,10 +16,9 @@ import numpy as np
 import warp as wp
 
 from kernels.device import once
-from kernels.normal_equations import add_reading, symmetric
+from kernels.normal_equations import add_reading, fit_pixel, symmetric
 from kernels.packs import Band, pack_type
 from kernels.photometric.lambertian.lambert import NormalArrays, NormalFit, run_normal_kernel, write_normal
-from kernels.photometric.lambertian.least_squares import fit_pixel
 from kernels.photometric.lambertian.near import NearLights, directions_in
 from kernels.photometric.lambertian.readings import Readings
 
@@ -54,18 +53,12 @@ rounding of half values."""
 
 
 def solve_robust(band: Band, readings: Readings, directions: np.ndarray, near_lights: NearLights | None = None) -> NormalFit:
-    """Estimate normals from the lights that, at each pixel, are neither shadow nor highlight.
+    """Estimate normals from the lights that, at each pixel, are neither shadow nor highlight; not synchronised on CUDA.
 
     Args:
         readings: its grey readings; on return each holds the weight, 0…1, that the light had in the fit.
         directions: [lights, 3] unit, from the surface to the light; padding is ignored.
         near_lights: directions and falloff per pixel, in place of `directions`, where some light is near.
-
-    Returns:
-        Normals on the device; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: directions do not match the band.
     """
     return run_normal_kernel(_robust_kernel, band, readings, directions, near_lights)
 

@@ -69,22 +69,17 @@ class Material(NamedTuple):
 
 def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
                  table: wp.array | None = None, shared: np.ndarray | None = None) -> Material:
-    """Fit the material of sampled pixels.
+    """Fit the material of sampled pixels; waits for the device.
+
+    The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so that an asset renders as
+    fitted. With a table a surface without any specular lobe is a candidate too, because lights behind the rim tell it from one of F0 = 0,
+    whose Fresnel rise shines there; it has F0 = 0 and roughness 1.
 
     Args:
         normal: [n, 3] unit normals.
         options: noise and shadows, as in the search.
         table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
         shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel has a material of its own.
-
-    Returns:
-        The materials. The albedo is that of the Lambertian lobe closest to the fitted diffuse lobe under the capture's lights, so
-        that an asset renders as fitted. With a table a surface without any specular lobe is a candidate too, because lights
-        behind the rim tell it from one of F0 = 0, whose Fresnel rise shines there; it has F0 = 0 and roughness 1.
-        Waits for the device.
-
-    Raises:
-        ArrayError: a table of other lights.
     """
     tinted = _fit(samples, normal, shape, options, table, TINTED)
     bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole lobe, so that F0 needs no bound
@@ -134,19 +129,14 @@ def fit_tinted(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> Mater
 
 
 def fit_given(samples: Samples, normal: np.ndarray, material: np.ndarray, *, shape: Diffuse) -> Material:
-    """Fit the albedo of sampled pixels to a specular lobe that is given.
-
-    Args:
-        material: [4] F0 and roughness.
-    """
+    """Fit the albedo of sampled pixels to a specular lobe that is given: `material` is [4] F0 and roughness."""
     return _fit(samples, normal, shape, None, None, GIVEN, material)
 
 
 def fit_given_f0(samples: Samples, normal: np.ndarray, f0: float, *, shape: Diffuse) -> Material:
-    """Fit albedo and roughness of sampled pixels to an F0 that is given. Each roughness begins with the weights of readings without misfit.
+    """Fit albedo and roughness of sampled pixels to an F0 that is given, of all channels.
 
-    Args:
-        f0: of all channels.
+    Each roughness begins with the weights of readings without misfit.
     """
     return _fit(samples, normal, shape, None, None, GIVEN_F0, np.full(4, f0), anew=True)
 
@@ -170,13 +160,9 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
 
 
 def _reconcile(own: Material, cold: Material, one_f0: list[Material], blend: Material, common: np.ndarray) -> Material:
-    """Return the materials of dielectric pixels whose own F0 is far above the common ones.
+    """Return the materials of dielectric pixels whose own F0 is far above the `common` ones.
 
-    Args:
-        own, cold: with an F0 of the pixel's own, from two starts.
-        one_f0: with each of the common F0.
-        blend: of the shared materials.
-        common: [values] F0.
+    `own` and `cold` have an F0 of the pixel's own, from two starts, `one_f0` each of the common ones, `blend` is of the shared materials.
     """
     own = _where(cold.cost < own.cost, cold, own)
     best = one_f0[0]

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from kernels.device import once
-from kernels.logarithm import log_of
+from kernels.elementary import log_of
 from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.model.lobes import Reflectance
 from kernels.photometric.model.robust_weights import LOG_GROUP, Criteria, plain_weights, weigh
@@ -58,11 +58,7 @@ def common_weight(dd: float, ds: wp.vec3, ss: wp.vec3, rd: wp.vec3, rs: wp.vec3,
 
 @once
 def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
-    """Return the kernel for one width of packs and one kind of light.
-
-    Args:
-        bare: whether a surface without any specular lobe is a candidate of its own.
-    """
+    """Return the kernel for one width of packs and one kind of light; `bare`: a surface without a specular lobe is a candidate too."""
     held, prepare, respond, lambertian = reflectance
     write_weights = plain_weights(lanes)
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)

@@ -54,10 +54,7 @@ def metals_of(shared: np.ndarray, single: Material) -> Metals:
 def search_metals(samples: Samples, normal: np.ndarray, material: Material, metals: Metals, *, shape: Diffuse) -> np.ndarray:
     """Return the normals, [n, 3] float32, with those of metals replaced that a shared metal explains at less than half of the cost.
 
-    Args:
-        normal: [n, 3] unit normals found so far.
-        material: what they make of each pixel.
-        metals: of the object.
+    `material` is what the given normals make of each pixel.
     """
     tried = np.flatnonzero(SAVED * material.cost > metals.cost + COST_FLOOR)
     if not len(tried) or not len(metals.lobes):

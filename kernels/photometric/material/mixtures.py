@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import once
-from kernels.logarithm import log_of
+from kernels.elementary import log_of
 from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.material.material import COST_FLOOR, Material
 from kernels.photometric.material.material_kernel import REWEIGHTINGS, common_weight
@@ -182,17 +182,15 @@ class _Mixed(NamedTuple):
 
 
 def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, single: Material, *, shape: Diffuse) -> np.ndarray:
-    """Choose the pairs of shared materials that pixels mix.
+    """Choose the pairs of shared materials that pixels mix; waits for the device.
 
     Args:
         samples: some hundreds of pixels, spread over the object.
-        normal: [n, 3] unit normals.
         materials: [materials, 4] F0 and roughness, of shared_materials.choose_materials.
         single: what one material a pixel makes of the same samples.
 
     Returns:
-        [pairs, 2, 4] float32, the pair that explains most first; none where two materials explain no pixel clearly better than
-        one. Waits for the device.
+        [pairs, 2, 4] float32, the pair that explains most first; none where two materials explain no pixel clearly better than one.
     """
     pairs = np.array([(materials[i], materials[j]) for i in range(len(materials)) for j in range(i)], dtype=np.float32).reshape(-1, 2, 4)
     fits = [_fit(samples, normal, pair[None], shape) for pair in pairs]
@@ -208,16 +206,9 @@ def choose_pairs(samples: Samples, normal: np.ndarray, materials: np.ndarray, si
 
 
 def mix_materials(samples: Samples, normal: np.ndarray, single: Material, pairs: np.ndarray, *, shape: Diffuse) -> tuple[Material, Mixture]:
-    """Replace the material of pixels that two materials explain clearly better than one.
+    """Replace the material of pixels that two materials, of [pairs, 2, 4], explain clearly better than one; waits for the device.
 
-    Args:
-        normal: [n, 3] unit normals.
-        single: one material a pixel.
-        pairs: [pairs, 2, 4] of choose_pairs.
-
-    Returns:
-        The materials, in mixed pixels with the albedo of both together and with F0 and roughness of single_lobe; and the mixture. Waits for
-        the device.
+    Mixed pixels get the albedo of both together, and F0 and roughness of single_lobe.
     """
     mixture = Mixture(np.zeros(len(normal), np.float32), np.zeros(len(normal), np.uint8))
     tried = np.flatnonzero(single.cost > COST_FLOOR)  # what costs less needs no second material

@@ -30,14 +30,9 @@ times that their step is halved about the best: three per cent from one to the n
 
 
 def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) -> np.ndarray:
-    """Choose the materials that sampled pixels share.
+    """Return [materials, 4] float32: F0 and roughness of the materials that sampled pixels share, in the order in which they were chosen.
 
-    Args:
-        samples: some hundreds of pixels, spread over the object.
-        normal: [n, 3] unit normals.
-
-    Returns:
-        [materials, 4] float32: F0 and roughness, in the order in which they were chosen. Waits for the device.
+    Waits for the device. The samples are some hundreds of pixels, spread over the object.
     """
     own = fit_material(samples, normal, shape=shape)
     chosen = evenly(len(normal), CANDIDATES)
@@ -56,13 +51,7 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
 
 
 def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:
-    """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough.
-
-    Args:
-        samples, normal, shape: as for choose_materials.
-        materials: [materials, 4] F0 and roughness.
-        costs: [materials, n] of every pixel under each of them.
-    """
+    """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough; `costs` is [materials, n]."""
     dielectric = is_dielectric(materials)
     if dielectric.sum() < 2:
         return materials

@@ -12,8 +12,7 @@ LEAST_NZ = 0.02
 def rings(degrees: tuple[float, ...], last_count: int) -> np.ndarray:
     """Return the offsets of candidates from a centre: the centre, then rings.
 
-    Returns:
-        [candidates, 4] float32: sine and cosine of the angle from the centre, cosine and sine of the azimuth.
+    They are [candidates, 4] float32: sine and cosine of the angle from the centre, cosine and sine of the azimuth.
     """
     offsets = [(0.0, 1.0, 1.0, 0.0)]
     for index, angle in enumerate(degrees):

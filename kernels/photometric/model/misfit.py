@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.photometric.lambertian.least_squares import CONFIDENCE_HALF
+from kernels.normal_equations import CONFIDENCE_HALF
 from kernels.photometric.model.samples import evenly
 
 SMOOTHNESS = np.radians(32.0)
@@ -82,11 +82,7 @@ class Uncertainty(NamedTuple):
 
 
 def measure_misfit(pairs: PairFits) -> Misfit:
-    """Return what pairs of neighbouring pixels say about the misfit of an object.
-
-    Raises:
-        ArrayError: shapes do not fit.
-    """
+    """Return what pairs of neighbouring pixels say about the misfit of an object."""
     lights, _, count = pairs.readings.shape
     if pairs.weights.shape != pairs.readings.shape or pairs.directions.shape != (lights, 3, 2, count):
         raise ArrayError(f"readings are {pairs.readings.shape}, weights {pairs.weights.shape}, directions {pairs.directions.shape}: "
@@ -116,12 +112,7 @@ def _share(common: np.ndarray, total: np.ndarray) -> float:
 
 
 def uncertainty_of(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray, agreeing: np.ndarray, misfit: Misfit) -> Uncertainty:
-    """Return the standard error and the confidence of normals.
-
-    Args:
-        across, squares, freedom, agreeing: [pixels], of a NormalFit.
-        misfit: of the object.
-    """
+    """Return the standard error and the confidence of normals, of which the [pixels] of a NormalFit are given."""
     across, squares, freedom = (np.asarray(values, dtype=np.float64) for values in (across, squares, freedom))
     level = np.where(freedom > 0, misfit.level, max(misfit.level, UNKNOWN_LEVEL))
     variance = (PRIOR * level + squares) / (PRIOR + freedom)
@@ -183,13 +174,8 @@ def _excess(pairs: PairFits) -> float:
 def _left(errors: np.ndarray, light: np.ndarray, gain: np.ndarray) -> np.ndarray:
     """Return the covariance of the residuals of a fit, from that of the errors of its readings, both [lights, lights].
 
-    The fit takes `light @ gain` of the errors out. As products with three columns that is a tenth of the work of whole matrices, which BLAS
-    would divide among threads that wait for each other.
-
-    Args:
-        errors: symmetric covariance.
-        light: [lights, 3] directions.
-        gain: [3, lights], from readings to b.
+    The fit takes `light @ gain` of the errors out, [lights, 3] directions and [3, lights] from readings to b. As products with three
+    columns that is a tenth of the work of whole matrices, which BLAS would divide among threads that wait for each other.
     """
     rest = errors - light @ (gain @ errors)
     return rest - (rest @ gain.T) @ light.T

@@ -61,20 +61,16 @@ MIRROR_SPREAD = 0.026
 
 def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.ndarray, share: np.ndarray, *,
                    light_count: int, device: str) -> wp.array:
-    """Tabulate the readings of every lobe under every light.
+    """Tabulate the readings of every lobe under every light; waits for the device.
 
     Args:
         direction: [samples, 3] unit, from the surface to the sample.
         solid_angle: [samples] steradians; 0 for a distant light.
         light: [samples] which light the sample belongs to.
         share: [samples] of the light's irradiance, radiance · solid angle / their sum.
-        light_count: lights.
 
     Returns:
-        [GRID², light_count, COLUMNS] float32 on the device, node u · GRID + v. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
+        [GRID², light_count, COLUMNS] float32 on the device, node u · GRID + v.
     """
     count = len(direction)
     if direction.shape != (count, 3) or any(array.shape != (count,) for array in (solid_angle, light, share)) or count == 0:
@@ -100,16 +96,14 @@ def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.nda
 
 
 def search_table(table: wp.array, f0: float, widths: tuple[int, ...] = SEARCH_WIDTHS) -> wp.array:
-    """Return the lobes of the search, specular ones of reflectance f0 at normal incidence.
+    """Return the lobes of the search, specular ones of reflectance f0 at normal incidence; waits for the device.
 
     Args:
         table: of response_table.
-        f0: reflectance.
         widths: indices in WIDTHS of the GGX lobes.
 
     Returns:
-        [GRID², lights, 2 + widths] float32: π times the diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX
-        lobes. Waits for the device.
+        [GRID², lights, 2 + widths] float32: π times the diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX lobes.
     """
     values = table.numpy()
     kept = np.array([0, *(1 + j for j in widths)])

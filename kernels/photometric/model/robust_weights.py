@@ -45,6 +45,17 @@ def weigh(shining: float, expected: float, off2: float, plain: float, shadow: wp
     return trust * plain / (1.0 + off2), 1.0 + given * wp.min(wp.where(dark == 1, shadow[0], off2), LARGEST_SQUARE)
 
 
+@wp.func
+def weigh_grey(reading: float, predicted: float, off2: float, given: float, sigma: float, shadow: wp.vec2):
+    """Return the weight of a grey reading in a robust fit, and the exponential of its cost.
+
+    `off2` is its r²/σ², `sigma` 1 / σ, `given` 1.0 or, where there is no reading, 0.0.
+    """
+    dark = wp.where(reading < shadow[1] * predicted, 1, 0) * wp.where(off2 > shadow[0], 1, 0)
+    trust = wp.where(reading > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
+    return given * trust * sigma * sigma / (1.0 + off2), 1.0 + given * wp.where(dark == 1, shadow[0], off2)
+
+
 @once
 def plain_weights(lanes: int) -> Any:
     """Return the Warp function that writes the WEIGHT_ROWS of every light of a pack, as values `row` and those after it."""

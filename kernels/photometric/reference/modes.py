@@ -55,14 +55,13 @@ class Modes(NamedTuple):
 
 
 def find_modes(samples: Samples, model: Model, view: np.ndarray) -> np.ndarray:
-    """Return the candidates of least cost over the visible hemisphere.
+    """Return the candidates of least cost over the visible hemisphere; waits for the device.
 
     Args:
-        model: their lobes.
         view: [n, 3] unit directions to the viewer, the middle of the grid.
 
     Returns:
-        [2, n, 3] float32 unit: the best, and the best of those at least APART from it. Waits for the device.
+        [2, n, 3] float32 unit: the best, and the best of those at least APART from it.
     """
     offsets = rings(*GRID_RINGS)
     noise = np.tile(np.array(GRID_NOISE, dtype=np.float32), (samples.pixel_count, 1))
@@ -83,11 +82,7 @@ def candidates(centre: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def weigh(first: Posterior, second: Posterior) -> Modes:
-    """Return the more probable of two modes.
-
-    Args:
-        first, second: posteriors of n pixels around either mode.
-    """
+    """Return the more probable of two modes, given the posteriors of the same pixels around either."""
     away = angle_degrees(first.normal, second.normal)
     apart = away > np.maximum(SAME * (first.sigma + second.sigma), 0.5 * APART)
     excess = np.minimum(first.excess, second.excess)

@@ -105,10 +105,7 @@ def measure_noise(groups: Sequence[Group]) -> Noise:
     """Return the noise that the readings show about the best explanation of their pixels.
 
     The normals are moved to the mean of their posterior and the noise measured again, because normals that were found under another noise
-    leave residuals of their own.
-
-    Args:
-        groups: pixels of one object, by what they may reflect.
+    leave residuals of their own. The groups are pixels of one object, by what they may reflect.
     """
     total = sum(group.samples.pixel_count for group in groups)
     noise = Noise(0.0, ASSUMED, ASSUMED)
@@ -144,16 +141,9 @@ def _thinned(group: Group, fraction: float) -> Group:
 
 
 def normal_posterior(group: Group, noise: Noise) -> Posterior:
-    """Return the posterior of the normals of sampled pixels around one mode.
+    """Return the posterior of the normals of sampled pixels around one mode; waits for the device.
 
     The candidates are laid out again about the mean wherever it lies more than a standard deviation from their middle.
-
-    Args:
-        group: n pixels.
-        noise: of the readings.
-
-    Returns:
-        The posterior. Waits for the device.
     """
     found, moved = _around(group, noise)
     for _ in range(MOST_ROUNDS - 1):

@@ -99,18 +99,12 @@ class Found(NamedTuple):
 
 
 def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None) -> Found:
-    """Find the normal and the material of sampled pixels that explain their readings best.
+    """Find the normal and the material of sampled pixels that explain their readings best; waits for the device.
 
     Args:
         samples: their readings, radiance over the irradiance of each light.
         view: [n, 3] unit directions to the viewer.
         start: [n, 3] unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere.
-
-    Returns:
-        The best candidates. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     lambert = Diffuse()
     first, other = find_modes(samples, bounded(tables.search[0], samples), view) if start is None else (start, start)
@@ -126,19 +120,7 @@ def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, 
 
 
 def solve_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, found: Found | None = None) -> SamplingFit:
-    """Estimate normal, material and regime of sampled pixels.
-
-    Args:
-        samples: their readings, radiance over the irradiance of each light.
-        view: [n, 3] unit directions to the viewer.
-        found: of `search_sampling` for these samples; None: it is looked for here.
-
-    Returns:
-        The fit. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
-    """
+    """Estimate normal, material and regime of sampled pixels; `found` is what search_sampling found for them, if it was asked."""
     lambert = Diffuse()
     if found is None:
         found = search_sampling(samples, tables, view)
@@ -171,16 +153,13 @@ def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, 
 
 
 def regimes(weights: np.ndarray, f0: np.ndarray, facing: np.ndarray, material: Material) -> np.ndarray:
-    """Return the regime of each pixel: a part of the light counts where both the mixture and the material contain it.
+    """Return [n] uint8 codes of Regime: a part of the light counts where both the mixture and the material contain it.
 
     Args:
         weights: [n, lobes] of the mixture.
         f0: [n] of its specular lobes.
         facing: [n] n·v.
         material: of the same pixels.
-
-    Returns:
-        [n] uint8 codes of Regime.
     """
     fresnel = f0 + (1 - f0) * np.clip(1 - facing, 0, 1) ** 5
     mixed = SPECULAR_SCALE / f0 * fresnel * weights[:, 1:].sum(axis=1)  # under even light, as π times the diffuse weight is

@@ -48,20 +48,13 @@ class Scores(NamedTuple):
 
 def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, noise: np.ndarray, table: wp.array,
                   bound: np.ndarray) -> Scores:
-    """Return the cost of candidates around a normal of each sampled pixel.
+    """Return the cost of candidates around the unit normal [n, 3] of each sampled pixel; waits for the device.
 
     Args:
-        centre: [n, 3] unit normals.
         offsets: [candidates, 4] of `candidates.rings`; the first is the centre.
         noise: [n, 2] standard deviation of a reading: constant part and part of the reading, both relative to the pixel's level.
         table: [cells, lights, lobes] of response_table.search_table or of a reference ball.
         bound: [lobes] largest weight of each lobe, in the units of the readings.
-
-    Returns:
-        The costs. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     count = samples.pixel_count
     if centre.shape != (count, 3) or noise.shape != (count, 2):

@@ -52,15 +52,11 @@ class Certainty(NamedTuple):
 
 
 def assess(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray) -> Certainty:
-    """Return how sure the normals of a search are.
+    """Return how sure the normals of a search are; waits for the device.
 
     Args:
-        found: the search.
         normal: [n, 3] unit, the result, which may be an average of several searches.
         spread: [n] of that average, degrees.
-
-    Returns:
-        Standard deviation and probability. Waits for the device.
     """
     lights = samples.light_count
     total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)

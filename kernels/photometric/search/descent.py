@@ -56,14 +56,9 @@ class Descent(NamedTuple):
     weights: np.ndarray  # [n, lobes] float32, of the mixture, for readings relative to the pixel's level
 
     def replace(self, where: np.ndarray, other: "Descent") -> np.ndarray:
-        """Put in the pixels of another descent that cost less, in place.
+        """Put in the pixels of another descent of m pixels that cost less, in place; return [m] bool, which were put in.
 
-        Args:
-            where: [m] their positions among these pixels.
-            other: descent of m pixels.
-
-        Returns:
-            [m] bool, which were put in.
+        `where` is [m], their positions among these pixels.
         """
         less = other.cost < self.cost[where]
         for whole, part in zip(self, other, strict=True):
@@ -73,20 +68,13 @@ class Descent(NamedTuple):
 
 def descend(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
             weights: np.ndarray | None = None, prior: Prior | None = None, schedule: Schedule = COLD) -> Descent:
-    """Return the normal of least cost near the start of each sampled pixel, under lights of one direction each.
+    """Return the normal of least cost near the start of each sampled pixel, under lights of one direction each; waits for the device.
 
     Args:
         start: [n, 3] unit normals to begin from.
-        options: how normals are judged.
         weights: [n, lobes] of the mixture at the start; None: unknown.
         prior: normals that the result is drawn to, of which the costs include the cost; None: none.
         schedule: the turns; one without softened turns needs weights.
-
-    Returns:
-        The best normal met on the way. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     if start.shape != (samples.pixel_count, 3):
         raise ArrayError(f"start is {start.shape}: give one normal for each of the {samples.pixel_count} pixels")

@@ -5,12 +5,12 @@ from typing import Any
 import warp as wp
 
 from kernels.device import once
-from kernels.logarithm import log_of
+from kernels.elementary import log_of
 from kernels.microfacet import diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.candidates import LEAST_NZ, tangents
 from kernels.photometric.model.lobes import LOBE_SCALE, LOBES, MIXTURE, MIXTURE_F0
-from kernels.photometric.model.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
+from kernels.photometric.model.robust_weights import LARGEST_SQUARE, LOG_GROUP, Criteria, weigh_grey
 from kernels.photometric.model.samples import samples_type
 
 SWEEPS = 8
@@ -48,6 +48,20 @@ def moved_by(n: wp.vec3, along: wp.vec3, across: wp.vec3, v: wp.vec3) -> wp.vec3
     mz = mz / size + lift * v[2]
     unit = 1.0 / wp.sqrt(mx * mx + my * my + mz * mz)
     return wp.vec3(mx * unit, my * unit, mz * unit)
+
+
+@wp.func
+def damped_step(s00: float, s01: float, s11: float, y0: float, y1: float, damping: float, moves: float):
+    """Return the damped Newton step of two tilts, LONGEST at most, from their normal equations s t = y; 0 where `moves` is 0.0."""
+    heavier = damping * (s00 + s11) + 1.0e-20
+    d00 = s00 + heavier
+    d11 = s11 + heavier
+    determinant = d00 * d11 - s01 * s01
+    scale = moves * wp.where(determinant > 0.0, 1.0, 0.0) / wp.max(determinant, 1.0e-30)
+    along = (d11 * y0 - s01 * y1) * scale
+    across = (d00 * y1 - s01 * y0) * scale
+    shorter = wp.min(1.0, LONGEST / wp.max(wp.sqrt(along * along + across * across), 1.0e-20))
+    return along * shorter, across * shorter
 
 
 @once
@@ -205,11 +219,10 @@ def descent_kernel(lanes: int) -> Any:
                     sigma = 1.0 / (criteria.noise[0] + criteria.noise[1] * wp.max(reading[k], 0.0))
                     off = (reading[k] - predicted[k]) * sigma
                     off2 = wp.where(explained[k] > 0.0, wp.min(off * off * narrow, LARGEST_SQUARE), 0.0)
-                    dark = wp.where(reading[k] < criteria.shadow[1] * predicted[k], 1, 0) * wp.where(off2 > criteria.shadow[0], 1, 0)
                     given = wp.where(reading[k] >= 0.0, 1.0, 0.0)
-                    trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-                    w[k] = given * trust * sigma * sigma / (1.0 + off2)
-                    product[k] = product[k] * (1.0 + given * wp.where(dark == 1, criteria.shadow[0], off2))
+                    weight, factor = weigh_grey(reading[k], predicted[k], off2, given, sigma, criteria.shadow)
+                    w[k] = weight
+                    product[k] = product[k] * factor
                 if light % LOG_GROUP == LOG_GROUP - 1:
                     for k in range(lanes):
                         total[k] += log_of(product[k])
@@ -257,17 +270,9 @@ def descent_kernel(lanes: int) -> Any:
                 nz[k] = wp.where(back, bz[k], nz[k])
                 curvature[k] = wp.where(kept, 0.5 * (s00 + s11), curvature[k])
                 swing[k] = wp.where(kept, wp.sqrt(0.25 * (s00 - s11) * (s00 - s11) + s01 * s01), swing[k])
-                heavier = damping[k] * (s00 + s11) + 1.0e-20
-                d00 = s00 + heavier
-                d11 = s11 + heavier
-                determinant = d00 * d11 - s01 * s01
-                moves = free * (1.0 - worse[k]) * wp.where(determinant > 0.0, 1.0, 0.0)
-                scale = moves / wp.max(determinant, 1.0e-30)
-                along = (d11 * y[TILT, k] - s01 * y[OTHER, k]) * scale
-                across = (d00 * y[OTHER, k] - s01 * y[TILT, k]) * scale
-                shorter = wp.min(1.0, LONGEST / wp.max(wp.sqrt(along * along + across * across), 1.0e-20))
-                step_a[k] = along * shorter
-                step_o[k] = across * shorter
+                along, across = damped_step(s00, s01, s11, y[TILT, k], y[OTHER, k], damping[k], free * (1.0 - worse[k]))
+                step_a[k] = along
+                step_o[k] = across
             pivots = mixture()
             for a in range(MIXTURE):
                 for k in range(lanes):

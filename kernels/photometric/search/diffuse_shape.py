@@ -44,14 +44,9 @@ class Shapes(NamedTuple):
 
 
 def choose_diffuse(samples: Samples, start: np.ndarray) -> Shapes:
-    """Choose the shape of the diffuse lobe from sampled pixels.
+    """Choose the shape of the diffuse lobe from some hundreds of pixels, spread over the object; waits for the device.
 
-    Args:
-        samples: some hundreds of pixels, spread over the object.
-        start: [n, 3] unit normals to begin from.
-
-    Returns:
-        The shapes. Waits for the device.
+    `start` is [n, 3] unit normals to begin from.
     """
     lambert = find_normals(samples, start, shape=Diffuse(), sweep=QUICK).best
     tried: dict[Diffuse, float] = {}

@@ -111,7 +111,7 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
                    wide: tuple[tuple[float, ...], int],
                    fine: tuple[tuple[tuple[float, ...], int], ...] = (), options: RingOptions | None = None,
                    table: wp.array | None = None, prior: Prior | None = None) -> Search:
-    """Find the candidate normal of least cost for each sampled pixel.
+    """Find the candidate normal of least cost for each sampled pixel; waits for the device.
 
     Args:
         start: [n, 3] unit normals to begin from.
@@ -121,12 +121,6 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
         table: [cells, lights, lobes] of response_table.search_table or of a reference ball, in place of the samples' directions;
             its diffuse lobe is what it is, whatever the shape.
         prior: normals that candidates are drawn to, of which the costs include the cost; None: none.
-
-    Returns:
-        The best candidates. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     options = options or RingOptions()
     if start.shape != (samples.pixel_count, 3):
@@ -155,15 +149,9 @@ def search_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse,
 
 
 def predict(samples: Samples, normal: np.ndarray, weights: np.ndarray, *, shape: Diffuse) -> np.ndarray:
-    """Return the readings that mixtures of lobes predict, relative to the level of each pixel.
+    """Return the readings, [n, lights] float32, that mixtures of lobes predict relative to the level of each pixel; waits for the device.
 
-    Args:
-        samples: directions of lights and viewer.
-        normal: [n, 3] unit normals.
-        weights: [n, lobes] of the mixtures, from search_normals.
-
-    Returns:
-        [n, lights] float32. Waits for the device.
+    `weights` is [n, lobes] of the mixtures, from search_normals.
     """
     predicted = wp.empty_like(samples.grey)
     devices.launch(_predict_kernel(samples.lanes), samples.packs,

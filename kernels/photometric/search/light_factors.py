@@ -1,8 +1,9 @@
 """Intensities of the lights from the object: the factor by which the readings of each light miss what normals and lobes predict.
 
 Normals and factors are found in turn: under the factors so far, the search explains the readings of some hundreds of pixels, and the
-median ratio of the lit readings of a light to their prediction is the change of its factor. Two things no object can tell: a common
-factor, which is albedo, and one that falls with the angle to the viewer, which is another shape of the diffuse lobe; they are taken out.
+median ratio of the lit readings of a light to their prediction is the change of its factor. Three things no object can tell: a common
+factor, which is albedo, one that falls with the angle to the viewer, which is another shape of the diffuse lobe, and, roughly, one that is
+linear in the direction of the light across the view; they are taken out.
 The factors are believed where those of one half of the object make the other half much easier to explain.
 
 Sources: lights of unknown intensity and known directions, Cho, Matsushita, Tai and Kweon, "Semi-calibrated photometric stereo", TPAMI
@@ -16,7 +17,7 @@ import numpy as np
 from kernels.photometric.model.samples import Samples, choose, device_values, host_values
 from kernels.photometric.search.descent import COLD, WARM, descend
 from kernels.photometric.search.hypotheses import Diffuse, predict
-from kernels.photometric.search.untold_factors import untold
+from kernels.spread import MAD_TO_SIGMA
 
 TRIAL_ROUNDS, ROUNDS = 2, 12
 """Rounds of each half, which show whether factors explain anything, and of the whole object."""
@@ -38,6 +39,11 @@ LEAST_GAIN = 0.02
 not explain the object, 0.04 where they are off by 1 %."""
 SURE = 2.5
 """Least ratio of that gain to its standard error over squares of pixels."""
+FIT_ROUNDS, GROSS = 5, 4.0
+"""Rounds in which lights off by more than this many standard deviations are left out of the fit of the part that no object can tell: one
+wrong light must not bend all others."""
+LARGEST_LINEAR = 4.0
+"""Largest part of the factors that is linear across the view, in standard deviations of what independent errors of the lights give."""
 
 
 class LightFactors(NamedTuple):
@@ -56,7 +62,6 @@ def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarr
 
     Args:
         samples: direct light of some hundreds of pixels, spread over the object.
-        start: [n, 3] unit normals to begin from.
         directions: [lights, 3] unit, in the camera frame.
         row, col: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour.
     """
@@ -99,3 +104,35 @@ def _divided(samples: Samples, factor: np.ndarray) -> Samples:
     """Return the samples with the grey readings of each light divided by its factor."""
     values = host_values(samples, samples.grey)
     return samples._replace(grey=device_values(samples, np.where(values >= 0, values / factor, -1)))
+
+
+def untold(logarithm: np.ndarray, directions: np.ndarray, *, falling: bool) -> np.ndarray:
+    """Return the part of the logarithms of the factors that the object cannot tell, or that independent errors of lights do not have.
+
+    A factor that is linear in the direction across the view turns all normals, which shading tells only weakly; it is kept as far as
+    errors of the size of the others would give it.
+
+    Args:
+        falling: whether a part that falls with the angle to the viewer cannot be told at all, because the shape of the diffuse lobe is
+            free; else it is kept like those across the view.
+    """
+    design = np.stack([np.ones(len(directions)), directions[:, 2], directions[:, 0], directions[:, 1]], axis=1)
+    found, spread = _robust_fit(design, logarithm)
+    centred = design - design.mean(axis=0)
+    kept = np.zeros(4)
+    for column in range(2 if falling else 1, 4):
+        extent = (design if column > 1 else centred)[:, column]
+        most = LARGEST_LINEAR * spread / max(float(np.linalg.norm(extent)), 1e-9)
+        kept[column] = np.clip(found[column], -most, most)
+    return design @ (found - kept)
+
+
+def _robust_fit(design: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the coefficients of a fit without the lights that are grossly wrong, and the robust standard deviation of the rest."""
+    used = np.ones(len(values), dtype=bool)
+    for _ in range(FIT_ROUNDS):
+        found = np.linalg.lstsq(design[used], values[used], rcond=None)[0]
+        residual = values - design @ found
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(residual))) + 1e-9
+        used = np.abs(residual) <= GROSS * spread
+    return found, spread

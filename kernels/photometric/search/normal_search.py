@@ -30,14 +30,9 @@ LEAST_TRIED = 32
 
 
 def neighbours(pixels: np.ndarray, width: int) -> np.ndarray:
-    """Return the neighbours of chosen pixels among them.
+    """Return [steps, n] int32, the neighbours of chosen pixels as positions in `pixels`, -1 where the neighbour is not among them.
 
-    Args:
-        pixels: [n] row-major positions in an image, ascending.
-        width: of the image.
-
-    Returns:
-        [steps, n] int32 positions in `pixels`, -1 where the neighbour is not among them.
+    `pixels` are [n] row-major positions in an image of this width, ascending.
     """
     rows, columns = np.divmod(pixels, width)
     found = np.full((len(STEPS), len(pixels)), -1, dtype=np.int32)
@@ -53,10 +48,7 @@ def propagate(samples: Samples, found: Descent, beside: np.ndarray, *, shape: Di
               prior: Prior | None = None) -> None:
     """Replace the answers of pixels that a start from a neighbour's answer betters, in place.
 
-    Args:
-        samples: readings of n pixels.
-        found: their descents.
-        beside: [steps, n] of `neighbours`, or some of its rows.
+    `beside` is [steps, n] of `neighbours`, or some of its rows.
     """
     for neighbour in beside:
         better = (neighbour >= 0) & (found.cost[neighbour] < CLEARLY_LESS * found.cost) & (found.cost > LEAST_COST)
@@ -79,20 +71,13 @@ class Found(NamedTuple):
 
 def find_normals(samples: Samples, start: np.ndarray, *, shape: Diffuse, options: SearchOptions | None = None,
                  beside: np.ndarray | None = None, prior: Prior | None = None, sweep: Sweep = CLOSE) -> Found:
-    """Find the normal of least cost of each sampled pixel, under lights of one direction each.
+    """Find the normal of least cost of each sampled pixel, under lights of one direction each; waits for the device.
 
     Args:
         start: [n, 3] unit normals to begin from.
-        options: how normals are judged.
-        beside: [steps, n] of propagation.neighbours; None: no pixel is another's neighbour.
+        beside: [steps, n] of `neighbours`; None: no pixel is another's neighbour.
         prior: normals that the results are drawn to, of which the costs include the cost; None: none.
         sweep: which pixels are surveyed, and how closely.
-
-    Returns:
-        The normals. Waits for the device.
-
-    Raises:
-        ArrayError: shapes that do not fit.
     """
     best = descend(samples, start, shape=shape, options=options, prior=prior)
     half = len(STEPS) // 2

@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import once
-from kernels.logarithm import log_of
+from kernels.elementary import log_of
 from kernels.microfacet import INVERSE_PI, diffuse_with_slopes, ggx_with_slopes, masking_root, masking_slope, schlick
 from kernels.packs import channels_type, pack_type
 from kernels.photometric.model.candidates import LEAST_NZ, tangents
@@ -49,14 +49,13 @@ class Refinement(NamedTuple):
 
 
 def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse) -> Refinement:
-    """Refine the normal and material of sampled pixels under lights of one direction each.
+    """Refine the normal and material of sampled pixels under lights of one direction each; waits for the device.
+
+    The result is the best fit met on the way, never of higher cost than the first.
 
     Args:
         normal: [n, 3] unit normals, within a few degrees of the truth.
         roughness: [n] of the material fit at these normals.
-
-    Returns:
-        The best fit met on the way, never of higher cost than the first. Waits for the device.
     """
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     refined = wp.empty((5, packs), dtype=pack_type(lanes, wp.float32), device=device)

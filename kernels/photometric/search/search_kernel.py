@@ -5,11 +5,11 @@ from typing import Any
 import warp as wp
 
 from kernels.device import once
-from kernels.logarithm import log_of
+from kernels.elementary import log_of
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.candidates import candidate_at, tangents
 from kernels.photometric.model.lobes import Lobes
-from kernels.photometric.model.robust_weights import LARGEST_SQUARE, LOG_GROUP, SHADOW_TRUST, Criteria
+from kernels.photometric.model.robust_weights import LARGEST_SQUARE, LOG_GROUP, Criteria, weigh_grey
 from kernels.photometric.model.samples import samples_type, scratch_type
 
 
@@ -101,11 +101,10 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
                             sigma = 1.0 / (noise[0] + noise[1] * wp.max(reading[k], 0.0))
                             off = (reading[k] - predicted[k]) * sigma
                             off2 = wp.where(turn == 0, 0.0, wp.min(off * off, LARGEST_SQUARE))
-                            dark = wp.where(reading[k] < shadow[1] * predicted[k], 1, 0) * wp.where(off2 > shadow[0], 1, 0)
                             given = inside * wp.where(reading[k] >= 0.0, 1.0, 0.0)
-                            trust = wp.where(reading[k] > 0.0, wp.where(dark == 1, SHADOW_TRUST, 1.0), SHADOW_TRUST)
-                            w[j, k] = given * trust * sigma * sigma / (1.0 + off2)
-                            product[k] = product[k] * (1.0 + given * wp.where(dark == 1, shadow[0], off2))
+                            weight, factor = weigh_grey(reading[k], predicted[k], off2, given, sigma, shadow)
+                            w[j, k] = weight
+                            product[k] = product[k] * factor
                     if turn == reweightings and triple % wp.static(LOG_GROUP // 3) == wp.static(LOG_GROUP // 3 - 1):
                         for k in range(lanes):
                             total[k] += log_of(product[k])

@@ -38,12 +38,7 @@ class Evidence(NamedTuple):
 
 
 def evidence(samples: Samples, cost: np.ndarray, weights: np.ndarray) -> Evidence:
-    """Return what the fits of sampled pixels leave unexplained. Waits for the device.
-
-    Args:
-        cost: [n] of the fit, per light.
-        weights: [n, lobes] of its mixture.
-    """
+    """Return what fits of sampled pixels, of cost [n] per light and mixture [n, lobes], leave unexplained; waits for the device."""
     unknowns = DIRECTION + (weights > USED).sum(axis=1)
     total = cost.astype(np.float64) * samples.light_count
     surplus = np.maximum(_informative(samples) - unknowns, 0)
@@ -114,15 +109,9 @@ class Survey(NamedTuple):
 
 def survey(samples: Samples, found: Descent, *, shape: Diffuse, options: SearchOptions | None = None,
            prior: Prior | None = None, sweep: Sweep = CLOSE) -> Survey | None:
-    """Survey the pixels that may have another mode, and take over better ones into their descents, in place.
+    """Survey the pixels that may have another mode, and take over better ones into their descents, in place; waits for the device.
 
-    Args:
-        samples: readings of n pixels.
-        found: their descents.
-        sweep: which pixels, and how closely.
-
-    Returns:
-        The survey; None if no pixel needs one. Waits for the device.
+    Returns None if no pixel needs a survey. `sweep` says which pixels are surveyed, and how closely.
     """
     told = evidence(samples, found.cost, found.weights)
     pixels = np.flatnonzero((told.noise > sweep.explained) | (told.surplus < SPARE))

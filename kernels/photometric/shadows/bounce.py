@@ -30,7 +30,6 @@ def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, sha
     sends on nothing in this sense: what it mirrors comes from one direction.
 
     Args:
-        normal: [n, 3] unit normals.
         tinted: of material.fit_tinted at these normals.
     """
     matt = fit_given(samples, normal, MATT, shape=shape).diffuse_albedo
@@ -52,9 +51,6 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
         grey_weights: [3], of the grey readings.
         field: places of the lights and the points of these pixels, where some light is near: the readings of the samples are divided
             by the falloff of each light there.
-
-    Raises:
-        ArrayError: shapes that do not fit, or corners outside the patches.
     """
     patches, _, lights = arriving.shape
     count = samples.pixel_count

@@ -90,12 +90,8 @@ def shadow_odds(readings: np.ndarray, toward: np.ndarray, normal: np.ndarray, vi
     Args:
         readings: [n, lights] grey radiance over irradiance; below 0 where there is none.
         toward: [lights, 3] unit directions to the lights.
-        normal: [n, 3] unit.
         view: [n, 3] unit directions to the viewer.
         material: [n, 3] grey diffuse albedo, grey F0 (0: no highlight) and roughness.
-
-    Raises:
-        ArrayError: numbers of pixels or lights do not fit.
     """
     count, lights = readings.shape
     if toward.shape != (lights, 3) or any(a.shape != (count, 3) for a in (normal, view, material)):

@@ -16,24 +16,19 @@ from kernels.errors import ArrayError
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.lambertian.near import Places
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type
-from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
+from kernels.surface.shadows import NO_REACH, Projection, Relief, in_shadow_within, relief_of, surface_point
 
 
 def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection,
-                    places: Places | None = None, extent: Extent | None = None) -> None:
-    """Mark readings whose light is hidden by the surface as no readings.
+                    places: Places | None = None) -> None:
+    """Mark readings whose light is hidden by the surface as no readings, in place.
 
     Args:
-        samples: changed in place.
         pixels: [n] their row-major positions in the image.
         height: [rows, cols] float32, camera-frame z.
         mask: [rows, cols] uint8, where there is surface.
         projection: of the camera; the unit is that of height.
         places: of the lights, where some light is near.
-        extent: of the height and mask, from shadows.extent_of; None: it is found.
-
-    Raises:
-        ArrayError: positions outside the image.
     """
     rows, cols = mask.shape
     if len(pixels) != samples.pixel_count or pixels.min() < 0 or pixels.max() >= rows * cols:
@@ -42,9 +37,8 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     where = wp.array(pixels[order], dtype=wp.int32, device=samples.device)
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
-                   [wp.array(place, dtype=wp.vec4, device=samples.device), where, height, mask,
-                    projection.perspective, projection.scale, projection.centre, *(extent or extent_of(height.numpy(), mask.numpy()))],
-                   [samples.arrays], device=samples.device)
+                   [wp.array(place, dtype=wp.vec4, device=samples.device), where,
+                    relief_of(height, mask, projection)], [samples.arrays], device=samples.device)
 
 
 @once
@@ -55,17 +49,11 @@ def _exclude_kernel(lanes: int) -> Any:
     def exclude_kernel(first: int,
                        places: wp.array(dtype=wp.vec4),  # [L or padded] position and 1, or anything and 0
                        pixels: wp.array(dtype=wp.int32),  # [P · lanes]
-                       height: wp.array2d(dtype=float),
-                       mask: wp.array2d(dtype=wp.uint8),
-                       perspective: bool,
-                       scale: wp.vec2,
-                       centre: wp.vec2,
-                       box: wp.vec4i,
-                       highest: float,
+                       relief: Relief,
                        # outputs
                        samples: samples_struct):
         p = first + wp.tid()
-        cols = mask.shape[1]
+        cols = relief.mask.shape[1]
         for light in range(samples.light_count):
             at = p * samples.pack_stride + light * samples.light_stride
             place = places[light]
@@ -75,10 +63,9 @@ def _exclude_kernel(lanes: int) -> Any:
             for k in range(lanes):
                 n = pixels[p * lanes + k]
                 row, col = n / cols, n % cols
-                start = unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
+                start = surface_point(row, col, relief.height, relief.camera)
                 reach = wp.where(place[3] > 0.0, wp.length(wp.vec3(place[0], place[1], place[2]) - start), NO_REACH)
-                if in_shadow_within(height, mask, row, col, wp.vec3(lx[k], ly[k], lz[k]), reach, perspective, scale, centre, box,
-                                    highest):
+                if in_shadow_within(relief, row, col, wp.vec3(lx[k], ly[k], lz[k]), reach):
                     y[k] = -1.0
                     red[k] = -1.0
                     green[k] = -1.0
@@ -97,15 +84,11 @@ edge, which follows from a height that is not exact, decides the reading."""
 
 
 def divide_by_visible(samples: Samples, part: np.ndarray) -> None:
-    """Divide readings by the visible part of their light, and mark those as no readings of which too little is visible.
+    """Divide readings by the visible part of their light, and mark those as no readings of which too little is visible, in place.
 
     Args:
-        samples: changed in place.
         part: [n, lights] from 0 to 1: what each pixel reflects of each light where the surface hides some of it, over what it would reflect
             of the whole.
-
-    Raises:
-        ArrayError: parts of other pixels or lights.
     """
     if part.shape != (samples.pixel_count, samples.light_count):
         raise ArrayError(f"part is {part.shape}: give one number for each of {samples.pixel_count} pixels and {samples.light_count} lights")

@@ -49,9 +49,7 @@ class Basis(NamedTuple):
 def gram(band: Band, keep: np.ndarray) -> np.ndarray:
     """Return [3, lights, lights] float64 inner products of the stored images of a band, padding included; waits for the device on CUDA.
 
-    Args:
-        band: the stack on the device.
-        keep: [pixels of the band] bool, the pixels that count.
+    `keep` is [pixels of the band] bool, the pixels that count.
     """
     band.require_channels(3)
     if keep.shape != (band.pixel_count,):
@@ -77,7 +75,6 @@ def principal(products: np.ndarray, count: int) -> Basis:
 
     Args:
         products: [3, lights, lights] Gram matrices, summed over all bands, of radiance and without padding.
-        count: coefficient images.
     """
     _check_count(count, products.shape[-1])
     _check_finite(products)
@@ -108,9 +105,7 @@ def _eigenvectors(products: np.ndarray, count: int) -> tuple[np.ndarray, np.ndar
 def projection(basis: Basis, scale: np.ndarray) -> np.ndarray:
     """Return [K, 3, lights padded] float32 weights with which combine_batch turns stored images into coefficient images.
 
-    Args:
-        basis: of principal.
-        scale: [lights padded] radiance of a stored 1.0.
+    `scale` is [lights padded], the radiance of a stored 1.0.
     """
     channels, count, lights = basis.matrix.shape
     weights = np.zeros((count, channels, len(scale)), dtype=np.float32)
@@ -125,7 +120,6 @@ def squared_residual(band: Band, gains: np.ndarray, coefficients: np.ndarray, fu
     Differences are taken in float: below 1e-6 of the image they are rounding.
 
     Args:
-        band: the stack on the device.
         gains: [3, lights padded] float32; image = gain · stored value. 0 for lights that do not count.
         coefficients: [terms, 3, pixels padded] float32.
         functions: [3, lights padded, terms]; rebuilt image = Σ function · coefficient. 0 for lights that do not count.

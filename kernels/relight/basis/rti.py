@@ -49,18 +49,14 @@ def biquadratic(directions: np.ndarray) -> np.ndarray:
 
 
 def hemispherical_harmonics(directions: np.ndarray, terms: int) -> np.ndarray:
-    """Return functions that are orthonormal over the hemisphere.
+    """Return functions that are orthonormal over the hemisphere at [lights, 3] unit vectors to the lights, z ≥ 0.
 
     Args:
-        directions: [lights, 3] unit vectors to the lights, z ≥ 0.
         terms: 4, 9 or 16.
 
     Returns:
-        [lights, terms] float64, by order l and then by m. In order l the cosines come first, the highest m leading, and sines
-        last: cos lφ … cos φ, 1, sin φ … sin lφ; functions of even m ≥ 2 carry a minus sign, as RTI files have them.
-
-    Raises:
-        ArrayError: another number of terms.
+        [lights, terms] float64, by order l and then by m. In order l the cosines come first, the highest m leading, and sines last: cos lφ
+        … cos φ, 1, sin φ … sin lφ; functions of even m ≥ 2 carry a minus sign, as RTI files have them.
 
     Source: Gautron, Křivánek, Pattanaik and Bouatouch, "A Novel Hemispherical Basis for Accurate and Efficient Rendering", EGSR
         2004: associated Legendre polynomials of 2 cos θ − 1.
@@ -142,7 +138,6 @@ def encode(band: Band, gains: np.ndarray, display_from_stack: np.ndarray) -> Ban
     """Encode every stored image of a band for a display: 0…1, half (off by at most 1/16 of an 8-bit step); not synchronised on CUDA.
 
     Args:
-        band: the stack on the device.
         gains: [3, lights] exposed scene-linear radiance of a stored 1.0; 0 for padding and for lights to leave out.
         display_from_stack: [3, 3] linear RGB of the display from that of the stack; white is 1.
     """

@@ -44,11 +44,7 @@ def direction_grid() -> DirectionGrid:
 
 
 def spread(samples: np.ndarray, energy: np.ndarray) -> np.ndarray:
-    """Spread samples of light over the directions of the grid.
-
-    Args:
-        samples: [n, 3] unit vectors to the samples.
-        energy: [n, channels] of each.
+    """Spread samples of light in unit directions [n, 3] over the directions of the grid.
 
     Returns:
         [D, channels] float64 energy of each direction; its sum is that of the samples. Directions beside a bright sample may have a

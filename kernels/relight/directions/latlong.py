@@ -73,14 +73,10 @@ def cut(rows: int, cols: int) -> SampleGrid:
 
 
 def check(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Check an environment, directions and rotations, and refuse what cannot be integrated.
-
-    Returns:
-        Directions, normalised, and rotations, in float64.
+    """Return directions, normalised, and rotations, in float64; refuse what an environment cannot be integrated with.
 
     Raises:
-        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite
-            (counted).
+        ArrayError: shapes that do not fit, directions that are not unit vectors, or radiance that is negative or not finite (counted).
     """
     directions, rotations = np.asarray(directions, dtype=np.float64), np.asarray(rotations, dtype=np.float64)
     if directions.ndim != 2 or directions.shape[1] != 3 or len(directions) == 0:
@@ -107,11 +103,8 @@ def first_of_equals(directions: np.ndarray) -> np.ndarray:
 def shared_turns(rotations: np.ndarray, columns: int) -> Iterator[Turn]:
     """Group rotations of a lat-long map that differ by whole columns of samples about its axis.
 
-    A spin of 240 frames on a grid of 768 columns, 3.2 columns a frame, has five different turns.
-
-    Args:
-        rotations: [frames, 3, 3] float64: turned = rotation @ direction.
-        columns: of the grid that the map is cut into.
+    Rotations are [frames, 3, 3], turned = rotation @ direction. A spin of 240 frames on a grid of 768 columns, 3.2 columns a frame, has
+    five different turns.
     """
     groups: dict[int, list[tuple[int, int]]] = {}
     for frame, rotation in enumerate(rotations):

@@ -39,14 +39,9 @@ REGISTER_FRAMES = 8
 
 
 def combine(band: Band, weights: np.ndarray) -> wp.array:
-    """Relight one frame: a weighted sum of the stored images.
+    """Relight one frame: return a weighted sum of the stored images, [3, pixels padded] float32 radiance; not synchronised on CUDA.
 
-    Args:
-        band: the stack on the device.
-        weights: [3, lights] float32, what each stored image is multiplied by in each channel; 0 for padding.
-
-    Returns:
-        [3, pixels padded] float32 radiance on the device; not synchronised on CUDA.
+    `weights` is [3, lights] float32, what each stored image is multiplied by in each channel; 0 for padding.
     """
     band.require_channels(3)
     _check_weights(weights, (3, band.frame_count))
@@ -63,15 +58,11 @@ def combine(band: Band, weights: np.ndarray) -> wp.array:
 
 
 def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) -> wp.array:
-    """Relight many frames: a weighted sum of the stored images for each.
+    """Relight many frames: return weighted sums of the stored images, [frames, 3, pixels padded] float32; not synchronised on CUDA.
 
     Args:
-        band: the stack on the device.
         weights: [frames, 3, lights] float32; 0 for padded lights.
         with_cublas: whether cuBLAS makes them on CUDA where it is installed. The last bits differ.
-
-    Returns:
-        [frames, 3, pixels padded] float32 radiance on the device; not synchronised on CUDA.
     """
     band.require_channels(3)
     _check_weights(weights, (len(weights), 3, band.frame_count))
@@ -94,16 +85,14 @@ def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) 
 
 
 def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
-    """Return weighted sums of many float32 rows; a frame at the same position does not depend on the others, to the last bit.
+    """Return [frames, channels, pixels padded] float32, weighted sums of many float32 rows; not synchronised on CUDA.
 
-    On the CPU the product is NumPy's BLAS, which is faster where rows are thousands.
+    A frame at the same position does not depend on the others, to the last bit. On the CPU the product is NumPy's BLAS, which is faster
+    where rows are thousands.
 
     Args:
         rows: [channels · n, P] float32 packs, contiguous; all rows of the first channel come first.
         weights: [frames, channels, n] float32.
-
-    Returns:
-        [frames, channels, pixels padded] float32 on the device; not synchronised on CUDA.
     """
     count, channels, terms = weights.shape
     _check_weights(weights, (count, channels, rows.shape[0] // channels))

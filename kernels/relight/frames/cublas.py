@@ -123,11 +123,7 @@ class SplitWeights(NamedTuple):
 
 
 def split(weights: np.ndarray) -> list[SplitWeights]:
-    """Return weights as two halves each, group by group.
-
-    Args:
-        weights: [frames, 3, lights] float32, finite.
-    """
+    """Return finite float32 weights [frames, 3, lights] as two halves each, group by group."""
     found = []
     for group, begin in enumerate(range(0, len(weights), GROUP)):
         mine = weights[begin : begin + GROUP].astype(np.float64)

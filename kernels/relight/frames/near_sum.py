@@ -24,11 +24,23 @@ LEAST_PART = 1e-3
 receives nothing, and the other lights receive its share."""
 
 
+@wp.struct
+class Net:
+    """The triangles between the captured lights, and which lights receive the energy at their corners."""
+
+    inward: wp.array(dtype=wp.vec3)  # [3 · faces] unit normals of the planes of the edges opposite to the corners
+    length: wp.array(dtype=float)  # [3 · faces] what a corner's coordinate is weighted by
+    neighbour: wp.array(dtype=int)  # [3 · faces] face beyond that edge
+    corner: wp.array(dtype=int)  # [3 · faces] vertex at the corner
+    start: wp.array(dtype=int)  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
+    owner: wp.array(dtype=int)  # the lights that share the energy of each vertex
+    part: wp.array(dtype=float)  # share of the vertex's energy that each of these lights receives
+
+
 def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -> wp.array:
     """Sum images, and the model's images, for near and far samples of light: [6, pixels padded] float32 radiance on the device.
 
     Args:
-        captured: images and model.
         sources: the wanted light, some tens of samples; what hides it is not looked at, the images show it.
         triangles: of the captured lights, of several in one place the first.
 
@@ -40,24 +52,30 @@ def sum_near(captured: Captured, sources: Sources, triangles: SphereTriangles) -
     if not (irradiance > 0).all():
         light, channel = np.argwhere(~(irradiance > 0))[0]
         raise ArrayError(f"irradiance of light {light} is 0 in channel {'RGB'[channel]}: its image says nothing about light from there")
-    kept = first_of_equals(direction)
-    vertex, owner = np.nonzero(triangles.share > LEAST_PART)
-    start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
-    part = triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex]
-    inward, length = edge_planes(triangles)
     pixels = surface.packs * devices.pack_width(device)
     weights = wp.zeros((3 * count, pixels), dtype=wp.float32, device=device)
 
-    def upload(values: np.ndarray, dtype: Any) -> wp.array:
-        return wp.array(values, dtype=dtype, device=device)
-
     position = wp.array(surface.values.numpy()[12:15].reshape(3, -1), dtype=wp.float32, device=device)
-    devices.launch(_weights_kernel, pixels,
-                   [position, upload(sources.place, wp.vec4), upload(sources.energy, wp.vec3), upload(sources.axis, wp.vec4),
-                    upload(inward.reshape(-1, 3), wp.vec3), upload(length.reshape(-1), wp.float32),
-                    upload(triangles.neighbour.reshape(-1), wp.int32), upload(triangles.corner.reshape(-1), wp.int32),
-                    upload(start, wp.int32), upload(kept[owner], wp.int32), upload(part, wp.float32), count], [weights], device=device)
+    wanted = [wp.array(values, dtype=dtype, device=device) for values, dtype in (
+        (sources.place, wp.vec4), (sources.energy, wp.vec3), (sources.axis, wp.vec4))]
+    devices.launch(_weights_kernel, pixels, [position, *wanted, _net(triangles, direction, device), count], [weights], device=device)
     return captured.sums(_sum_kernel, 6, as_packs(weights, device))
+
+
+def _net(triangles: SphereTriangles, direction: np.ndarray, device: str) -> Any:
+    vertex, owner = np.nonzero(triangles.share > LEAST_PART)
+    start = np.searchsorted(vertex, np.arange(len(triangles.vertex) + 1))
+    inward, length = edge_planes(triangles)
+    net = Net()
+    net.inward = wp.array(inward.reshape(-1, 3), dtype=wp.vec3, device=device)
+    net.length = wp.array(length.reshape(-1), dtype=wp.float32, device=device)
+    net.neighbour = wp.array(triangles.neighbour.reshape(-1), dtype=wp.int32, device=device)
+    net.corner = wp.array(triangles.corner.reshape(-1), dtype=wp.int32, device=device)
+    net.start = wp.array(start, dtype=wp.int32, device=device)
+    net.owner = wp.array(first_of_equals(direction)[owner], dtype=wp.int32, device=device)
+    net.part = wp.array(triangles.share[vertex, owner] / np.add.reduceat(triangles.share[vertex, owner], start[:-1])[vertex],
+                        dtype=wp.float32, device=device)
+    return net
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -66,13 +84,7 @@ def _weights_kernel(first: int,
                     place: wp.array(dtype=wp.vec4),  # [N]
                     energy: wp.array(dtype=wp.vec3),  # [N]
                     axis: wp.array(dtype=wp.vec4),  # [N]
-                    inward: wp.array(dtype=wp.vec3),  # [3 · faces] unit normals of the planes of the edges opposite to the corners
-                    length: wp.array(dtype=float),  # [3 · faces] what a corner's coordinate is weighted by
-                    neighbour: wp.array(dtype=int),  # [3 · faces] face beyond that edge
-                    corner: wp.array(dtype=int),  # [3 · faces] vertex at the corner
-                    start: wp.array(dtype=int),  # [vertices + 1] where the lights of a vertex begin; a light's own is the only one
-                    owner: wp.array(dtype=int),  # the lights that share the energy of each vertex
-                    part: wp.array(dtype=float),  # share of the vertex's energy that each of these lights receives
+                    net: Net,
                     count: int,  # lights
                     # outputs
                     weights: wp.array2d(dtype=float)):  # [3 · lights, pixels padded], 0
@@ -88,17 +100,17 @@ def _weights_kernel(first: int,
         if lobe[3] > 0.0:
             ahead = wp.max(-(toward[0] * lobe[0] + toward[1] * lobe[1] + toward[2] * lobe[2]), 0.0)
             arriving = arriving * wp.pow(ahead, lobe[3])
-        here, angles = walk(toward, here, inward, neighbour)
-        a = wp.max(angles[0], 0.0) * length[3 * here]
-        b = wp.max(angles[1], 0.0) * length[3 * here + 1]
-        c = wp.max(angles[2], 0.0) * length[3 * here + 2]
+        here, angles = walk(toward, here, net.inward, net.neighbour)
+        a = wp.max(angles[0], 0.0) * net.length[3 * here]
+        b = wp.max(angles[1], 0.0) * net.length[3 * here + 1]
+        c = wp.max(angles[2], 0.0) * net.length[3 * here + 2]
         given = energy[n] * (arriving / wp.max(a + b + c, 1.0e-20))
         for side in range(3):
             share = wp.where(side == 0, a, wp.where(side == 1, b, c))
-            vertex = corner[3 * here + side]
-            for i in range(start[vertex], start[vertex + 1]):
-                light = owner[i]
-                amount = given * (share * part[i])
+            vertex = net.corner[3 * here + side]
+            for i in range(net.start[vertex], net.start[vertex + 1]):
+                light = net.owner[i]
+                amount = given * (share * net.part[i])
                 weights[light, pixel] = weights[light, pixel] + amount[0]
                 weights[count + light, pixel] = weights[count + light, pixel] + amount[1]
                 weights[2 * count + light, pixel] = weights[2 * count + light, pixel] + amount[2]

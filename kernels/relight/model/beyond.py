@@ -29,8 +29,7 @@ be in the dark under all of them."""
 def spacing(direction: np.ndarray) -> float:
     """Return the angle between a captured light and its nearest neighbour, the median over the lights, in radians; π for a single light.
 
-    Args:
-        direction: [lights, 3] unit vectors; several in one place count as one.
+    Directions are [lights, 3] unit vectors; several in one place count as one.
     """
     kept = direction[first_of_equals(direction)]
     cosine = kept @ kept.T - 2 * np.eye(len(kept))
@@ -44,14 +43,9 @@ def reach(direction: np.ndarray) -> float:
 
 
 def share_beyond(direction: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Return how far samples of light lie beyond the captured lights, from 0 to 1.
+    """Return how far samples of light lie beyond the captured lights: [n] float64 from 0 to 1, both given as unit vectors.
 
-    Args:
-        direction: [lights, 3] unit vectors to the captured lights.
-        samples: [n, 3] unit vectors.
-
-    Returns:
-        [n] float64: 0 up to the reach of the nearest light, 1 from twice the reach on, linear in the angle between.
+    It is 0 up to the reach of the nearest light, 1 from twice the reach on, linear in the angle between.
     """
     nearest = np.arccos(np.clip((direction @ samples.T).max(axis=0, initial=-1.0), -1, 1))
     return np.asarray(np.clip(nearest / reach(direction) - 1, 0, 1))
@@ -60,12 +54,8 @@ def share_beyond(direction: np.ndarray, samples: np.ndarray) -> np.ndarray:
 def inward_pairs(direction: np.ndarray) -> np.ndarray:
     """Return which captured light is predicted from which other one to test a model beyond the lights.
 
-    Args:
-        direction: [lights, 3] unit vectors.
-
-    Returns:
-        [pairs, 2] int32: a light, and of the lights that are nearer to the mean direction the one whose angle from it is closest to
-        twice the reach. The innermost light has none.
+    The answer is [pairs, 2] int32: a light, and of the lights that are nearer to the mean direction the one whose angle from it is closest
+    to twice the reach. The innermost light has none.
     """
     kept = first_of_equals(direction)
     towards = direction[kept]
@@ -79,10 +69,7 @@ def inward_pairs(direction: np.ndarray) -> np.ndarray:
 def followed(change: np.ndarray, picture: np.ndarray, modelled_picture: np.ndarray) -> np.ndarray:
     """Return how a picture changes as a model of it does: a gain is added, a loss is a share of the picture.
 
-    Args:
-        change: […] of the model.
-        picture: […] before the change.
-        modelled_picture: […] what the model has in its place; a loss is no larger.
+    `change` is the model's, `modelled_picture` what the model has in place of the picture; a loss is no larger.
     """
     share = np.divide(picture, modelled_picture, out=np.zeros_like(picture), where=modelled_picture > 0)
     return np.where(change < 0, change * np.maximum(share, 0), change)

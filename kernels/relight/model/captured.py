@@ -30,14 +30,10 @@ class Captured(NamedTuple):
 
         Args:
             band: captured images of the same pixels as the surface.
-            surface: solved maps.
             visible: [lights or more, P] uint8 packs of occlusion.see_lights for the captured lights.
             direction: [lights, 3] unit vectors to the captured lights.
             irradiance: [lights, 3] of each.
             scale: [lights padded] radiance of a stored 1.0.
-
-        Raises:
-            ArrayError: images or visibility of other pixels or of fewer lights.
         """
         band.require_channels(3)
         count, device = len(direction), surface.device

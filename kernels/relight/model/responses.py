@@ -41,10 +41,7 @@ def empty_responses(count: int, packs: int, device: str) -> Responses:
 def respond(surface: Surface, sources: SourcesOnDevice, visible: wp.array, responses: Responses) -> None:
     """Compute the responses of a surface to far samples of light, as of energy one, into memory of as many packs as the surface has.
 
-    Args:
-        surface, sources: the pixels, and the samples.
-        visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; it has the rows of all samples.
-        responses: where they are written.
+    `visible` is [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; it has the rows of all samples.
     """
     devices.launch(_respond_kernel(devices.pack_width(surface.device)), responses.matt.size,
                    [surface.values, sources.place, sources.occluder, sources.share, visible], list(responses), device=surface.device)
@@ -53,10 +50,6 @@ def respond(surface: Surface, sources: SourcesOnDevice, visible: wp.array, respo
 def shown_gloss(captured: Captured, responses: Responses) -> wp.array:
     """Return [3 lights, P] float32 packs of the specular part under each captured light of irradiance one, as bright as the images show it
     (kernels.relight.model.gloss_ratio); on CUDA not synchronised.
-
-    Args:
-        captured: images and model.
-        responses: of the surface to the captured lights.
     """
     device = captured.surface.device
     shown = wp.empty(responses.gloss.shape, dtype=responses.gloss.dtype, device=device)

@@ -72,7 +72,6 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
         roughness: [n] 0…1; 0: no specular lobe, whatever F0.
         second: of pixels that mix two materials; None: there are none. The albedo is that of the whole pixel.
         profile: [n, 3] of lobe_profile.fit_profile; None: the specular part is that of the BRDF. A pixel without a lobe has no second one.
-        device: where.
     """
     count = len(normal)
     nothing = SecondLobe(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
@@ -91,11 +90,7 @@ def upload_surface(normal: np.ndarray, diffuse_albedo: np.ndarray, specular: np.
 
 
 def upload_sources(sources: Sources, device: str, counts: Sequence[int] | None = None) -> SourcesOnDevice:
-    """Put samples on the device: of one frame, or far ones for several frames, one after the other, as many samples as `counts` says.
-
-    Raises:
-        ArrayError: counts of other samples, or a near one among those of frames.
-    """
+    """Put samples on the device: of one frame, or far ones for several frames, one after the other, as many samples as `counts` says."""
     if counts is not None and (sum(counts) != sources.count or sources.place[:, 3].any()):
         raise ArrayError(f"samples are {sources.count}, {int(sources.place[:, 3].sum())} of them near, for frames of {sum(counts)}: "
                          "give the far samples of all frames")
@@ -105,17 +100,13 @@ def upload_sources(sources: Sources, device: str, counts: Sequence[int] | None =
 
 
 def shade(surface: Surface, sources: Sources, visible: wp.array | None = None) -> wp.array:
-    """Return the radiance of a surface under samples of light.
+    """Return the radiance of a surface under samples of light; not synchronised on CUDA.
 
     Args:
-        surface, sources: the pixels, and the samples.
         visible: [rows, P] uint8 packs, 255 where a pixel sees the occluder of that row; None: nothing is hidden.
 
     Returns:
-        [6, pixels padded] float32 radiance on the device, diffuse RGB and specular RGB; not synchronised on CUDA.
-
-    Raises:
-        ArrayError: samples that ask for rows of visibility that are not there, or visibility of other pixels.
+        [6, pixels padded] float32 radiance on the device, diffuse RGB and specular RGB.
     """
     if visible is None:
         kind = pack_type(devices.pack_width(surface.device), wp.uint8)

@@ -65,13 +65,12 @@ def far(direction: np.ndarray, irradiance: np.ndarray) -> Sources:
 
 
 def point(position: np.ndarray, intensity: np.ndarray, axis: np.ndarray | None = None, exponent: float = 0.0) -> Sources:
-    """Return one point light as a sample: irradiance = intensity · cos^exponent / distance².
+    """Return one point light as a sample: irradiance = intensity · cos^exponent / distance², of the cosine about the axis.
 
     Args:
         position: [3] in the unit of the surface, camera frame.
         intensity: [3].
         axis: [3] unit direction it shines along; None: evenly.
-        exponent: of the cosine about the axis.
     """
     lobe = None if axis is None else np.append(axis, exponent)[None]
     return _sources(np.append(position, 1.0)[None], np.asarray(intensity)[None], lobe)
@@ -81,7 +80,6 @@ def disc_samples(middle: np.ndarray, angle_degrees: float, count: int | None = N
     """Return [samples, 3] float64 unit vectors spread evenly over a disc on the sphere, each standing for the same solid angle.
 
     Args:
-        middle: [3] unit vector.
         angle_degrees: diameter, 0…180.
         count: of samples; None: DISC_SAMPLES, and more where they would be farther apart than DISC_PITCH_DEGREES.
 
@@ -114,13 +112,9 @@ def sphere(centre: np.ndarray, radius: float, radiance: np.ndarray, count: int =
 
 def rectangle(centre: np.ndarray, edge_u: np.ndarray, edge_v: np.ndarray, radiance: np.ndarray,
               count: int = RECTANGLE_SAMPLES) -> Sources:
-    """Return samples of a rectangle of even radiance that shines to one side: against edge_u × edge_v, as a UsdLux RectLight does.
+    """Return about `count` samples of a rectangle of even radiance that shines against edge_u × edge_v, as a UsdLux RectLight does.
 
-    Args:
-        centre: [3], camera frame.
-        edge_u, edge_v: [3] its whole edges, at a right angle.
-        radiance: [3].
-        count: of samples, about.
+    The centre lies in the camera frame; the edges are whole and at a right angle.
     """
     edge_u, edge_v = np.asarray(edge_u, dtype=np.float64), np.asarray(edge_v, dtype=np.float64)
     lengths = np.linalg.norm(edge_u), np.linalg.norm(edge_v)

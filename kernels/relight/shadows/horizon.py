@@ -121,11 +121,7 @@ def height_field(height: np.ndarray, mask: np.ndarray, projection: Projection, d
 def find_horizons(azimuths: Azimuths, pixels: np.ndarray, surface: Surface, field: HeightField) -> Horizons:
     """Find the horizons of pixels as far as lights are hidden by them, by following the surface in some directions in the picture.
 
-    Args:
-        azimuths: the directions, and the slopes between which horizons are told apart.
-        pixels: [m] row-major positions in the image.
-        surface: the same pixels.
-        field: the height.
+    `pixels` are [m] row-major positions in the image, of the same pixels as the surface.
 
     Convention:
         With an orthographic camera, a light in one of these directions is above the horizon where kernels.relight.shadows.occlusion sees
@@ -163,12 +159,7 @@ def _until(place: float, step: float, block: int) -> float:
 
 
 def see_above(direction: np.ndarray, surface: Surface, horizons: Horizons) -> wp.array:
-    """Return which pixels see which far lights, as occlusion.see_lights does.
-
-    Args:
-        direction: [n, 3] unit vectors, between directions in the picture whose horizons are there.
-        surface, horizons: the pixels, and their horizons.
-    """
+    """Return which pixels see which far lights, between directions whose horizons are there, as occlusion.see_lights does."""
     if horizons.tangent.shape[1] != surface.packs:
         raise ArrayError(f"horizons have {horizons.tangent.shape[1]} packs, the surface {surface.packs}: give the same pixels")
     pack = devices.pack_width(surface.device)

@@ -9,7 +9,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.surface.shadows import NO_REACH, Extent, Projection, extent_of, in_shadow_within, unproject
+from kernels.surface.shadows import NO_REACH, Extent, Projection, Relief, in_shadow_within, relief_of, surface_point
 
 
 def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection, *,
@@ -30,14 +30,13 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     """
     if not len(pixels) or pixels.min() < 0 or pixels.max() >= mask.shape[0] * mask.shape[1]:
         raise ArrayError(f"pixels must be positions from 0 to {mask.shape[0] * mask.shape[1] - 1}, one or more")
-    extent = extent_of(height.numpy(), mask.numpy()) if extent is None else extent
     pack = devices.pack_width(device)
     packs = -(-len(pixels) // pack)
     where = pixels[np.minimum(np.arange(packs * pack), len(pixels) - 1)]
     visible = wp.empty((len(place), packs), dtype=pack_type(pack, wp.uint8), device=device)
     devices.launch(_see_kernel(pack), len(place) * packs,
-                   [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device), height, mask,
-                    projection.perspective, projection.scale, projection.centre, *extent], [visible], device=device, uneven=True)
+                   [wp.array(place, dtype=wp.vec4, device=device), wp.array(where, dtype=wp.int32, device=device),
+                    relief_of(height, mask, projection, extent)], [visible], device=device, uneven=True)
     return visible
 
 
@@ -49,13 +48,7 @@ def _see_kernel(pack: int) -> Any:
     def see_kernel(first: int,
                    places: wp.array(dtype=wp.vec4),  # [N]
                    pixels: wp.array(dtype=wp.int32),  # [P · pack]
-                   height: wp.array2d(dtype=float),
-                   mask: wp.array2d(dtype=wp.uint8),
-                   perspective: bool,
-                   scale: wp.vec2,
-                   centre: wp.vec2,
-                   box: wp.vec4i,
-                   highest: float,
+                   relief: Relief,
                    # outputs
                    visible: wp.array2d(dtype=byte_pack)):  # [N, P]
         thread = first + wp.tid()
@@ -66,14 +59,14 @@ def _see_kernel(pack: int) -> Any:
         out = byte_pack()
         for k in range(pack):
             n = pixels[p * pack + k]
-            row, col = n / mask.shape[1], n % mask.shape[1]
+            row, col = n / relief.mask.shape[1], n % relief.mask.shape[1]
             toward = wp.vec3(place[0], place[1], place[2])
             reach = float(NO_REACH)
             if place[3] > 0.0:
-                toward = toward - unproject(float(col) + 0.5, float(row) + 0.5, height[row, col], perspective, scale, centre)
+                toward = toward - surface_point(row, col, relief.height, relief.camera)
                 reach = wp.length(toward)
                 toward = toward / wp.max(reach, 1.0e-20)
-            hidden = in_shadow_within(height, mask, row, col, toward, reach, perspective, scale, centre, box, highest)
+            hidden = in_shadow_within(relief, row, col, toward, reach)
             out[k] = wp.where(hidden, wp.uint8(0), wp.uint8(255))
         visible[light, p] = out
 

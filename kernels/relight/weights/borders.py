@@ -38,16 +38,14 @@ class Shares(NamedTuple):
 
 
 def divide(samples: LatLongSamples, nearest: np.ndarray, lights: np.ndarray, *, quarterings: int = QUARTERINGS) -> Shares:
-    """Share samples out to the cells of the lights by area.
+    """Share samples of a lat-long map out to the cells of the lights by area.
+
+    There is a share for each sample and each light whose cell may touch it; zeros occur.
 
     Args:
-        samples: as in a lat-long map.
         nearest: [samples] index of the light nearest to the middle, or of one as near but for rounding.
         lights: [lights, 3] unit vectors, all different.
         quarterings: how often a sample may be cut in four where many cells meet.
-
-    Returns:
-        A share for each sample and each light whose cell may touch it; zeros occur.
     """
     frame = _frames(samples)
     sample, rival = _rivals(frame[:, 0], reach(samples.polar, samples.half_polar, samples.half_azimuth), nearest, lights)

@@ -34,17 +34,13 @@ class Nearest(NamedTuple):
 def integrate_cells(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, device: str) -> LightEnergy:
     """Integrate a lat-long map over the cells of the lights, for several rotations of the map.
 
+    Both energy and solid angle of the cells sum to those of the whole map. Of lights in one place the first has the cell.
+
     Args:
         environment: [rows, cols, 3] scene-linear radiance; top row +y, image centre +z, a quarter from the left +x.
         directions: [lights, 3] unit vectors from the object to the lights (without padding).
         rotations: [frames, 3, 3]: the environment is turned by these, turned = rotation @ direction.
         device: where the nearest lights are found; sums are taken on the host in float64.
-
-    Returns:
-        Energy and solid angle of each cell; both sum to those of the whole map. Of lights in one place the first has the cell.
-
-    Raises:
-        ArrayError: as latlong.check.
     """
     directions, rotations = check(environment, directions, rotations)
     kept = first_of_equals(directions)
@@ -62,12 +58,9 @@ def integrate_cells(environment: np.ndarray, directions: np.ndarray, rotations: 
 
 
 def nearest_light(grid: SampleGrid, directions: np.ndarray, *, device: str) -> Nearest:
-    """Find the nearest light at each sample of a grid, and whether a border between two cells may cross the sample.
+    """Find the nearest light at each sample of a grid, and whether a border between two cells may cross the sample; waits for the device.
 
-    Args:
-        grid: of a lat-long map.
-        directions: [lights, 3] unit vectors, all different.
-        device: where; the call waits for it.
+    Directions are [lights, 3] unit vectors, all different.
     """
     pack = devices.pack_width(device)
     rows, cols = len(grid.polar), len(grid.azimuth)

@@ -41,15 +41,10 @@ class EnvironmentParts(NamedTuple):
 
 
 def sample_environment(environment: np.ndarray, count: int = SAMPLES) -> EnvironmentSamples:
-    """Cut a lat-long map into samples: direction, energy and angular radius.
+    """Cut a lat-long map into `count` samples at most: direction, energy and angular radius. Their sum is that of the map.
 
     Args:
-        environment: [rows, cols, 3] scene-linear radiance, finite, 0 or above; top row +y, image centre +z, a quarter from the
-            left +x.
-        count: largest number of samples.
-
-    Returns:
-        The samples that have energy; their sum is that of the map.
+        environment: [rows, cols, 3] scene-linear radiance, finite, 0 or above; top row +y, image centre +z, a quarter from the left +x.
     """
     rows, cols, _ = environment.shape
     polar, azimuth = np.pi * (np.arange(rows) + 0.5) / rows, 2 * np.pi * (np.arange(cols) + 0.5) / cols
@@ -110,8 +105,7 @@ def sample_environment(environment: np.ndarray, count: int = SAMPLES) -> Environ
 def split_environment(environment: np.ndarray, radius: float) -> EnvironmentParts:
     """Divide a lat-long map [rows, cols, 3], finite, 0 or above, into small bright places, of this angular radius at most, and the rest.
 
-    Returns:
-        The samples of sample_environment that are small, at most MOST_SMALL with most energy, and BROAD_SAMPLES samples of what they leave.
+    The first are samples of sample_environment, at most MOST_SMALL with most energy; the rest is BROAD_SAMPLES samples of what they leave.
     """
     samples = sample_environment(environment)
     small = np.flatnonzero(samples.radius < radius)

@@ -52,13 +52,9 @@ def edge_planes(triangles: SphereTriangles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def locate(grid: SampleGrid, triangles: SphereTriangles, rotation: np.ndarray, *, device: str) -> Located:
-    """Find the triangle that each sample of a grid lies in when the grid is turned, and where in it.
+    """Find the triangle that each sample of a grid lies in when the grid is turned, and where in it; waits for the device.
 
-    Args:
-        grid: of a lat-long map.
-        triangles: that cover the sphere.
-        rotation: [3, 3].
-        device: where; the call waits for it.
+    The triangles cover the sphere.
     """
     planes, length = edge_planes(triangles)
     inward = (planes @ rotation).reshape(-1, 3)

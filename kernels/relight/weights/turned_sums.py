@@ -37,12 +37,9 @@ class _Parts(NamedTuple):
 
 def gather(environment: np.ndarray, rotations: np.ndarray, lights: int,
            split: Callable[[np.ndarray, SampleGrid], Iterable[Shares]]) -> LightEnergy:
-    """Sum the energy of the samples of a map over lights.
+    """Sum the energy of the samples of a map [rows, cols, 3], turned by rotations [frames, 3, 3], over lights.
 
     Args:
-        environment: [rows, cols, 3] scene-linear radiance.
-        rotations: [frames, 3, 3] of the map.
-        lights: how many there are.
         split: (rotation, band) → which parts of the band's samples go where; the shares of a sample add up to one.
     """
     energy, areas = np.zeros((len(rotations), lights, 3)), np.zeros((len(rotations), lights))
@@ -71,13 +68,7 @@ def _sorted(shares: Iterable[Shares], columns: int, lights: int) -> _Parts:
 
 
 def _sums(amounts: wp.array, parts: _Parts, turn: Turn) -> np.ndarray:
-    """Return [frames, lights, 3] float64 the energy of each light in each frame of a turn.
-
-    Args:
-        amounts: [rows, cols] vec3d energy of each sample, on the host.
-        parts: of the samples.
-        turn: its frames, and by how many columns the map is shifted in each.
-    """
+    """Return [frames, lights, 3] float64 the energy of each light in each frame of a turn, of samples [rows, cols] vec3d on the host."""
     shift = wp.array(np.array(turn.columns) % amounts.shape[1], dtype=wp.int32, device=HOST)
     energy = wp.zeros((len(parts.begin) - 1, len(turn.frames)), dtype=wp.vec3d, device=HOST)
     inputs = [wp.array(values, dtype=kind, device=HOST)

@@ -49,21 +49,14 @@ class Smoothed(NamedTuple):
 
 def smooth(ranges: wp.array, sigma: wp.array, guide: wp.array, status: wp.array, rows: int, cols: int, *, radius: int = 2,
            spatial_px: float = 1.5) -> Smoothed:
-    """Smooth ranges: put each on the plane through its neighbours.
+    """Smooth ranges: put each on the plane through its neighbours. Invalid pixels stay invalid: nothing is filled in.
 
     Args:
         ranges, sigma: [rows · cols] float32 metres, padded or not.
         guide: [rows · cols] float32, above zero where OK: the image whose edges are kept (amplitude or passive intensity).
         status: [rows · cols] int32; only OK pixels are changed and count.
-        rows, cols: of the image.
         radius: pixels of the window.
         spatial_px: standard deviation of the Gaussian over the window, pixels.
-
-    Returns:
-        Ranges and their standard deviations. Invalid pixels stay invalid: nothing is filled in.
-
-    Raises:
-        ArrayError: sizes do not match, an array is a slice with gaps, or an option is not above zero.
 
     Source:
         Petschnigg et al., "Digital photography with flash and no-flash image pairs", SIGGRAPH 2004 (joint bilateral); of

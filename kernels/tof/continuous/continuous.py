@@ -87,18 +87,12 @@ def weights(modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Se
 def decode(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarray, reference_phase_rad: Sequence[float] | np.ndarray, *,
            noise: Noise, saturation: float | None = None, scale: Sequence[float] | np.ndarray | None = None,
            device: str) -> Correlation:
-    """Fit phase, amplitude and offset of each frequency by least squares, with the noise that they inherit.
+    """Fit phase, amplitude and offset of each frequency by least squares, with the noise that they inherit; not synchronised on CUDA.
 
     Args:
-        images: [M, pixel] float32 readings, in any order.
+        images: [M, pixel] float32 readings, in any order; those that are not finite count as saturated ones.
         modulation_hz, reference_phase_rad, scale: [M] as `weights` takes them.
         saturation: readings at or above it are none; the frequency is then not usable at that pixel. None: none saturates.
-
-    Returns:
-        The phases, on the device; not synchronised on CUDA. Readings that are not finite count as saturated ones.
-
-    Raises:
-        ArrayError: shapes do not match, or the images cannot give phases (see `weights`).
 
     Source:
         Lange, "3D time-of-flight distance measurement with custom solid-state image sensors in CMOS/CCD-technology", Siegen 2000
@@ -240,14 +234,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 def sample_harmonics(cosines: np.ndarray, sines: np.ndarray) -> np.ndarray:
-    """Return Σ_h cosines[h]·cos hφ + sines[h]·sin hφ at ENTRIES phases.
-
-    Args:
-        cosines, sines: [H] radians, h from 0.
-
-    Returns:
-        [ENTRIES] float64 radians, phases k · 2π / ENTRIES.
-    """
+    """Return Σ_h cosines[h]·cos hφ + sines[h]·sin hφ, radians, at the ENTRIES phases k · 2π / ENTRIES; h counts from 0."""
     angle = np.arange(ENTRIES)[:, None] * (2 * np.pi / ENTRIES) * np.arange(len(cosines))
     return np.cos(angle) @ np.asarray(cosines, dtype=np.float64) + np.sin(angle) @ np.asarray(sines, dtype=np.float64)
 
@@ -256,14 +243,7 @@ def straighten(found: Correlation, table: np.ndarray) -> Correlation:
     """Correct each phase by the table's value at it.
 
     Args:
-        found: phases as measured.
         table: [frequency, entries] radians by measured phase, evenly spaced over the turn; interpolated linearly.
-
-    Returns:
-        The same with other phases, 0…2π; on the device.
-
-    Raises:
-        ArrayError: the table has another number of frequencies, or is not finite.
 
     Source:
         Lindner, Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006 (the table); here harmonics of the phase.

@@ -39,14 +39,12 @@ class Ranges(NamedTuple):
 def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agreement_rad: float = AGREEMENT_RAD) -> Ranges:
     """Take the most probable hypothesis of each pixel and say why where it is not good enough.
 
+    LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; OUT_OF_RANGE: nothing in the span of `unwrap` fits;
+    MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain.
+
     Args:
-        found, weighed: phases and hypotheses of the same pixels.
         light_speed: metres a second.
         agreement_rad: systematic error of a phase up to which frequencies count as agreeing.
-
-    Returns:
-        Ranges, on the device. LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; OUT_OF_RANGE: nothing
-        in the span of `unwrap` fits; MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain.
     """
     device, pixels = str(weighed.range.device), weighed.range.shape[1]
     pack, count = devices.pack_width(device), len(found.modulation_hz)

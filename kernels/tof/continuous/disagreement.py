@@ -36,19 +36,12 @@ class Disagreement(NamedTuple):
 
 
 def widen(found: Correlation, ranges: Ranges, rows: int, cols: int, *, light_speed: float) -> Disagreement:
-    """Add the variance that frequencies disagree by to that of the phases.
+    """Add the variance that frequencies disagree by to that of the phases; those of a single frequency stay the same.
 
     Args:
         found: phases; rows · cols pixels and padding.
         ranges: what `decide` took from them: of pixels that are OK or MULTIPATH the misfit is known.
-        rows, cols: of the image.
         light_speed: metres a second.
-
-    Returns:
-        Phases no surer than before; with one frequency, or where a pixel has one, they are the same.
-
-    Raises:
-        ArrayError: the image has another number of pixels.
 
     Source:
         DerSimonian and Laird, "Meta-analysis in clinical trials", Controlled Clinical Trials 7, 1986: the moment estimate of τ², here of a

@@ -46,14 +46,10 @@ def mark_flying(ranges: wp.array, sigma: wp.array, status: wp.array, rows: int, 
     Args:
         ranges, sigma: [rows · cols] float32 metres, padded or not.
         status: [rows · cols] int32; only pixels that are OK are looked at and count as neighbours.
-        rows, cols: of the image.
         least_m: smallest departure that counts, metres.
 
     Returns:
         [rows · cols] int32 status with FLYING in it, on the device.
-
-    Raises:
-        ArrayError: sizes do not match, or `least_m` is not above zero.
     """
     require_image(ranges, sigma, status, rows=rows, cols=cols)
     if not (np.isfinite(least_m) and least_m > 0):
@@ -64,11 +60,7 @@ def mark_flying(ranges: wp.array, sigma: wp.array, status: wp.array, rows: int, 
 
 
 def require_image(*arrays: wp.array, rows: int, cols: int) -> None:
-    """Refuse arrays that are not one image.
-
-    Raises:
-        ArrayError: one has another size.
-    """
+    """Refuse arrays that are not one image."""
     for array in arrays:
         if len(array.shape) != 1 or not 0 < rows * cols <= array.shape[0]:
             raise ArrayError(f"an array is {array.shape}, the image is {rows} x {cols}: give [rows · cols], padded or not")

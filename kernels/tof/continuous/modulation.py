@@ -14,18 +14,7 @@ MOST_TURNS = 1000
 
 
 def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> np.ndarray:
-    """Return the phase that a metre of range adds, 4πf/c: light goes there and back.
-
-    Args:
-        modulation_hz: [F] frequencies.
-        light_speed: c, metres a second.
-
-    Returns:
-        [F] float64.
-
-    Raises:
-        ArrayError: no frequency, or one is not above zero.
-    """
+    """Return the phase [F] that a metre of range adds, 4πf/c: light goes there and back. The speed of light is in metres a second."""
     return 4 * np.pi * require_frequencies(modulation_hz) / light_speed
 
 
@@ -42,19 +31,10 @@ def require_frequencies(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarr
 
 
 def common_range_m(modulation_hz: Sequence[float] | np.ndarray, light_speed: float) -> float:
-    """Return the shortest range after which every phase repeats, within REPEAT_TURNS.
+    """Return the shortest range after which every phase repeats, within REPEAT_TURNS; equal frequencies count once.
 
-    For whole multiples of one frequency g it is c / (2g): 14.99 m for 20, 30 and 80 MHz.
-
-    Args:
-        modulation_hz: [F] frequencies; equal ones count once.
-        light_speed: metres a second.
-
-    Returns:
-        Metres; MOST_TURNS turns of the lowest frequency where they repeat later than that.
-
-    Raises:
-        ArrayError: no frequency, or one is not above zero.
+    For whole multiples of one frequency g it is c / (2g): 14.99 m for 20, 30 and 80 MHz. Where phases repeat later than that, it is
+    MOST_TURNS turns of the lowest frequency.
     """
     turns_per_metre = np.unique(radians_per_metre(modulation_hz, light_speed)) / (2 * np.pi)
     turns = np.arange(1, MOST_TURNS + 1)
@@ -65,11 +45,7 @@ def common_range_m(modulation_hz: Sequence[float] | np.ndarray, light_speed: flo
 
 
 def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, farthest_m: float, light_speed: float) -> None:
-    """Refuse a span that the frequencies cannot tell apart.
-
-    Raises:
-        ArrayError: the span is empty, or longer than the common range; the message says both.
-    """
+    """Refuse a span that is empty, or longer than the common range of the frequencies; the message says both."""
     if not 0 <= nearest_m < farthest_m:
         raise ArrayError(f"ranges from {nearest_m:g} to {farthest_m:g} m are no span: give 0 <= nearest < farthest")
     common = common_range_m(modulation_hz, light_speed)
@@ -80,11 +56,7 @@ def require_span(modulation_hz: Sequence[float] | np.ndarray, nearest_m: float, 
 
 
 def require_ascending(times: Sequence[float] | np.ndarray, what: str) -> None:
-    """Refuse times that do not grow.
-
-    Raises:
-        ArrayError: naming the first that does not.
-    """
+    """Refuse times that do not grow, naming the first."""
     for index, (before, after) in enumerate(pairwise(times)):
         if not after > before:
             raise ArrayError(f"{what} are out of order: number {index + 1} ({after:g} s) is not after number {index} ({before:g} s)")

@@ -37,16 +37,11 @@ class Pooled(NamedTuple):
 def pool(found: Correlation, rows: int, cols: int, *, light_speed: float) -> Pooled:
     """Add the phasors of dark neighbours up where a pixel has no signal of its own.
 
+    Pixels with a signal of their own, or with none in any window, are as they were. Amplitude is the mean of the window.
+
     Args:
         found: phases of `decode`, corrected for wiggling; rows · cols pixels and padding.
-        rows, cols: of the image.
         light_speed: metres a second.
-
-    Returns:
-        The phases; pixels with a signal of their own, or with none in any window, are as they were. Amplitude is the mean of the window.
-
-    Raises:
-        ArrayError: the image has another number of pixels.
     """
     device, pixels, count = str(found.phase.device), found.phase.shape[1], found.phase.shape[0]
     if not 0 < rows * cols <= pixels:

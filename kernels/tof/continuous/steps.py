@@ -43,9 +43,6 @@ def cover_steps(ranges: Ranges, amplitude: wp.array, rows: int, cols: int, *, sp
 
     Returns:
         [pixel] float32 metres, on the device; pixels that are not OK, or whose neighbours are not, keep what they have.
-
-    Raises:
-        ArrayError: the image has another number of pixels.
     """
     device, pixels = str(ranges.range.device), ranges.range.shape[0]
     if not 0 < rows * cols <= pixels:

@@ -46,9 +46,6 @@ def unwrap(found: Correlation, *, nearest_m: float, farthest_m: float, light_spe
         nearest_m, farthest_m: the span to look in; END_SIGMAS standard deviations beyond either end are looked at too.
         light_speed: metres a second.
 
-    Returns:
-        The hypotheses, on the device.
-
     Raises:
         ArrayError: the frequencies cannot tell the whole span apart; the message says what they can.
 
@@ -203,13 +200,6 @@ def vote(weighed: Hypotheses, rows: int, cols: int) -> Hypotheses:
 
     The probability of a hypothesis is multiplied by the density that the neighbours' hypotheses, weighed by their probabilities, have at
     its range, plus a little for a pixel that is on none of their surfaces. Nothing is smoothed.
-
-    Args:
-        weighed: of `unwrap`; rows · cols pixels and padding.
-        rows, cols: of the image.
-
-    Raises:
-        ArrayError: the image has another number of pixels.
 
     Source:
         Järemo Lawin, Forssén, Ovrén, "Efficient multi-frequency phase unwrapping using kernel density estimation", ECCV 2016; here

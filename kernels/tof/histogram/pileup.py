@@ -27,10 +27,7 @@ class LiveCounts(NamedTuple):
 
 
 def place(counts: np.ndarray, device: str) -> wp.array:
-    """Return histograms on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
-
-    Args:
-        counts: [pixel, bin], not negative.
+    """Return histograms [pixel, bin] on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
 
     Raises:
         ArrayError: wrong shape, negative or not finite counts, or not one count in all of them.
@@ -60,9 +57,6 @@ def correct_pileup(counts: wp.array, *, pulses: int) -> LiveCounts:
     Returns:
         The photons that the pulses left at each bin would have counted, whose mean is live · flux, the fraction of the pulses left, and
         `pulses`. A bin with less than EXHAUSTED of the pulses left has live 0.
-
-    Raises:
-        ArrayError: pulses is not above zero.
 
     Source:
         Coates, "The correction for photon `pile-up' in the measurement of radiative lifetimes", J. Phys. E 1(8), 1968.

@@ -45,14 +45,7 @@ class Pulse(NamedTuple):
 
 
 def gaussian(sigma_bins: float) -> Pulse:
-    """Return a Gaussian pulse.
-
-    Args:
-        sigma_bins: standard deviation, in bins, jitter of the detector included.
-
-    Raises:
-        ArrayError: it is not above zero.
-    """
+    """Return a Gaussian pulse of this standard deviation in bins, jitter of the detector included."""
     if not (np.isfinite(sigma_bins) and sigma_bins > 0):
         raise ArrayError(f"the pulse is {sigma_bins} bins wide: give a width above zero")
     half = int(REACH_SIGMAS * STEPS_PER_SIGMA)
@@ -70,9 +63,6 @@ def with_tail(sigma_bins: float, tail_bins: float, part: float) -> Pulse:
         sigma_bins: standard deviation of the Gaussian, in bins.
         tail_bins: decay time of the tail, in bins.
         part: of the photons that are delayed, 0…1.
-
-    Raises:
-        ArrayError: a width is not above zero, or the part is not within 0…1.
 
     Source:
         The jitter of a silicon photodiode, a Gaussian peak and a diffusion tail: Cova, Ghioni, Lacaita, Samori, Zappa, "Avalanche
@@ -95,9 +85,6 @@ def measured(times_bins: Sequence[float] | np.ndarray, power: Sequence[float] | 
     Args:
         times_bins: [n ≥ 3] ascending times, in bins.
         power: [n] in any unit, none negative, not all zero; between samples the power is linear, outside it is zero.
-
-    Raises:
-        ArrayError: the times are out of order, or the power is no pulse.
     """
     times, values = np.asarray(times_bins, dtype=np.float64), np.asarray(power, dtype=np.float64)
     if times.ndim != 1 or times.shape != values.shape or len(times) < 3:

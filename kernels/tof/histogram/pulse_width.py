@@ -51,7 +51,6 @@ def estimate_pulse(histograms: LiveCounts, counts: np.ndarray) -> PulseShape:
     better; waits for the device.
 
     Args:
-        histograms: of all pixels.
         counts: [pixel, bin] the same as recorded, to pick the brightest.
 
     Raises:

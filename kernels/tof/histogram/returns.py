@@ -73,8 +73,6 @@ def find_returns(histograms: LiveCounts, pulse: Pulse, *, most: int = 1, first_b
     """Find the returns of each histogram.
 
     Args:
-        histograms: counts, and the part of the pulses that saw each bin.
-        pulse: shape of a return.
         most: returns to look for, 1 to 4; later ones only where they are as significant as the first must be.
         first_bin, last_bin: where returns may be, in bins from the start; None: to the end.
 

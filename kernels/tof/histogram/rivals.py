@@ -52,9 +52,7 @@ def vote_on_returns(histograms: LiveCounts, pulse: Pulse, found: Returns, rows: 
     """Return the most probable return of each pixel; waits for the device.
 
     Args:
-        histograms, pulse: as given to `find_returns`.
         found: what it found; pixels whose first return is SURE keep it.
-        rows, cols: of the image.
         usable: [pixel] bool: the others neither vote nor get a return.
         first_bin, last_bin: where returns may be.
 

@@ -64,7 +64,6 @@ def return_times(histograms: LiveCounts, pulse: Pulse, position: wp.array, photo
     """Return the mean and the standard deviation of the time of each return.
 
     Args:
-        pulse: shape of a return.
         position: [return, pixel] float32 times of greatest likelihood, bins.
         photons: [return, pixel] float32 their strengths; the first 0 ends the list.
         background: [pixel] float32 photons a bin.

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.photometric.model.samples import evenly
-from kernels.photometric.search.untold_factors import untold
+from kernels.photometric.search.light_factors import untold
 from service.light_estimation.explanations import grey_readings
 from service.light_estimation.lambertian import fit_lambertian
 from service.light_estimation.semi_calibrated import fit_grey_intensities

@@ -6,26 +6,25 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.photometric.shadows.shadowing import exclude_shadows
-from kernels.surface.shadows import NO_REACH, Projection, extent_of, in_shadow_within
+from kernels.surface.shadows import NO_REACH, Projection, Relief, in_shadow_within, relief_of
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
 
 STEP_AT, STEP_HEIGHT = 40, 10.0
 
 
 @wp.kernel(enable_backward=False)
-def shadow_kernel(height: wp.array2d(dtype=float), mask: wp.array2d(dtype=wp.uint8), toward: wp.vec3, perspective: bool,
-                  scale: wp.vec2, centre: wp.vec2, box: wp.vec4i, highest: float, out: wp.array2d(dtype=wp.uint8)):
+def shadow_kernel(relief: Relief, toward: wp.vec3, out: wp.array2d(dtype=wp.uint8)):
     r, c = wp.tid()
-    if in_shadow_within(height, mask, r, c, toward, NO_REACH, perspective, scale, centre, box, highest):
+    if in_shadow_within(relief, r, c, toward, NO_REACH):
         out[r, c] = wp.uint8(1)
 
 
 def shadows(height: np.ndarray, mask: np.ndarray, toward, projection: Projection, device: str) -> np.ndarray:
     out = wp.zeros(height.shape, dtype=wp.uint8, device=device)
-    wp.launch(shadow_kernel, dim=height.shape,
-              inputs=[wp.array(height, dtype=float, device=device), wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device),
-                      wp.vec3(*(np.array(toward) / np.linalg.norm(toward))), *projection, *extent_of(height, mask)],
-              outputs=[out], device=device)
+    relief = relief_of(wp.array(height, dtype=float, device=device), wp.array(mask.astype(np.uint8), dtype=wp.uint8, device=device),
+                       projection)
+    wp.launch(shadow_kernel, dim=height.shape, inputs=[relief, wp.vec3(*(np.array(toward) / np.linalg.norm(toward)))], outputs=[out],
+              device=device)
     return out.numpy().astype(bool)
 
 

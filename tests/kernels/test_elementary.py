@@ -1,8 +1,10 @@
+"""The elementary functions of the kernels against those of float64."""
+
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
-from kernels.structured.angles import angle_of, cosine_of_turns, sine_of_turns
+from kernels.elementary import angle_of, cosine_of_turns, log_of, sine_of_turns
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -38,3 +40,18 @@ def test_as_numpy_in_double(device):
 def test_axes_and_zero(device):
     angle, *_ = run([1, 0, -1, 0, 0, 1], [0, 1, 0, -1, 0, 1], [0] * 6, device)
     np.testing.assert_allclose(angle, np.array([0, 0.5, 1, 1.5, 0, 0.25]) * np.pi, atol=1e-6)
+
+
+def test_the_logarithm(device):
+    """Numbers of every size, and close to one. Tolerance: two roundings of the result or of the polynomial."""
+    rng = np.random.default_rng(2)
+    sizes, near_one = np.exp(rng.uniform(-87, 88, 20000)), 1 + rng.uniform(-0.3, 0.45, 20000)
+    x = np.concatenate([sizes, near_one, [1.0, 2.0, 1e-37, 3e38]]).astype(np.float32)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def evaluate(x: wp.array(dtype=float), out: wp.array(dtype=float)):
+        out[wp.tid()] = log_of(x[wp.tid()])
+
+    out = wp.zeros(len(x), dtype=float, device=device)
+    wp.launch(evaluate, dim=len(x), inputs=[wp.array(x, dtype=float, device=device)], outputs=[out], device=device)
+    np.testing.assert_allclose(out.numpy(), np.log(x.astype(np.float64)), rtol=1.3e-7, atol=1.2e-7)

@@ -47,7 +47,6 @@ def find_steps(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, right: E
         value: [rows, cols] height in units of the pixels' distance.
         sigma: [rows, cols] its standard deviation.
         known: [rows, cols] bool, where there is a height.
-        right, down: the edges.
     """
     edges = right, Edges(*(plane.T for plane in down))
     kept = known & ~_mixed(value, sigma, known, edges[0]) & ~_mixed(value.T, sigma.T, known.T, edges[1]).T
@@ -100,11 +99,7 @@ def _carry_on(value: np.ndarray, sigma: np.ndarray, known: np.ndarray,
 
 def _grow(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, edges: tuple[Edges, Edges],
           open_edges: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Give pixels beside known ones, in place, the value that the neighbour with the most alike normal has there.
-
-    Returns:
-        Whether there was such a pixel.
-    """
+    """Give pixels beside known ones, in place, the value that the neighbour with the most alike normal has there; return if any was."""
     least = np.full(value.shape, np.inf)
     new_value, new_sigma = value.copy(), sigma.copy()
     for flipped, (e, opened) in enumerate(zip(edges, open_edges, strict=True)):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kernels.errors import ArrayError
-from kernels.surface.joined import Joined, join_depth
+from service.joining.depth_and_normals import Joined, join_depth
 from tests.scenes.joined import MM, View, degrees_between, drifting, see
 
 LEAST_RATIO, NORMAL_RATIO = 0.5, 1.1

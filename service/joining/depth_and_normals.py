@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.surface.depth_steps import SLOPE_ERROR, Edges, find_steps
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
-from kernels.surface.scales import correct
 from kernels.surface.slopes import STEEPEST
+from service.joining.depth_steps import SLOPE_ERROR, Edges, find_steps
+from service.joining.scales import correct
 
 LEAST_DEPTHS = 12
 """Number of depths by which a part is placed; one with fewer has no place of its own."""
@@ -50,9 +50,6 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         depth_sigma: [rows, cols] standard deviations of the depth, above 0 and independent between pixels.
         measured: [rows, cols] bool, where there is a depth.
         x, y: [rows, cols] plane coordinates of the pixels, as for `integrate_normals`.
-        perspective: which of the two cameras it is.
-        device: "cpu" or "cuda:0".
-        progress: told the fraction done, 0…1.
 
     Raises:
         ArrayError: shapes do not fit, fewer than LEAST_DEPTHS pixels have both, or values are not finite or not positive where they must

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.spread import MAD_TO_SIGMA
+from stage.spread import MAD_TO_SIGMA
 
 PASSES = 2
 """Number of times each scale is looked at: cells are interpolated, which leaves part of a correction undone."""
