@@ -43,12 +43,16 @@ def figures(programs: Programs, client, asset, truth, maps) -> Comparison:
     return compare(picture, truth, maps[0].mask, maps[1])
 
 
-def test_maps_written_by_hand_come_near_the_path_tracer(client, programs, maps, truth, tmp_path):
-    found = figures(programs, client, write_by_hand(maps[0], tmp_path, "hand", metal=maps[1]), truth, maps)
+def assert_near(programs: Programs, client, asset, truth, maps) -> None:
+    found = figures(programs, client, asset, truth, maps)
     assert 0.9 < found.metal < 1.1
     assert 0.9 < found.dielectric < 1.1
     assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
     assert found.rmse < MOST_ERROR[client]
+
+
+def test_maps_written_by_hand_come_near_the_path_tracer(client, programs, maps, truth, tmp_path):
+    assert_near(programs, client, write_by_hand(maps[0], tmp_path, "hand", metal=maps[1]), truth, maps)
 
 
 PNG8, EXR = {"textures": TextureFormat.PNG8}, {"textures": TextureFormat.EXR}
@@ -74,11 +78,7 @@ def test_exported_metals_are_as_bright_as_the_path_tracer_says(client, way, prog
     true.write(tmp_path / "maps" / MAPS_FILE)
     asset = tmp_path / f"balls.{way[:4].strip()}"
     export(ExportRequest(maps=tmp_path / "maps", out=asset, **options))
-    found = figures(programs, client, asset, truth, maps)
-    assert 0.9 < found.metal < 1.1
-    assert 0.9 < found.dielectric < 1.1
-    assert 0.9 < found.scale < 1.1, "one irradiance gives one radiance everywhere"
-    assert found.rmse < MOST_ERROR[client]
+    assert_near(programs, client, asset, truth, maps)
 
 
 @pytest.mark.parametrize(("client", "other"), [(client, other) for client in (Client.BLENDER, Client.THREE)

@@ -20,6 +20,17 @@ class Outcome(NamedTuple):
     out: str
     err: str
 
+    def well(self) -> str:
+        """Return what a run printed that succeeded and had nothing to say on the standard error."""
+        assert (self.code, self.err) == (0, ""), self
+        return self.out
+
+    def refused(self, words: str, *, printed: bool = False) -> str:
+        """Return the one sentence, with these words, of a run that was refused; unless it has printed something, it said nothing else."""
+        assert self.code == 2 and printed == bool(self.out) and self.err.startswith("relit: ") and self.err.count("\n") == 1, self
+        assert words in self.err, self
+        return self.err
+
 
 class Program:
     """Runs `relit ARGS`; what C libraries write on the terminal is caught too.
@@ -45,14 +56,13 @@ class Program:
     def done(self, *arguments: object) -> Outcome:
         """Run what has to succeed without a word of complaint."""
         outcome = self(*arguments)
-        assert (outcome.code, outcome.err) == (0, "")
+        outcome.well()
         return outcome
 
     def refused(self, *arguments: object) -> str:
         """Return the one sentence that refuses the user's input."""
         outcome = self(*arguments)
-        assert outcome.code == 2 and outcome.err.startswith("relit: ") and outcome.err.count("\n") == 1, outcome
-        return outcome.err
+        return outcome.refused("", printed=bool(outcome.out))
 
 
 @pytest.fixture

@@ -3,13 +3,14 @@
 import os
 import pwd
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from tests.service.waiting import free_port
 
 START_S = 60.0
 NAME = "relit"
@@ -31,7 +32,7 @@ class Postgres:
     def __init__(self, programs: Path, folder: Path, port: int) -> None:
         self._programs, self._folder, self._port = programs, folder, port
         self._databases = 0
-        self._user = None if os.geteuid() != 0 else next(name for name in ORDINARY_USERS if _is_user(name))
+        self._user = None if os.geteuid() != 0 else next(user.pw_name for user in pwd.getpwall() if user.pw_name in ORDINARY_USERS)
 
     def new_database(self) -> str:
         """The URL of a database that is empty."""
@@ -75,7 +76,7 @@ class Postgres:
 def postgres(programs: Path) -> Iterator[Postgres]:
     """A server that runs; it and its folder go at the end. Not below pytest's folders, which the server's user may not enter."""
     folder = Path(tempfile.mkdtemp(prefix="relit-postgres-"))
-    server = Postgres(programs, folder, _free_port())
+    server = Postgres(programs, folder, free_port())
     try:
         server.create()
         yield server
@@ -85,17 +86,3 @@ def postgres(programs: Path) -> Iterator[Postgres]:
                 server.stop("immediate")
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _is_user(name: str) -> bool:
-    try:
-        pwd.getpwnam(name)
-    except KeyError:
-        return False
-    return True

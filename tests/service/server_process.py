@@ -8,13 +8,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import httpx2
 
-START_S = 60.0
+from service.requests.keys import NewKey, Scope
+from service.server.base.settings import Settings
+from service.server.database import keys
+from service.server.database.engine import Database, connect
+from tests.service.waiting import until
+
+FREE = {"min_free_bytes": "0", "requests_per_second": "10000", "request_burst": "10000"}
+"""Settings of a server that tests ask often, whatever space the disk has left."""
 FIRST_LOOK_S, LAST_LOOK_S = 0.05, 0.5
 """Seconds between two looks at something, at first and after some seconds: a look takes five thousandths of a second of a core, here and
 in the server."""
@@ -23,22 +30,50 @@ SABOTAGE = os.pathsep.join([str(HERE / "server" / "jobs" / "sabotage"), str(HERE
 """PYTHONPATH of processes whose workers do with frames what the variable SABOTAGE says; it has this checkout's `service` too."""
 
 
+def environment_with(**settings: object) -> dict[str, str]:
+    """The environment of this process with these settings of the service alone."""
+    others = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
+    return others | {f"RELIT_{name.upper()}": str(value) for name, value in settings.items()}
+
+
+class JsonLog:
+    """A log of JSON lines that is still written."""
+
+    def __init__(self, path: Path, mark: bytes = b"") -> None:
+        """Take each line for JSON, or those that begin with a mark alone."""
+        self._path, self._mark, self._read = path, mark, 0
+        self._lines: list[dict[str, Any]] = []
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Its lines so far, of which each is parsed once."""
+        with open(self._path, "rb") as log:
+            log.seek(self._read)
+            whole, end, _ = log.read().rpartition(b"\n")
+        self._read += len(whole + end)
+        self._lines += [json.loads(line) for line in whole.splitlines() if line.startswith(self._mark)]
+        return self._lines
+
+
 class Server:
     """A server that runs."""
 
-    def __init__(self, process: subprocess.Popen[str], url: str, data: Path, log: Path) -> None:
-        self.process, self.url, self.data, self.log = process, url, data, log
-        self._lines: list[dict[str, Any]] = []
-        self._log_read = 0
+    def __init__(self, process: subprocess.Popen[str], url: str, data: Path, log: Path, settings: dict[str, str]) -> None:
+        self.process, self.url, self.data, self.log, self.settings = process, url, data, log, settings
+        self.lines = JsonLog(log).lines
 
-    def lines(self) -> list[dict[str, Any]]:
-        """The lines of the log, of which each is JSON; each is parsed once."""
-        with open(self.log, "rb") as log:
-            log.seek(self._log_read)
-            whole, end, _ = log.read().rpartition(b"\n")
-        self._log_read += len(whole + end)
-        self._lines += [json.loads(line) for line in whole.splitlines()]
-        return self._lines
+    @contextmanager
+    def database(self) -> Iterator[Database]:
+        """Open its database."""
+        made = connect(Settings(data=self.data, database_url=self.settings.get("database_url")).sqlalchemy_url)
+        try:
+            yield made
+        finally:
+            made.close()
+
+    def key(self, project: str = "larch", scope: Scope = Scope.ADMIN) -> str:
+        """Make a key."""
+        with self.database() as database:
+            return keys.create(database, NewKey(project=project, name="test", scope=scope))
 
     def client(self, key: str | None = None) -> httpx2.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
@@ -60,13 +95,12 @@ class Server:
 def serving(folder: Path, *options: str, descriptors: int | None = None, sabotage: str | None = None, **settings: str) -> Iterator[Server]:
     """Start a server, and end it.
 
-    `settings` without RELIT_, as text; options of `relit serve` beside --data and --port; files that it may have open at most; what its
-    workers do with frames, as jobs/sabotage tells.
+    `settings` beside FREE, without RELIT_ and as text; options of `relit serve` beside --data and --port; files that it may have open at
+    most; what its workers do with frames, as jobs/sabotage tells.
     """
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
-    environment |= {f"RELIT_{name.upper()}": value for name, value in settings.items()}
+    environment = environment_with(**FREE | settings)
     if sabotage is not None:
         environment |= {"PYTHONPATH": SABOTAGE, "SABOTAGE": sabotage}
     with open(log, "a") as errors:
@@ -79,15 +113,15 @@ def serving(folder: Path, *options: str, descriptors: int | None = None, sabotag
         line = process.stdout.readline()
         found = re.search(r"http://\S+:\d+", line)
         assert found is not None, f"the server did not start: {line!r} {log.read_text()[-4000:]}"
-        server = Server(process, found[0], folder / "data", log)
-        deadline = time.monotonic() + START_S
-        while True:
-            try:
-                httpx2.get(f"{server.url}/healthz", timeout=5)
-                break
-            except httpx2.TransportError:
-                assert process.poll() is None and time.monotonic() < deadline, log.read_text()[-4000:]
-                time.sleep(0.05)
+        server = Server(process, found[0], folder / "data", log, settings)
+
+        def answers() -> bool:
+            with suppress(httpx2.TransportError):
+                return httpx2.get(f"{server.url}/healthz", timeout=5).is_success
+            assert process.poll() is None, log.read_text()[-4000:]
+            return False
+
+        until(answers, "the server does not answer", every_s=0.05)
         yield server
     finally:
         if process.poll() is None:

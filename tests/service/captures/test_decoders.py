@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from pathlib import Path
 
 import cv2
@@ -15,11 +16,13 @@ import pytest
 from service.captures import decoders
 from service.captures.decoders import Decoders
 from stage import inputs
+from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError, StageError, StorageError
 from stage.formats import images
 from stage.stack.ingest import open_stack
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_image
 from tests.service.server.api.captures import lying_png
+from tests.service.waiting import until
 
 PIXELS = 1 << 20
 NOISE = np.random.default_rng(0)
@@ -27,9 +30,8 @@ NOISE = np.random.default_rng(0)
 
 @pytest.fixture
 def made():
-    found = Decoders(PIXELS)
-    yield found
-    found.close()
+    with closing(Decoders(PIXELS)) as found:
+        yield found
 
 
 @pytest.fixture
@@ -47,7 +49,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_the_pixels_and_headers_are_those_of_this_process(folder, made):
+def test_pixels_headers_and_stacks_are_those_of_this_process(folder, made, tmp_path):
     for path in sorted(folder.iterdir()):
         header, recorded, pixels = images.read_header(path), images.read_recorded(path), images.read_pixels(path)
         with images.decoded_by(made):
@@ -55,6 +57,11 @@ def test_the_pixels_and_headers_are_those_of_this_process(folder, made):
             other = images.read_recorded(path)
             assert other.dtype == recorded.dtype and np.array_equal(other, recorded) and other.flags.writeable
             assert np.array_equal(images.read_pixels(path), pixels)
+    write_capture(tmp_path / "cap", make_scene(size=16, lights=5))
+    here = open_stack(Capture.open(tmp_path / "cap"), cache=tmp_path / "here")
+    with images.decoded_by(made):
+        there = open_stack(Capture.open(tmp_path / "cap"), cache=tmp_path / "there")
+    assert here.key == there.key and np.array_equal(here.band(0, 256), there.band(0, 256)) and np.array_equal(here.scale, there.scale)
 
 
 def test_a_fault_has_the_same_sentence(folder, made):
@@ -76,24 +83,11 @@ def test_a_fault_has_the_same_sentence(folder, made):
 
 def test_an_image_of_too_many_pixels_is_not_decoded(tmp_path):
     (tmp_path / "a.png").write_bytes(lying_png(30, 20))
-    found = Decoders(599)
-    try:
-        with images.decoded_by(found), pytest.raises(ImageError, match="has 30x20 pixels, 599 are allowed"):
-            images.read_recorded(tmp_path / "a.png")
-    finally:
-        found.close()
+    with closing(Decoders(599)) as found, images.decoded_by(found), pytest.raises(ImageError, match="30x20 pixels, 599 are allowed"):
+        images.read_recorded(tmp_path / "a.png")
 
 
-def test_links_out_of_a_confined_folder_are_not_followed(folder, made):
-    (folder / "in").mkdir()
-    (folder / "in" / "link.png").symlink_to(folder / "a.png")
-    with images.decoded_by(made):
-        assert images.read_recorded(folder / "in" / "link.png").shape == (20, 30, 3)
-        with inputs.confined(folder / "in", folder), pytest.raises(ManifestError, match="leads out"):
-            images.read_recorded(folder / "in" / "link.png")
-
-
-def test_a_process_that_dies_costs_one_image(folder, made):
+def test_a_process_that_dies_costs_one_image_and_links_out_of_a_folder_are_not_followed(folder, made):
     with images.decoded_by(made):
         images.read_recorded(folder / "a.png")
         idle, = made._idle
@@ -101,6 +95,12 @@ def test_a_process_that_dies_costs_one_image(folder, made):
         with pytest.raises(ImageError, match=r"cannot be decoded: its decoder broke off \(exit code -9\)"):
             images.read_recorded(folder / "a.png")
         assert images.read_recorded(folder / "a.png").shape == (20, 30, 3)
+    (folder / "in").mkdir()
+    (folder / "in" / "link.png").symlink_to(folder / "a.png")
+    with images.decoded_by(made):
+        assert images.read_recorded(folder / "in" / "link.png").shape == (20, 30, 3)
+        with inputs.confined(folder / "in", folder), pytest.raises(ManifestError, match="leads out"):
+            images.read_recorded(folder / "in" / "link.png")
 
 
 def running(monkeypatch, code: str) -> None:
@@ -120,17 +120,13 @@ data, files, _, _ = socket.recv_fds(asking, 1 << 16, 1)
     ("asking.send(json.dumps({'error': 'a.png: ' + json.dumps(sorted(os.environ))}).encode())", r'a\.png: \["LANG|a\.png: \["'),
     ("time.sleep(600)", "it takes longer than 1 seconds"),
 ])
-def test_a_process_that_is_taken_over_can_only_answer(monkeypatch, folder, code, words):
+def test_a_process_that_is_taken_over_can_only_answer(monkeypatch, folder, made, code, words):
     monkeypatch.setattr(decoders, "WALL_S", 1.0 if "600" in code else 60.0)
     monkeypatch.setenv("RELIT_DATABASE_URL", "postgresql://user:secret@host/name")
     running(monkeypatch, code)
-    found = Decoders(PIXELS)
-    try:
-        with images.decoded_by(found), pytest.raises(ImageError, match=words) as error:
-            images.read_recorded(folder / "a.png")
-        assert "RELIT" not in str(error.value)
-    finally:
-        found.close()
+    with images.decoded_by(made), pytest.raises(ImageError, match=words) as error:
+        images.read_recorded(folder / "a.png")
+    assert "RELIT" not in str(error.value)
 
 
 def test_several_threads_are_served_and_nothing_is_left(folder, tmp_path_factory):
@@ -150,16 +146,6 @@ def test_several_threads_are_served_and_nothing_is_left(folder, tmp_path_factory
     assert len(os.listdir("/proc/self/fd")) <= before and threading.active_count() < 40
 
 
-def test_a_stack_is_the_same(tmp_path, made):
-    from stage.capture.capture import Capture
-
-    write_capture(tmp_path / "cap", make_scene(size=16, lights=5))
-    here = open_stack(Capture.open(tmp_path / "cap"), cache=tmp_path / "here")
-    with images.decoded_by(made):
-        there = open_stack(Capture.open(tmp_path / "cap"), cache=tmp_path / "there")
-    assert here.key == there.key and np.array_equal(here.band(0, 256), there.band(0, 256)) and np.array_equal(here.scale, there.scale)
-
-
 def test_the_process_ends_with_the_worker(folder):
     code = f"""
 import os, signal, sys
@@ -173,12 +159,10 @@ print(found._idle[0].process.pid, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     process = int(done.stdout)
-    for _ in range(500):
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return
-        if Path(f"/proc/{process}/stat").read_text().split()[2] == "Z":
-            return
-        threading.Event().wait(0.02)
-    pytest.fail("it goes on")
+
+    def has_ended() -> bool:
+        with suppress(FileNotFoundError):
+            return Path(f"/proc/{process}/stat").read_text().split()[2] == "Z"
+        return True
+
+    until(has_ended, "it goes on")

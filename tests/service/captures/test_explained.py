@@ -42,25 +42,15 @@ def test_encoded_images_that_are_declared_linear_are_named(tmp_path, encode):
     (finding,) = findings(tmp_path, encode(SCALED))
     assert finding.startswith("color_space: the images look display-encoded, but lin_rec709")
     assert finding.endswith(("declare srgb_texture if they are", "declare g22_rec709_scene if they are"))
-
-
-def test_linear_images_that_are_declared_encoded_are_named(tmp_path):
+def test_other_suspicions_are_named_and_the_command_prints_them_and_ends_well(relit, tmp_path):
     (finding,) = findings(tmp_path, SCALED, color_space="srgb_texture")
     assert "the images look linear, but srgb_texture is declared" in finding
+    (finding,) = findings(tmp_path, SCALED[::-1])
+    assert finding.startswith("frames[].light: the order looks reversed")
+    assert "\nfinding      frames[].light: the order looks reversed" in relit("info", tmp_path).well()
 
 
 def test_a_dark_image_is_taken_off_first(tmp_path):
     """A pedestal that hides the shadows, in the images and in the dark image."""
     write_exr(tmp_path / "dark.exr", np.full((*SCENE.mask.shape, 3), 0.2))
     assert findings(tmp_path, 0.2 + 0.8 * SCALED, dark="dark.exr") == []
-
-
-def test_the_order_of_the_lights_is_looked_at_too(tmp_path):
-    (finding,) = findings(tmp_path, SCALED[::-1])
-    assert finding.startswith("frames[].light: the order looks reversed")
-
-
-def test_the_command_prints_findings_and_ends_well(relit, tmp_path):
-    findings(tmp_path, srgb(SCALED))
-    outcome = relit("info", tmp_path)
-    assert outcome.code == 0 and "\nfinding      color_space: the images look display-encoded" in outcome.out

@@ -16,6 +16,8 @@ def test_angles_and_shares():
     assert found.widest_deg == pytest.approx(60) and found.highlight_deg == pytest.approx(30)
     assert found.elsewhere == pytest.approx(0.75)  # of the sphere beyond a cone of 60 degrees
     assert found.dark == 0  # the half ring on the side of a normal faces it
+    assert front_lights(np.vstack([ring(30, 5), [[1, 0, 0]]])) is None
+    assert front_lights(ring(120, 5)) is None and front_lights(np.zeros((0, 3))) is None
 
 
 def test_normals_that_three_lights_do_not_face():
@@ -26,8 +28,3 @@ def test_normals_that_three_lights_do_not_face():
     dark = ((normals @ ring(80, 3).T > 0).sum(axis=1) < 3).mean()
     assert found.dark == pytest.approx(dark, abs=0.01)  # the standard error of the random normals is 0.002
     assert f"{100 * found.dark:.0f} % of the directions" in found.sentence()
-
-
-def test_lights_beside_or_behind():
-    assert front_lights(np.vstack([ring(30, 5), [[1, 0, 0]]])) is None
-    assert front_lights(ring(120, 5)) is None and front_lights(np.zeros((0, 3))) is None

@@ -106,46 +106,41 @@ def test_the_printed_command_makes_the_capture(relit, tmp_path, layout):
     folder.mkdir(parents=True)
     write(folder)
     before = files_in(tmp_path)
-    outcome = relit("import", "guess", folder)
-    assert (outcome.code, outcome.err) == (0, "")
+    out = relit("import", "guess", folder).well()
     assert files_in(tmp_path) == before  # it only looks
-    said = dict(line.split(maxsplit=1) for line in outcome.out.splitlines())
+    said = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert said["because"] and said["looks"].startswith("like ")
     words = shlex.split(said["run"])
     assert words[:3] == ["relit", "import", layout]
     assert {word for word in words if word in capitals} == set(capitals)
-    assumed = [line for line in outcome.out.splitlines() if line.startswith("assumed")]
+    assumed = [line for line in out.splitlines() if line.startswith("assumed")]
     assert all(any(word.split(",")[0] in line for line in assumed) for word in capitals)  # each is explained
-    outcome = relit(*(capitals.get(word, word) for word in words[1:]))
-    assert (outcome.code, outcome.err) == (0, "")
+    relit(*(capitals.get(word, word) for word in words[1:])).well()
     assert Capture.open(folder).manifest.frames
     then = shlex.split(said["then"])
     lit = layout in ("diligent", "lp", "relightlab", "near-lights", "olat", "photos")
     assert then[:3] == ["relit", "solve" if lit else "depth", str(folder)]
 
 
-def test_stripes_without_planes_are_told_by_their_names(relit, tmp_path):
+def test_stripes_without_planes_and_videos_are_told_by_their_names(relit, tmp_path):
     write_scan(tmp_path / "scan")
-    outcome = relit("import", "guess", tmp_path / "scan")
-    assert outcome.code == 0 and f"run      relit import laser {tmp_path}/scan --focal-px FOCAL\n" in outcome.out
-    assert "then     relit calibrate laser-planes POSE POSE" in outcome.out and "assumed  FOCAL is the focal length" in outcome.out
-
-
-def test_a_video_is_taken_for_one_of_patterns(relit, tmp_path):
+    out = relit("import", "guess", tmp_path / "scan").well()
+    assert f"run      relit import laser {tmp_path}/scan --focal-px FOCAL\n" in out
+    assert "then     relit calibrate laser-planes POSE POSE" in out and "assumed  FOCAL is the focal length" in out
+    tmp_path = tmp_path / "video"
+    tmp_path.mkdir()
     (tmp_path / "scan.mp4").write_bytes(b"its frames are not looked at")
-    outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 0 and f"relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in outcome.out
-    assert f"then     relit depth {tmp_path}/scan-frames" in outcome.out
+    out = relit("import", "guess", tmp_path).well()
+    assert f"relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in out
+    assert f"then     relit depth {tmp_path}/scan-frames" in out
 
 
 def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):
     (tmp_path / "thesis.pdf").write_bytes(b"%PDF")
     write_image(tmp_path / "photo.jpg", np.zeros((4, 4, 3), np.uint8))
-    outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 2 and "holds 1 .jpg, 1 .pdf, which is no layout that relit import" in outcome.err
+    relit("import", "guess", tmp_path).refused("holds 1 .jpg, 1 .pdf, which is no layout that relit import")
     (tmp_path / "capture.json").write_text("{}")
-    outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 2 and "is a capture already: relit info" in outcome.err
+    relit("import", "guess", tmp_path).refused("is a capture already: relit info")
 
 
 @pytest.mark.parametrize("name", ["light.mat", "calibration.xml", "lights.csv", "a.npy", "b.dome", "c.npz", "d.json"])
@@ -154,5 +149,4 @@ def test_damaged_files_are_passed_over(relit, tmp_path, name):
     outcome = relit("import", "guess", tmp_path)
     assert outcome.code == (0 if name == "b.dome" else 2) and outcome.err.count("\n") == (0 if name == "b.dome" else 1)
     write_images(tmp_path)
-    outcome = relit("import", "guess", tmp_path)
-    assert outcome.code == 0 and f"relit import {'relightlab' if name == 'b.dome' else 'photos'}" in outcome.out
+    assert f"relit import {'relightlab' if name == 'b.dome' else 'photos'}" in relit("import", "guess", tmp_path).well()

@@ -96,9 +96,8 @@ def test_planes_of_any_file_give_the_true_depth(relit, tmp_path, write):
     camera = write_camera(tmp_path / "camera.yml")
     name, form = write(folder)
     words = "import", "laser", folder, "--camera", camera, "--planes", folder / name, "--axes", "right,down,away", "--unit-m", 0.001
-    outcome = relit(*words, *(() if form is None else ("--form", form)))
-    assert (outcome.code, outcome.err) == (0, ""), outcome.err
-    assert "12 planes from" in outcome.out and "background.png shows the scene without the laser" in outcome.out
+    out = relit(*words, *(() if form is None else ("--form", form))).well()
+    assert "12 planes from" in out and "background.png shows the scene without the laser" in out
     found = [frame.laser for frame in Capture.open(folder).manifest.frames if frame.laser]
     for laser, normal in zip(found, NORMALS[::-1] if write is as_csv else NORMALS, strict=True):
         assert abs(abs(np.dot(laser.normal, normal)) - 1) < 1e-9
@@ -108,16 +107,20 @@ def test_planes_of_any_file_give_the_true_depth(relit, tmp_path, write):
     assert maps.mask.sum() > 800 and np.median(error) < 0.0012 and np.quantile(error, 0.99) < 0.003
 
 
-def test_a_wrong_form_has_no_depth(relit, tmp_path):
-    """The planes of the other sign meet the lines of sight behind the camera."""
+@pytest.fixture
+def scan(tmp_path):
+    """A folder of images, the file of its camera, and the words that import them with planes in a text."""
     folder = tmp_path / "scan"
     write_scan(folder)
-    camera = write_camera(tmp_path / "camera.yml")
     name, _ = as_text(folder)
-    words = "import", "laser", folder, "--camera", camera, "--planes", folder / name, "--axes", "right,down,away", "--unit-m", 0.001
-    assert relit(*words, "--form", "equals").code == 0
-    outcome = relit("depth", folder, "--out", tmp_path / "out", "--device", "cpu")
-    assert outcome.code == 2 and "no laser frame has a depth" in outcome.err
+    return folder, write_camera(tmp_path / "camera.yml"), ("--planes", folder / name, "--axes", "right,down,away", "--unit-m", 0.001)
+
+
+def test_a_wrong_form_has_no_depth(relit, tmp_path, scan):
+    """The planes of the other sign meet the lines of sight behind the camera."""
+    folder, camera, planes = scan
+    assert relit("import", "laser", folder, "--camera", camera, *planes, "--form", "equals").code == 0
+    relit("depth", folder, "--out", tmp_path / "out", "--device", "cpu").refused("no laser frame has a depth")
 
 
 def test_without_planes_there_are_placeholders(relit, tmp_path):
@@ -129,18 +132,14 @@ def test_without_planes_there_are_placeholders(relit, tmp_path):
     assert relit("info", tmp_path / "scan").code == 0
 
 
-def test_what_does_not_fit_is_one_sentence(relit, tmp_path):
-    folder = tmp_path / "scan"
-    write_scan(folder)
-    camera = write_camera(tmp_path / "camera.yml")
-    name, _ = as_text(folder)
+def test_what_does_not_fit_is_one_sentence(relit, scan):
+    folder, camera, given = scan
+    name = given[1]
 
     def refused(*words):
-        outcome = relit("import", "laser", folder, *words)
-        assert outcome.code == 2 and outcome.err.count("\n") == 1 and not (folder / "capture.json").exists()
-        return outcome.err
+        assert not (folder / "capture.json").exists()
+        return relit("import", "laser", folder, *words).refused("")
 
-    given = "--planes", folder / name, "--axes", "right,down,away", "--unit-m", 0.001
     assert "perspective camera: give --camera FILE or --focal-px" in refused(*given, "--form", "zero")
     assert "of each plane: say what they mean, --form zero for a x + b y" in refused("--camera", camera, *given)
     assert "needs --axes" in refused("--camera", camera, "--planes", folder / name)

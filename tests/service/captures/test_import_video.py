@@ -51,20 +51,18 @@ def imported(relit, path, folder, frames, *options):
 def test_a_video_goes_to_columns_in_two_commands(relit, tmp_path, codec, suffix):
     path, folder = video(tmp_path / f"scan.{suffix}", codec), tmp_path / "scan"
     last = 2 + HOLD * len(PATTERNS) - 1
-    outcome = imported(relit, path, folder, f"4-{last}:{HOLD}")
-    assert (outcome.code, outcome.err) == (0, "")
+    out = imported(relit, path, folder, f"4-{last}:{HOLD}").well()
     manifest = Capture.open(folder).manifest
     assert manifest.color_space == "srgb_texture"
     names = [frame.image for frame in manifest.frames]
     assert names == [f"scan_{4 + HOLD * number:06d}.png" for number in range(len(PATTERNS))]
     if codec == "FFV1":
-        assert "lossless" in outcome.out and manifest.assumed == ()
+        assert "lossless" in out and manifest.assumed == ()
         for name, expected in zip(names, images(), strict=True):
             assert np.abs(read_recorded(folder / name).astype(int) - expected).max() <= 2  # through YUV of 8 bits
     else:
-        assert "compressed" in outcome.out and "frames of a compressed video (" in manifest.assumed[0]
-    outcome = relit("depth", folder, "--out", tmp_path / "out", "--device", "cpu")
-    assert outcome.code == 0
+        assert "compressed" in out and "frames of a compressed video (" in manifest.assumed[0]
+    relit("depth", folder, "--out", tmp_path / "out", "--device", "cpu").well()
     layers, _ = exr.read(tmp_path / "out" / "depth.exr")
     near = layers["mask.Y"] > 0.5
     assert near.mean() > 0.7 and np.abs(layers["projector.U"] - U)[near].max() < 1.5  # stripes of a pixel, sampled at 0.6
@@ -97,6 +95,5 @@ def test_a_video_needs_a_folder_and_a_folder_no_frames(relit, tmp_path):
     before = files_in(tmp_path)
     outcome = relit("import", "gray", path, "--projector", "64x32", "--sequence", "columns")
     assert outcome.code == 2 and "scan.avi: is a video: give a folder for its frames" in outcome.err
-    outcome = imported(relit, tmp_path, tmp_path / "scan", "0-3")
-    assert outcome.code == 2 and "--video-frames 0-3: " in outcome.err and "is no video" in outcome.err
+    assert "is no video" in imported(relit, tmp_path, tmp_path / "scan", "0-3").refused("--video-frames 0-3: ")
     assert files_in(tmp_path) == before

@@ -36,10 +36,8 @@ def test_a_table_of_lights_in_any_axes_gives_the_true_normals(relit, tmp_path, a
 
 
 def test_axes_are_asked_for_and_never_guessed(relit, tmp_path):
-    outcome = relit("import", "olat", tmp_path, "--vectors", "to-light")
-    assert outcome.code == 2 and "--axes" in outcome.err and outcome.err.count("\n") == 1
-    outcome = relit("import", "olat", tmp_path, "--vectors", "to-light", "--axes", "right,up,forward")
-    assert outcome.code == 2 and "axes" in outcome.err and outcome.err.count("\n") == 1
+    relit("import", "olat", tmp_path, "--vectors", "to-light").refused("--axes")
+    relit("import", "olat", tmp_path, "--vectors", "to-light", "--axes", "right,up,forward").refused("axes")
 
 
 NEAR_PS = np.diag([1.0, -1.0, -1.0])
@@ -68,11 +66,10 @@ def test_leds_in_the_layout_of_near_ps_give_the_true_height(relit, tmp_path):
     dome = near_lights.dome(perspective=True)
     folder = tmp_path / "Datasets" / "Statuette"
     write_near_ps(folder, dome, near_lights.lamps(dome, 8, 3.0, widest=50, exponent=1.4))
-    outcome = relit("import", "near-lights", folder, tmp_path / "capture", "--lights", tmp_path / "Datasets" / "light.mat",
+    out = relit("import", "near-lights", folder, tmp_path / "capture", "--lights", tmp_path / "Datasets" / "light.mat",
                     "--camera", tmp_path / "Datasets" / "camera.mat", "--axes", "right,down,away", "--unit-m", "0.001",
-                    "--images", "*raw_0*", "--surface-z-m", dome.camera["surface_z_m"])
-    assert outcome.code == 0, outcome.err
-    assert "8 near lights" in outcome.out and "(MATLAB)" in outcome.out and "raw_ambient.png is subtracted" in outcome.out
+                    "--images", "*raw_0*", "--surface-z-m", dome.camera["surface_z_m"]).well()
+    assert "8 near lights" in out and "(MATLAB)" in out and "raw_ambient.png is subtracted" in out
     camera = Capture.open(tmp_path / "capture").camera
     assert np.allclose(camera.principal_px, np.array(camera.resolution) / 2) and np.allclose(camera.focal_px, dome.camera["focal_px"])
     assert relit("solve", tmp_path / "capture", "--out", tmp_path / "maps", "--method", "robust").code == 0
@@ -83,6 +80,7 @@ def test_leds_in_the_layout_of_near_ps_give_the_true_height(relit, tmp_path):
     assert degrees_between(maps.normal, dome.normal)[solved].max() < 0.5  # 16-bit readings minus ambient light
 
 
+@pytest.mark.long
 def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     scene = make_scene(24, 8)
     images = [{"filename": f"DSC_{number:04d}.png", "skip": number == 3, "direction": dict.fromkeys("xyz", 0.0)} for number in range(9)]
@@ -99,9 +97,8 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
         "lens": {"focalLength": 0}, "spheres": [], "crop": {"left": 2, "top": 2, "width": 20, "height": 20}, "dome": {
             "label": "", "imageWidth": 48.0, "domeDiameter": 600.0, "verticalOffset": 0.0, "lightConfiguration": "directional",
             "directions": directions, "positionsSphere": [], "positions3d": [], "ledAdjust": adjust}}))
-    outcome = relit("import", "relightlab", tmp_path / "lab")
-    assert outcome.code == 0, outcome.err
-    assert "8 far lights" in outcome.out and "1 images are skipped" in outcome.out and "crops the images" in outcome.out
+    out = relit("import", "relightlab", tmp_path / "lab").well()
+    assert "8 far lights" in out and "1 images are skipped" in out and "crops the images" in out
     capture = Capture.open(tmp_path / "photos")
     assert np.isclose(capture.camera.pixel_size_m, 0.002) and len(capture.manifest.frames) == 8
     assert relit("solve", tmp_path / "photos", "--out", tmp_path / "maps", "--method", "robust").code == 0
@@ -110,19 +107,16 @@ def test_a_project_of_relightlab_gives_the_true_normals(relit, tmp_path):
     assert maps.mask.sum() > 0.9 * scene.mask.sum()
 
 
+@pytest.mark.long
 def test_images_without_lights_are_solved_as_unknown_and_refused_as_known(relit, tmp_path):
     """What `--lights unknown` makes of them is judged in tests/service/solve/lights/test_unknown_lights.py."""
     scene = make_scene(24, 12)
     for number, image in enumerate(scene.images):
         write_exr(tmp_path / f"IMG_{number}.exr", image)
     write_image(tmp_path / "mask.png", scene.mask.astype(np.uint8) * 255)
-    outcome = relit("import", "photos", tmp_path)
-    assert outcome.code == 0 and "12 placeholders, IMG_0.exr to IMG_11.exr" in outcome.out
-    refused = relit("solve", tmp_path, "--out", tmp_path / "maps")
-    assert refused.code == 2 and "placeholder" in refused.err
-    outcome = relit("solve", tmp_path, "--out", tmp_path / "maps", "--lights", "unknown", "--method", "robust")
-    assert (outcome.code, outcome.err) == (0, ""), outcome.err
+    assert "12 placeholders, IMG_0.exr to IMG_11.exr" in relit("import", "photos", tmp_path).well()
+    relit("solve", tmp_path, "--out", tmp_path / "maps").refused("placeholder")
+    relit("solve", tmp_path, "--out", tmp_path / "maps", "--lights", "unknown", "--method", "robust").well()
     (tmp_path / "few").mkdir()
     write_exr(tmp_path / "few" / "a.exr", scene.images[0])
-    refused = relit("import", "photos", tmp_path / "few")
-    assert refused.code == 2 and "few: has 1 images: normals need 3 or more" in refused.err
+    relit("import", "photos", tmp_path / "few").refused("few: has 1 images: normals need 3 or more")

@@ -12,33 +12,32 @@ from service.cli.main import program
 from service.requests import (
     basis,
     calibrate,
-    calibration_jobs,
     captures,
     demo,
     depth,
     export,
     imports,
-    imports_tof,
-    inspect_board,
     jobs,
     keys,
     patterns,
     register,
     relight,
     shade,
-    simulate,
     solve,
 )
 from service.requests.base.base import Choice, Options, Role
 from service.requests.base.options import build, help_text, options_of, typed, values_of
+from service.requests.imports_tof import HistogramImport, KinectImport, TofImport
+from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
     "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
-    "separate": [depth.SeparateRequest], "inspect-board": [inspect_board.InspectBoardRequest],
-    "gauge-board": [inspect_board.GaugeBoardRequest],
-    "simulate cw": [simulate.SimulateCwRequest], "simulate pulsed": [simulate.SimulatePulsedRequest],
+    "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
+    "gauge-board": [GaugeBoardRequest],
+    "simulate cw": [SimulateCwRequest], "simulate pulsed": [SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
     "basis": [basis.BasisRequest], "view": [captures.ViewRequest], "demo": [demo.DemoRequest],
     "bench": [demo.BenchRequest],
@@ -46,8 +45,8 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "import opencv-gray": [imports.OpencvGrayImport], "import near-lights": [imports.NearLightsImport],
     "import photos": [imports.PhotosImport],
     "import relightlab": [imports.RelightlabImport], "import gray": [imports.GrayImport], "import phase": [imports.PhaseImport],
-    "import scanner": [imports.ScannerImport], "import tof": [imports_tof.TofImport], "import histogram": [imports_tof.HistogramImport],
-    "import kinect": [imports_tof.KinectImport], "import laser": [imports.LaserImport],
+    "import scanner": [imports.ScannerImport], "import tof": [TofImport], "import histogram": [HistogramImport],
+    "import kinect": [KinectImport], "import laser": [imports.LaserImport],
     "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
@@ -57,21 +56,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate procam": [calibrate.ProcamRequest],
     "calibrate stereo": [calibrate.StereoRequest], "calibrate response": [calibrate.ResponseRequest],
     "calibrate tof": [calibrate.TofCalibrationRequest],
-    "submit solve": [jobs.SolveJob], "submit depth": [jobs.DepthJob], "submit relight": [jobs.RelightJob], "submit shade": [jobs.ShadeJob],
-    "submit export": [jobs.ExportJob], "submit view": [jobs.ViewJob], "submit pipeline": [jobs.PipelineJob],
-    "submit basis": [jobs.BasisJob], "submit separate": [jobs.SeparateJob], "submit scan": [jobs.ScanJob],
-    "submit patterns": [jobs.PatternsJob],
-    "submit inspect-board": [jobs.InspectBoardJob], "submit gauge-board": [jobs.GaugeBoardJob], "submit join": [jobs.JoinJob],
-    "submit register": [jobs.RegisterJob], "submit fuse": [jobs.FuseJob],
-    "submit calibrate-mirror-ball": [calibration_jobs.MirrorBallJob],
-    "submit calibrate-light-positions": [calibration_jobs.LightPositionsJob],
-    "submit calibrate-grey-ball": [calibration_jobs.GreyBallJob], "submit calibrate-intensity": [calibration_jobs.IntensityJob],
-    "submit calibrate-dark": [calibration_jobs.DarkJob], "submit calibrate-flat-field": [calibration_jobs.FlatFieldJob],
-    "submit calibrate-saturation": [calibration_jobs.SaturationJob], "submit calibrate-procam": [calibration_jobs.ProcamJob],
-    "submit calibrate-stereo": [calibration_jobs.StereoCalibrationJob],
-    "submit calibrate-response": [calibration_jobs.ResponseJob], "submit calibrate-tof": [calibration_jobs.TofCalibrationJob],
-    "submit calibrate-white-balance": [calibration_jobs.WhiteBalanceJob],
-    "submit calibrate-laser-planes": [calibration_jobs.LaserPlanesJob],
+    **{f"submit {kind}": [model] for kind, model in jobs.JOBS.items()},
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {
@@ -163,15 +148,6 @@ def test_a_choice_is_the_same_here_there_and_in_the_schema(kind):
         assert default in ([], "") or here[name].default == (",".join(default) if isinstance(default, list) else default)
 
 
-def test_the_options_of_a_pipeline_are_those_of_its_parts():
-    found = shown("submit pipeline")
-    for kind in ("solve", "export", "relight"):
-        there = shown(f"submit {kind}")
-        for option in options_of(KINDS[kind]):
-            if option.role is Role.CHOICE:
-                assert found[option.name] == there[option.name]
-
-
 def test_what_is_typed_builds_the_request_and_back():
     given = {"capture": Path("c"), "out": "o.#.exr", "aov": "beauty,mask", "exposure": 1.5, "align": True}
     request = build(relight.RelightRequest, given)
@@ -186,11 +162,17 @@ def test_what_is_typed_builds_the_request_and_back():
     assert (pipeline.name, pipeline.export.name) == ("night", "owl")
 
 
-def test_every_choice_is_explained_once():
+def test_every_choice_is_explained_once_and_the_options_of_a_pipeline_are_those_of_its_parts():
     """In help as in the schema; the words stand beside the value."""
     for option in options_of(solve.SolveRequest):
         if isinstance(option.kind, type) and issubclass(option.kind, Choice):
             assert all(f"{value}: {value.words}" in shown("solve")[option.name].help for value in option.kind)
+    found = shown("submit pipeline")
+    for kind in ("solve", "export", "relight"):
+        there = shown(f"submit {kind}")
+        for option in options_of(KINDS[kind]):
+            if option.role is Role.CHOICE:
+                assert found[option.name] == there[option.name]
 
 
 def commands(group: Any, words: tuple[str, ...] = ()) -> Any:

@@ -11,7 +11,9 @@ from typer import Context
 from typer.main import get_command
 
 import service
-from service.cli.main import BLAS_THREADS, COMMANDS, program
+from service.captures import info
+from service.cli.main import BLAS_THREADS, COMMANDS, main, program
+from service.solve import opening
 from stage.capture.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
 
@@ -20,15 +22,11 @@ SHOWN = ["demo", "import", "info", "calibrate", "solve", "depth", "separate", "i
 ROOT = Path(service.__file__).parents[1]
 
 
-def test_version(relit):
+def test_help_names_every_command_and_the_version_is_printed(relit):
+    out = relit("--help").well()
+    assert all(f" {name} " in out for name in SHOWN)
+    assert relit() == (2, "", out)  # nothing asked: the same help, and not a success
     assert relit("--version") == (0, f"relit {service.__version__}\n", "")
-
-
-def test_help_names_every_command(relit):
-    outcome = relit("--help")
-    assert outcome.code == 0
-    assert all(f" {name} " in outcome.out for name in SHOWN)
-    assert relit() == (2, "", outcome.out)  # nothing asked: the same help, and not a success
 
 
 def test_the_help_that_is_shown_without_loading_commands_is_theirs(relit):
@@ -42,9 +40,8 @@ def test_the_help_that_is_shown_without_loading_commands_is_theirs(relit):
 
 @pytest.mark.parametrize("command", SHOWN)
 def test_help_of_each_command(relit, command):
-    outcome = relit(command, "--help")
-    assert (outcome.code, outcome.err) == (0, "")
-    assert f"relit {command}" in outcome.out and "--help" in outcome.out
+    out = relit(command, "--help").well()
+    assert f"relit {command}" in out and "--help" in out
 
 
 @pytest.mark.parametrize("command", [
@@ -56,16 +53,14 @@ def test_help_of_each_command(relit, command):
 def test_every_command_takes_a_device_and_refuses_one_that_is_not_there(relit, tmp_path, command):
     capture = write_capture(tmp_path / "capture")
     words = [word.replace("CAPTURE", str(capture)).replace("OUT", str(tmp_path / "out")) for word in command]
-    outcome = relit(*words, "--device", "cuda:99")
-    assert outcome.code == 2 and "cuda:99" in outcome.err and outcome.err.count("\n") == 1
+    relit(*words, "--device", "cuda:99").refused("device cuda:99 is not on this machine: ", printed=command == ["doctor"])
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
 def test_doctor_finds_this_installation_sound(relit):
-    outcome = relit("doctor")
-    assert outcome.code == 0, outcome.out
-    assert outcome.out.splitlines()[-1] == "sound"
-    assert "cpu" in outcome.out and "works" in outcome.out
+    out = relit("doctor").well()
+    assert out.splitlines()[-1] == "sound"
+    assert "cpu" in out and "works" in out
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -79,22 +74,21 @@ def test_doctor_finds_this_installation_sound(relit):
     (["bench", "--repeats", "1"], "repeats: is 1: input should be greater than or equal to 3"),
 ])
 def test_wrong_options_are_one_sentence(relit, arguments, words):
-    outcome = relit(*arguments)
-    assert (outcome.code, outcome.out) == (2, "")
-    assert outcome.err.startswith("relit: ") and outcome.err.count("\n") == 1
-    assert words in outcome.err
+    relit(*arguments).refused(words)
 
 
 def test_info_of_a_sound_capture(relit, tmp_path):
     scene = make_scene(size=8, lights=4)
     write_capture(tmp_path, scene, saturation=0.2)
-    outcome = relit("info", tmp_path)
-    assert (outcome.code, outcome.err) == (0, "")
-    facts = {line.split()[0]: line[13:] for line in outcome.out.splitlines()}
-    assert facts["name"] == "cap" and facts["frames"] == "4 distant light"
+    facts = {line.split()[0]: line[13:] for line in relit("info", tmp_path).well().splitlines()}
+    assert facts["name"] == "cap" and facts["frames"] == "4 distant light" and facts["given"] == "mask, saturation"
     assert facts["camera"] == "orthographic, 8x8, no scale" and facts["mask"] == f"{scene.mask.sum()} of 64 pixels"
-    assert facts["lights"].startswith("4 distant, up to 30 degrees") and ", 0 behind" in facts["lights"]
+    assert facts["lights"].startswith("4 distant, up to 30 degrees") and facts["lights"].endswith("0 behind the object")
+    assert float(facts["brightest"].split()[0]) == float(f"{scene.images.max():.4g}")
     assert facts["saturated"] == f"{int((scene.images.astype(np.float32) >= 0.2).any(axis=-1).sum())} readings at or above 0.2"
+    write_capture(tmp_path / "patterns", scene, frames=[
+        {"image": f"{i:03d}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)])
+    assert "4 gray pattern" in relit("info", tmp_path / "patterns").well()
 
 
 def test_info_lists_every_fault_and_ends_with_the_first(relit, tmp_path):
@@ -107,14 +101,6 @@ def test_info_lists_every_fault_and_ends_with_the_first(relit, tmp_path):
     assert len(wrong) == 3
     assert "000.exr: 64 pixels are negative" in wrong[0] and "needs three or more" in wrong[1] and "mask is empty" in wrong[2]
     assert outcome.err == f"relit: {wrong[0]} (and 2 more, above)\n"
-
-
-def test_info_of_a_structured_light_capture(relit, tmp_path):
-    frames = [{"image": f"{i:03d}.exr", "pattern": {"code": "gray", "axis": "column", "bit": i, "bits": 4}} for i in range(4)]
-    write_capture(tmp_path, make_scene(size=8, lights=4), frames=frames)
-    outcome = relit("info", tmp_path)
-    assert (outcome.code, outcome.err) == (0, "")
-    assert "4 gray pattern" in outcome.out
 
 
 def test_import_diligent_and_look_at_it(relit, tmp_path):
@@ -134,25 +120,7 @@ def test_import_diligent_and_look_at_it(relit, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
-def test_import_lp(relit, tmp_path):
-    for index in range(3):
-        write_image(tmp_path / "rti" / f"my {index}.png", np.full((4, 4, 3), 90, np.uint8))
-    (tmp_path / "rti" / "dome.lp").write_text("3\nmy 0.png 0 0 1\nmy 1.png 0.5 0 1\nmy 2.png 0 0.5 1\n")
-    assert relit("import", "lp", tmp_path / "rti", tmp_path / "cap") == (0, f"capture  {tmp_path}/cap/capture.json\n", "")
-    outcome = relit("info", tmp_path / "cap")
-    assert outcome.code == 0 and "srgb_texture" in outcome.out
-
-
-def test_an_unknown_device_is_named(relit, tmp_path):
-    write_capture(tmp_path / "cap", make_scene(size=4, lights=3))
-    outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out", "--device", "cuda:77")
-    assert outcome.code == 2 and outcome.err.startswith("relit: device cuda:77 is not on this machine: ")
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_interruption_ends_with_130_and_a_sentence(relit, tmp_path, monkeypatch):
-    from service.solve import opening
-
+def test_an_interruption_ends_with_130_and_a_sentence_and_a_defect_of_ours_keeps_its_traceback(relit, tmp_path, monkeypatch):
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
@@ -161,12 +129,6 @@ def test_an_interruption_ends_with_130_and_a_sentence(relit, tmp_path, monkeypat
     outcome = relit("solve", tmp_path / "cap", "--out", tmp_path / "out")
     assert outcome.code == 130
     assert outcome.err.startswith("relit: interrupted") and outcome.err.count("\n") == 1
-
-
-def test_a_defect_of_ours_keeps_its_traceback(monkeypatch, tmp_path):
-    from service.captures import info
-    from service.cli.main import main
-
     def fail(*arguments, **options):
         raise ZeroDivisionError
 
@@ -176,25 +138,20 @@ def test_a_defect_of_ours_keeps_its_traceback(monkeypatch, tmp_path):
         main()
 
 
-def run_program(*arguments: object) -> subprocess.CompletedProcess:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, "-m", "service.cli.main", *map(str, arguments)], capture_output=True, text=True,
-                          timeout=120, env=environment, cwd=ROOT)
-
-
 @pytest.mark.long
-def test_as_a_program_of_its_own(tmp_path):
+def test_as_a_program_of_its_own_whose_reader_may_go_away(tmp_path):
+    def run(*arguments: object) -> subprocess.CompletedProcess:
+        return subprocess.run([sys.executable, "-m", "service.cli.main", *map(str, arguments)], capture_output=True, text=True,
+                              timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT)}, cwd=ROOT)
+
     write_capture(tmp_path / "cap", make_scene(size=8, lights=4))
-    done = run_program("solve", tmp_path / "cap", "--method", "lambert", "--out", tmp_path / "out")
+    done = run("solve", tmp_path / "cap", "--method", "lambert", "--out", tmp_path / "out")
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "out" / "maps.exr").exists()
     edit_manifest(tmp_path / "cap", colour="red")
-    done = run_program("info", tmp_path / "cap")
+    done = run("info", tmp_path / "cap")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"relit: {tmp_path}/cap/capture.json: colour: is not a known key\n"
-
-
-def test_a_reader_that_goes_away_is_no_traceback():
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run([sys.executable, "-m", "service.cli.main", "--help"], stdout=writer, stderr=subprocess.PIPE, text=True,

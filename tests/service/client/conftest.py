@@ -1,9 +1,8 @@
 """One server with a worker for the tests of the client, reached with a key, and ways to break what lies between."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import httpx2
 import pytest
@@ -52,17 +51,22 @@ class Cut(httpx2.SyncByteStream):
         self.inner.close()
 
 
+def lose(answer: httpx2.Response) -> NoReturn:
+    """Let an answer be lost on its way."""
+    answer.read()
+    answer.close()
+    raise httpx2.ReadError("the test lost the answer")
+
+
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("server"), "--device", "cpu", sabotage="long", roots=str(OWL.parent),
-                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
+    with serving(tmp_path_factory.mktemp("server"), "--device", "cpu", sabotage="long", roots=str(OWL.parent)) as running:
         yield running
 
 
 @pytest.fixture(scope="session")
 def key(server: Server) -> str:
-    return subprocess.run([sys.executable, "-m", "service.cli.main", "keys", "create", "--project", "owls", "--name", "tests", "--scope",
-                           "admin", "--data", str(server.data)], check=True, capture_output=True, text=True, timeout=60).stdout.strip()
+    return server.key("owls")
 
 
 @pytest.fixture
@@ -77,9 +81,9 @@ def client(server: Server, key: str, between: Between) -> Iterator[Client]:
 
 
 @pytest.fixture(scope="session")
-def owl(server: Server, key: str) -> str:
+def dome(server: Server, key: str) -> str:
     with Client(server.url, key) as client:
-        return client.captures.register(str(OWL)).id
+        return client.captures.register(str(OWL.parent / "lambert")).id
 
 
 @pytest.fixture(scope="session")

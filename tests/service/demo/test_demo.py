@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from pxr import Usd, UsdGeom, UsdShade
 
 import service.demo.demo
 from stage.formats import exr
@@ -20,9 +21,8 @@ FRAMES = [f"frame.{number:04d}.exr" for number in range(1, 25)]
 def run(relit, out) -> SurfaceMaps:
     """Run the demo, and read every file of it."""
     before = files_in(OWL)
-    outcome = relit("demo", "--out", out, "--device", "cpu")
-    assert (outcome.code, outcome.err) == (0, "")
-    assert [line.split() for line in outcome.out.splitlines()] == [
+    said = relit("demo", "--out", out, "--device", "cpu").well()
+    assert [line.split() for line in said.splitlines()] == [
         ["maps", f"{out}/maps.exr"], ["report", f"{out}/report.json"], ["asset", f"{out}/asset.usdz"],
         ["frames", f"{out}/{FRAMES[0]}", "…", FRAMES[-1]], ["picture", f"{out}/preview.png"]]
     assert {name for name in files_in(out) if not name.startswith(".relit")} == {
@@ -39,8 +39,6 @@ def run(relit, out) -> SurfaceMaps:
     assert all((a != b).any() for a, b in pairwise(frames))  # the environment turns
     picture = oiio.ImageBuf(str(out / "preview.png")).get_pixels(oiio.UINT8)
     assert picture.shape[2] == 3 and picture.std() > 10
-    from pxr import Usd, UsdGeom, UsdShade
-
     usd_stage = Usd.Stage.Open(str(out / "asset.usdz"))
     prims = list(usd_stage.Traverse())
     mesh = next(UsdGeom.Mesh(prim) for prim in prims if prim.IsA(UsdGeom.Mesh))

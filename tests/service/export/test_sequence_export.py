@@ -19,7 +19,7 @@ from stage.errors import ResultError
 from stage.results.maps import SurfaceMaps
 from tests.clients.validators import findings
 from tests.scenes import depth as depths
-from tests.scenes.captures import write_image
+from tests.scenes.captures import edit_manifest, write_image
 from tests.scenes.sequence import write_sequence
 
 TIMES = [0.0, 0.1, 0.3]
@@ -34,8 +34,7 @@ def walk(tmp_path_factory):
     mask = np.zeros((28, 28), np.uint8)
     mask[3:25, 3:20] = 255
     write_image(folder / "in" / "step01" / "mask.png", mask)
-    manifest = json.loads((folder / "in" / "step01" / "capture.json").read_text())
-    (folder / "in" / "step01" / "capture.json").write_text(json.dumps({**manifest, "mask": "mask.png"}))
+    edit_manifest(folder / "in" / "step01", mask="mask.png")
     solve_sequence(SolveRequest(capture=folder / "in", out=folder / "out", method=Method.ROBUST, device="cpu"))
     return folder / "out"
 
@@ -121,8 +120,7 @@ def test_what_is_refused(walk, tmp_path, relit):
     with pytest.raises(ResultError, match=r"a: holds neither maps.exr nor depth.exr"):
         exported(broken, tmp_path / "x.usdc")
     assert not any(tmp_path.glob("*.usd*")) and not any(tmp_path.glob(".x*"))
-    outcome = relit("export", walk, "--out", tmp_path / "walk.usdc")
-    assert (outcome.code, outcome.err) == (0, "") and "3 steps" in outcome.out
+    assert "3 steps" in relit("export", walk, "--out", tmp_path / "walk.usdc").well()
 
 
 SCRIPT = """

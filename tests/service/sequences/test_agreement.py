@@ -82,10 +82,16 @@ def test_errors_that_all_steps_share_are_not_averaged_away():
     assert np.sqrt((track.sigma**2).mean()) == pytest.approx(np.sqrt(9 + 0.1) * SIGMA, rel=0.05)
 
 
-def test_a_cut_carries_nothing_over():
+def test_a_cut_carries_nothing_over_and_steps_without_noise_weigh_the_same():
     random = np.random.default_rng(3)
     one, other = noisy(sphere(0), random), noisy(-sphere(20) * (1, 1, -1), random)
     assert not agree(other - one, np.full(ALL.shape, 2 * SIGMA**2), ALL, 2).any()
+    ones = np.zeros((4, 4, 1))
+    still = np.zeros((4, 4))
+    track = begin(ones, still, still, np.ones((4, 4), bool))
+    for value in (3.0, 6.0):
+        track = advance(track, begin(ones + value, still, still, np.ones((4, 4), bool)), np.ones((4, 4), bool))
+    np.testing.assert_allclose(track.mean, 3)
 
 
 def test_missing_estimates_agree_with_nothing_and_begin_anew():
@@ -98,12 +104,3 @@ def test_missing_estimates_agree_with_nothing_and_begin_anew():
                     found)
     assert (track.mean[:, :20] == 1).all() and (track.mean[:, 24:] == 0.5).all()
     assert (track.count[:, :20] == 1).all() and (track.count[:, 24:] == 2).all()
-
-
-def test_steps_without_noise_weigh_the_same():
-    ones = np.zeros((4, 4, 1))
-    still = np.zeros((4, 4))
-    track = begin(ones, still, still, np.ones((4, 4), bool))
-    for value in (3.0, 6.0):
-        track = advance(track, begin(ones + value, still, still, np.ones((4, 4), bool)), np.ones((4, 4), bool))
-    np.testing.assert_allclose(track.mean, 3)

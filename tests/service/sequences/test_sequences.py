@@ -115,6 +115,7 @@ def test_a_cut_carries_nothing_over(tmp_path):
     assert report["steps"][3]["joined_pixels"] < 0.005 * SIZE**2 and report["steps"][4]["joined_pixels"] > 0.9 * SIZE**2
 
 
+@pytest.mark.long
 def test_a_change_of_all_lights_is_taken_out(tmp_path):
     """3 % more light in one step: its albedo is that of the others, within the noise of the joined one."""
     for step, brightness in enumerate((1.0, 1.03, 1.0)):
@@ -127,6 +128,7 @@ def test_a_change_of_all_lights_is_taken_out(tmp_path):
     assert ratio[1] - ratio[0] == pytest.approx(0.03, abs=0.005)
 
 
+@pytest.mark.long
 def test_intensities_of_the_first_step_are_those_of_all(tmp_path):
     """Lights that are 10 % off in every step; in the last other lights are, which the images contradict."""
     random = np.random.default_rng(5)
@@ -171,19 +173,11 @@ def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
     assert solve_sequence(request(tmp_path, max_sigma=5.0)).kept == 0
 
 
-def test_without_joining_each_step_is_a_solve(tmp_path):
-    write_sequence(tmp_path / "in", [None] * 2, noise=NOISE, size=16)
-    result = solve_sequence(request(tmp_path, temporal=False, frame_rate=12.5))
-    assert files_in(tmp_path / "out" / "step01") == {"maps.exr", "report.json", "step.json"}
-    assert result.joined == 0 and json.loads((tmp_path / "out" / "sequence.json").read_text())["frames_per_second"] == 12.5
-
-
 def test_what_is_refused(tmp_path, relit):
     write_sequence(tmp_path / "in", [None] * 2, size=16)
     with pytest.raises(RequestError, match=r"--lights refined: each step of a sequence"):
         solve_sequence(request(tmp_path, lights=LightsKnown.REFINED))
-    outcome = relit("solve", tmp_path / "in", "--out", tmp_path / "in")
-    assert outcome.code == 2 and "step00 in it is a capture of the sequence" in outcome.err
+    relit("solve", tmp_path / "in", "--out", tmp_path / "in").refused("step00 in it is a capture of the sequence")
     outcome = relit("solve", tmp_path / "in" / "step00", "--out", tmp_path / "out", "--no-temporal")
     assert outcome.code == 2 and "--no-temporal:" in outcome.err and "is one capture" in outcome.err
     edit_manifest(tmp_path / "in" / "step01", camera={"projection": "orthographic", "resolution": [8, 16]})
@@ -192,13 +186,16 @@ def test_what_is_refused(tmp_path, relit):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_says_what_it_made(tmp_path, relit):
-    write_sequence(tmp_path / "in", [None] * 2, size=24, noise=NOISE)
-    outcome = relit("solve", tmp_path / "in", "--out", tmp_path / "out", "--method", "lambert")
-    assert (outcome.code, outcome.err) == (0, "") and "(2 steps, 0 done before)" in outcome.out
-    assert "taken at 24 a second" in outcome.out
+def test_the_command_says_what_it_made_and_without_joining_each_step_is_a_solve(tmp_path, relit):
+    write_sequence(tmp_path / "in", [None] * 2, size=16, noise=NOISE)
+    out = relit("solve", tmp_path / "in", "--out", tmp_path / "joined", "--method", "lambert").well()
+    assert "(2 steps, 0 done before)" in out and "taken at 24 a second" in out
+    result = solve_sequence(request(tmp_path, temporal=False, frame_rate=12.5))
+    assert files_in(tmp_path / "out" / "step01") == {"maps.exr", "report.json", "step.json"}
+    assert result.joined == 0 and json.loads((tmp_path / "out" / "sequence.json").read_text())["frames_per_second"] == 12.5
 
 
+@pytest.mark.long
 def test_a_warning_of_many_steps_is_said_once(tmp_path):
     """A flat relief whose steps all warn of the height, each of another place."""
     write_sequence(tmp_path / "in", [8, 10, 12], noise=NOISE, size=24)
@@ -207,21 +204,16 @@ def test_a_warning_of_many_steps_is_said_once(tmp_path):
     assert len(said) == 1 and said[0].startswith("step00: ") and said[0].endswith("(and 2 more of 3 steps, with other figures)")
 
 
-@pytest.fixture(scope="module")
-def spheres(tmp_path_factory):
-    """A sphere that moves before a plane, under phases that a Gray code numbers."""
-    folder = tmp_path_factory.mktemp("spheres")
+def test_depth_at_rest_is_joined_and_what_moves_is_not(tmp_path):
+    """A sphere that moves before a plane, under phases that a Gray code numbers.
+
+    As for normals, but errors of whole periods, where a step cannot tell the period, are no noise and left out.
+    """
     patterns = [*depths.BLACK_WHITE, *depths.phase_patterns("column", 16), *depths.gray_patterns("column", stripe=16)]
-    scenes = [depths.make_scene(centre=(-0.1 + 0.04 * step, 0, -1.35)) for step in range(5)]
+    scenes, out = [depths.make_scene(centre=(-0.1 + 0.04 * step, 0, -1.35)) for step in range(5)], tmp_path / "out"
     for step, scene in enumerate(scenes):
-        depths.write_patterns(folder / "in" / f"s{step}", scene, patterns, noise=0.01, seed=step)
-    depth_sequence(DepthRequest(capture=folder / "in", out=folder / "out", device="cpu", read_noise=0.01))
-    return folder / "out", scenes
-
-
-def test_depth_at_rest_is_joined_and_what_moves_is_not(spheres):
-    """As for normals; errors of whole periods, where a step cannot tell the period, are no noise and left out."""
-    out, scenes = spheres
+        depths.write_patterns(tmp_path / "in" / f"s{step}", scene, patterns, noise=0.01, seed=step)
+    depth_sequence(DepthRequest(capture=tmp_path / "in", out=out, device="cpu", read_noise=0.01))
     changing = np.any([(np.abs(each.depth - scenes[0].depth) > 0) | each.shaded for each in scenes], axis=0)
     for step in range(1, len(scenes)):
         joined, alone = (DepthMaps.read(out / f"s{step}" / part / "depth.exr") for part in (".", "alone"))
@@ -231,10 +223,6 @@ def test_depth_at_rest_is_joined_and_what_moves_is_not(spheres):
         assert rms(errors[0][rest]) < 1.1 * rms(errors[1][rest]) / np.sqrt(step + 1) + 0.0002
         assert rms(joined.sigma[rest]) > 0.95 * rms(errors[0][rest])
         assert rms(errors[0][moves]) <= 1.02 * rms(errors[1][moves])
-
-
-def test_points_are_those_of_the_joined_depth(spheres):
-    out, _ = spheres
     maps, cloud = DepthMaps.read(out / "s4" / "depth.exr"), read_ply(out / "s4" / "points.ply")
     cols, rows = (np.floor(place).astype(int) for place in maps.camera.image_coordinates(cloud.points))
     np.testing.assert_allclose(-cloud.points[:, 2], maps.depth[rows, cols], rtol=1e-5)

@@ -1,14 +1,32 @@
-"""A service without processes, on each kind of database."""
+"""Each kind of database, and a service without processes on it."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from service.server.base.settings import Settings
+from service.server.database.engine import Database, connect
+from service.server.database.schema import upgrade
 from tests.service.server.house import DAYS, House
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest) -> str | None:
+    """Of each kind of database; those on PostgreSQL are a new one each."""
+    return None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+
+
+@pytest.fixture
+def database(tmp_path: Path, database_url: str | None) -> Iterator[Database]:
+    """A database of each kind, with its tables, and as many connections as threads ask at once."""
+    made = connect(Settings(data=tmp_path, database_url=database_url).sqlalchemy_url, connections=12)
+    upgrade(made)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.long)])
 def house(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[House]:
     url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
     made = House(tmp_path / "data", retention_days=DAYS, upload_hours=48, database_url=url)

@@ -9,7 +9,7 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
 from service.server.base.settings import Settings
 from service.server.database import jobs
 from service.server.process.backup import CONTENTS, backup, restore
-from tests.service.server.jobs.conftest import database_url, undisturbed  # noqa: F401  (fixtures)
+from tests.service.server.jobs.conftest import undisturbed  # noqa: F401  (a fixture)
 from tests.service.server.jobs.harness import digests, harness
 from tests.service.server_process import SABOTAGE
 
@@ -58,44 +58,32 @@ def saved(tmp_path):
     return tmp_path / "saved"
 
 
-def test_files_that_are_being_written_are_left_out(saved):
-    assert sorted(path.name for path in saved.rglob("*") if path.is_file()) == ["backup.json", "maps.exr", "relit.sqlite"]
-
-
-@pytest.mark.parametrize("damage", ["flip", "cut", "remove", "no contents", "contents"])
-def test_a_damaged_backup_is_refused_and_nothing_is_made(relit, saved, tmp_path, damage):
-    file = saved / "projects/larch/jobs/job_x/maps.exr"
-    if damage == "flip":
-        file.unlink()
-        file.write_bytes(b"mops")
-    elif damage == "cut":
-        file.unlink()
-        file.write_bytes(b"map")
-    elif damage == "remove":
-        file.unlink()
-    elif damage == "no contents":
-        (saved / CONTENTS).unlink()
-    else:
-        (saved / CONTENTS).write_text('{"schema": "relit.backup/1", "files": {"../x": {}}}')
-    outcome = relit("restore", saved, "--data", tmp_path / "second")
-    assert (outcome.code, outcome.out) == (2, "") and outcome.err.count("\n") == 1
-    words = {"no contents": "is no whole backup", "contents": "../x leads out of the backup"}
-    assert words.get(damage, "maps.exr: is missing or differs from its checksum") in outcome.err
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("projects/larch/jobs/job_x/maps.exr", "mops", "maps.exr: is missing or differs from its checksum"),
+    ("projects/larch/jobs/job_x/maps.exr", "map", "maps.exr: is missing or differs from its checksum"),
+    ("projects/larch/jobs/job_x/maps.exr", None, "maps.exr: is missing or differs from its checksum"),
+    (CONTENTS, None, "is no whole backup"),
+    (CONTENTS, '{"schema": "relit.backup/1", "files": {"../x": {}}}', "../x leads out of the backup"),
+], ids=["flip", "cut", "remove", "no contents", "contents"])
+def test_a_damaged_backup_is_refused_and_nothing_is_made(relit, saved, tmp_path, name, content, words):
+    (saved / name).unlink()
+    if content is not None:
+        (saved / name).write_text(content)
+    relit("restore", saved, "--data", tmp_path / "second").refused(words)
     assert not (tmp_path / "second").exists()
 
 
-def test_a_service_is_neither_overwritten_nor_saved_into_itself(relit, saved, tmp_path):
+def test_the_commands_say_what_they_did_and_neither_overwrite_nor_save_into_a_service(relit, saved, tmp_path):
+    """What is being written is left out."""
+    assert sorted(path.name for path in saved.rglob("*") if path.is_file()) == ["backup.json", "maps.exr", "relit.sqlite"]
+    out = relit("restore", saved, "--data", tmp_path / "second").well()
+    assert out.splitlines()[0] == f"data     {tmp_path / 'second'}"
+    assert (tmp_path / "second/projects/larch/jobs/job_x/maps.exr").read_bytes() == b"maps"
+    out = relit("backup", "--data", tmp_path / "second", "--out", tmp_path / "again").well()
+    assert out.splitlines()[0] == f"backup   {tmp_path / 'again'}"
     data = tmp_path / "first" / "data"
     assert "there is a service in this folder already" in relit("restore", saved, "--data", data).err
     assert "is not empty: give a new folder" in relit("backup", "--out", saved, "--data", data).err
     assert "lies in the data folder" in relit("backup", "--out", data / "saved", "--data", data).err
     assert "there is no service in this folder" in relit("backup", "--out", tmp_path / "x", "--data", tmp_path / "nowhere").err
     assert not (tmp_path / "x").exists() and not (tmp_path / "nowhere").exists()
-
-
-def test_the_commands_say_what_they_did(relit, saved, tmp_path):
-    outcome = relit("restore", saved, "--data", tmp_path / "second")
-    assert outcome.code == 0 and outcome.out.splitlines()[0] == f"data     {tmp_path / 'second'}"
-    assert (tmp_path / "second/projects/larch/jobs/job_x/maps.exr").read_bytes() == b"maps"
-    outcome = relit("backup", "--data", tmp_path / "second", "--out", tmp_path / "again")
-    assert outcome.code == 0 and outcome.out.splitlines()[0] == f"backup   {tmp_path / 'again'}"

@@ -7,21 +7,21 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 import httpx2
 import pytest
 import uvicorn
 from anyio import to_thread
 
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.server.base.settings import Settings
 from service.server.database import keys
-from service.server.database.engine import connect
 from service.server.process import connections
 from service.server.process.connections import ConnectionLimits, limits_of, raise_descriptors
 from service.server.process.serve import THREADS, http_server
 from tests.service.server_process import serving
+from tests.service.waiting import until
 
 WAIT_S = 20.0
 HALF = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n"
@@ -103,11 +103,6 @@ def test_a_header_has_to_come_in_time_however_slowly_its_bytes_come(monkeypatch)
         assert ended and closed(silent) and closed(kept)
 
 
-def test_requests_wait_in_so_many_threads_and_no_more():
-    with running(ConnectionLimits(20, 20)) as (port, _):
-        assert httpx2.get(f"http://127.0.0.1:{port}/threads", timeout=WAIT_S).content == b"%d" % THREADS
-
-
 def test_an_address_that_takes_its_share_leaves_the_rest_to_others():
     with running(ConnectionLimits(20, 5)) as (port, server):
         theirs = [opened(port, HALF, "127.0.0.2") for _ in range(30)]
@@ -120,6 +115,7 @@ def test_an_address_that_takes_its_share_leaves_the_rest_to_others():
             connection.close()
 
 
+@pytest.mark.long
 def test_who_takes_no_answer_is_closed_and_who_is_busy_is_not(monkeypatch):
     monkeypatch.setattr(connections, "STALL_S", 5.0)  # so that a loaded machine asks a third time before the first two are closed
     monkeypatch.setattr(connections, "HEADER_S", 0.5)
@@ -129,10 +125,7 @@ def test_who_takes_no_answer_is_closed_and_who_is_busy_is_not(monkeypatch):
         assert all(connection.recv(1) for connection in stalled)
         with suppress(ConnectionResetError):  # which may come before the answer, as the request is not read
             assert b"503" in answered(port)  # all are busy: none can be closed for it
-        deadline = time.monotonic() + WAIT_S
-        while server.server_state.connections:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        until(lambda: not server.server_state.connections, within_s=WAIT_S)
         reader, taken = opened(port, request), 0
         while taken < LARGE:  # for longer than a header may take
             piece = reader.recv(1 << 20)
@@ -143,12 +136,14 @@ def test_who_takes_no_answer_is_closed_and_who_is_busy_is_not(monkeypatch):
             connection.close()
 
 
-def test_a_proxy_is_believed_where_it_is_named_and_nowhere_else():
+def test_a_proxy_is_believed_where_it_is_named_alone_and_requests_wait_in_so_many_threads():
     forged = b"X-Forwarded-For: 10.9.8.7\r\n"
     with running(ConnectionLimits(20, 20)) as (port, _):
         assert answered(port, headers=forged).endswith(b"127.0.0.1")
     with running(ConnectionLimits(20, 20), trusted_proxies="127.0.0.0/24") as (port, _):
         assert answered(port, headers=forged).endswith(b"10.9.8.7")
+    with running(ConnectionLimits(20, 20)) as (port, _):
+        assert httpx2.get(f"http://127.0.0.1:{port}/threads", timeout=WAIT_S).content == b"%d" % THREADS
 
 
 @pytest.mark.parametrize("descriptors", [64, 256, 1024, 4096, 20_000, 1 << 20])
@@ -175,11 +170,9 @@ def test_half_sent_requests_stop_no_service_of_1024_descriptors(tmp_path):
     """Before there were bounds, 1100 of them stopped it for as long as they stayed, and the log grew by megabytes a second."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(4096, hard)), hard))
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0", descriptors=1024) as server:
+    with serving(tmp_path, "--anonymous", "--device", "none", descriptors=1024) as server:
         port, logged = int(server.url.rpartition(":")[2]), server.log.stat().st_size
-        half = []
-        for _ in range(1100):
-            half.append(opened(port, HALF))
+        half = [opened(port, HALF) for _ in range(1100)]
         for _ in range(20):
             assert httpx2.get(f"{server.url}/healthz", timeout=WAIT_S).status_code == 200
         assert len(os.listdir(f"/proc/{server.process.pid}/fd")) < 1024
@@ -191,42 +184,31 @@ def test_half_sent_requests_stop_no_service_of_1024_descriptors(tmp_path):
 @pytest.mark.long
 def test_a_key_has_its_streams_and_leaves_the_rest_to_others(tmp_path):
     """One read key opened 1003 streams within its rate limit, and other projects were not answered."""
-    with serving(tmp_path, "--device", "none", min_free_bytes="0", max_streams="3", max_project_streams="5") as server:
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        made = [keys.create(database, NewKey(project=project, name="x", scope=Scope.READ)) for project in ("larch", "larch", "birch")]
+    with serving(tmp_path, "--device", "none", max_streams="3", max_project_streams="5") as server, ExitStack() as stack:
+        made = [server.key(project, Scope.READ) for project in ("larch", "larch", "birch")]
         port = int(server.url.rpartition(":")[2])
 
         def stream(key: str) -> tuple[int, socket.socket]:
             connection = opened(port, f"GET /v1/events HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\n\r\n".encode())
+            stack.enter_context(connection)
             return int(re.match(rb"HTTP/1.1 (\d+)", connection.recv(4096))[1]), connection
 
         first = [stream(made[0]) for _ in range(6)]
-        second = [stream(made[1]) for _ in range(4)]
-        other = [stream(made[2]) for _ in range(1)]
         assert [status for status, _ in first] == [200] * 3 + [429] * 3
-        assert [status for status, _ in second] == [200] * 2 + [429] * 2
-        assert [status for status, _ in other] == [200]
+        assert [stream(made[1])[0] for _ in range(4)] == [200] * 2 + [429] * 2
+        assert stream(made[2])[0] == 200
         first[0][1].close()
-        deadline = time.monotonic() + WAIT_S
-        while (again := stream(made[0]))[0] != 200:  # once the server has seen that it is closed
-            again[1].close()
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        for _, connection in (*first, *second, *other, again):
-            connection.close()
-        database.close()
+        until(lambda: stream(made[0])[0] == 200)  # once the server has seen that it is closed
 
 
 @pytest.mark.long
 def test_the_stream_of_a_revoked_key_ends(tmp_path):
-    with serving(tmp_path, "--device", "none", min_free_bytes="0") as server:
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        revoked, kept = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.READ)) for _ in range(2))
-        with server.client(revoked) as one, server.client(kept) as two:
+    with serving(tmp_path, "--device", "none") as server:
+        revoked, kept = (server.key(scope=Scope.READ) for _ in range(2))
+        with server.client(revoked) as one, server.client(kept) as two, server.database() as database:
             with one.stream("GET", "/v1/events") as ending, two.stream("GET", "/v1/events") as staying:
                 assert ending.status_code == staying.status_code == 200
                 assert keys.revoke(database, revoked.partition(".")[0])
                 assert list(ending.iter_lines()) == []
                 assert not staying.is_closed
             assert one.get("/v1/events").status_code == 401
-        database.close()

@@ -6,45 +6,34 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx2
 import pytest
 
-from service.demo.demo import sample_folder
 from service.requests.keys import Scope
 from service.server.base.settings import Settings
-from service.server.database.engine import connect
-from service.server.jobs.queue import JobQueue, prepare
 from service.server.process.connections import AT_ONCE, MAX_CONNECTIONS, OWN_DESCRIPTORS
 from service.server.process.processes import PRIVATE
-from service.server.process.sample import show_sample
-from service.server.storage.objects import open_storage
+from tests.service.server_process import environment_with
+from tests.service.waiting import free_port, until
 
 HOME = Path(__file__).parents[3]
 TEXT = (HOME / "docs" / "service.md").read_text(encoding="utf-8")
 PORT = "8470"
 
 
-def free_port() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return str(server.getsockname()[1])
-
-
 @pytest.mark.long
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_the_walk_runs(tmp_path):
-    port = free_port()
+    port = str(free_port())
     script = "\n".join(re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)).replace(PORT, port)
     assert script.count(port) >= 2
     (tmp_path / "samples").symlink_to(HOME / "samples")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
-    environment |= {"RELIT_PORT": port, "RELIT_DEVICES": "cpu", "RELIT_MIN_FREE_BYTES": "0",
-                    "PATH": f"{Path(sys.executable).parent}:{environment['PATH']}"}
+    environment = environment_with(port=port, devices="cpu", min_free_bytes=0)
+    environment["PATH"] = f"{Path(sys.executable).parent}:{environment['PATH']}"
     walk = subprocess.Popen(["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, env=environment, text=True, start_new_session=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
@@ -68,9 +57,6 @@ def test_the_systemd_unit_leaves_room_for_all_connections_and_time_to_drain():
     assert float(service["TimeoutStopSec"]) > settings.drain_s + 15
     assert int(service["UMask"], 8) == PRIVATE and service["KillMode"] == "mixed"  # `relit serve` itself ends its workers
     assert service["ExecStart"].split()[1:] == ["serve", "--config", "/etc/relit.toml"]
-
-
-def test_every_scope_is_described():
     assert re.findall(r"^\| `(\w+)` \| (?:captures|also)", TEXT, re.MULTILINE) == [scope.value for scope in Scope]
 
 
@@ -88,26 +74,12 @@ def test_the_service_of_the_demo_says_what_to_try_and_that_works(tmp_path):
         urls = [re.search(r"http://\S+", line)[0] for line in (said[0], said[2], said[3])]
         body = json.loads(re.search(r"-d '(.*)'", said[4])[1])
         with httpx2.Client(timeout=60) as client:
-            deadline = time.monotonic() + 60
-            while {client.get(url).json()["state"] for url in urls[1:]} != {"ready"}:
-                assert time.monotonic() < deadline, (tmp_path / "log").read_text()
-                time.sleep(0.1)
+            until(lambda: {client.get(url).json()["state"] for url in urls[1:]} == {"ready"}, "not ready", every_s=0.1)
             assert client.post(f"{urls[0]}/jobs", json=body).status_code == 202
             assert len(client.get(f"{urls[0]}/captures").json()["items"]) == 1
     finally:
         process.terminate()
         assert process.wait(90) == 0, (tmp_path / "log").read_text()
-
-
-def test_the_sample_is_registered_once(tmp_path, capsys):
-    settings = Settings(data=tmp_path / "data")
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    for _ in range(2):
-        show_sample("http://x", database, JobQueue(database), open_storage(settings), sample_folder(), None)
-    first, second = capsys.readouterr().out.split("capture ")[1:]
-    assert first == second
-    database.close()
 
 
 def test_the_tests_that_the_code_names_exist():

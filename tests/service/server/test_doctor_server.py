@@ -1,7 +1,8 @@
 """relit doctor, of a service."""
 
+import sqlite3
+
 import pytest
-import sqlalchemy as sa
 
 from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import CheckJob
@@ -16,18 +17,16 @@ from service.server.jobs.queue import JobQueue, prepare
 @pytest.fixture
 def data(tmp_path, monkeypatch):
     monkeypatch.setenv("RELIT_MIN_FREE_BYTES", "0")
-    folder = tmp_path / "data"
-    settings = Settings(data=folder)
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    keys.create(database, NewKey(project="larch", name="x", scope=Scope.READ))
-    database.close()
-    return folder
+    return tmp_path / "data"
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def database(data):
-    made = connect(Settings(data=data).sqlalchemy_url)
+    """Of a service with one key."""
+    settings = Settings(data=data)
+    made = connect(settings.sqlalchemy_url)
+    prepare(settings, made)
+    keys.create(made, NewKey(project="larch", name="x", scope=Scope.READ))
     yield made
     made.close()
 
@@ -55,28 +54,17 @@ def test_a_sound_service(relit, data, database, tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", [["doctor", "--device", "cpu"], ["serve", "--port", "0"], ["worker", "--device", "cpu"]], ids="-".join)
 def test_a_data_folder_below_a_root_is_refused(relit, data, monkeypatch, command):
     monkeypatch.setenv("RELIT_ROOTS", str(data.parent))
-    outcome = relit(*command, "--data", data)
-    assert outcome.code == 2 and "could register the captures of another" in outcome.err and outcome.err.count("\n") == 1
+    relit(*command, "--data", data).refused("could register the captures of another", printed="doctor" in command)
 
 
-def test_nothing_is_asked_of_a_service_that_is_not_there(relit, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    outcome = relit("doctor", "--device", "cpu")
-    assert outcome.code == 0 and "database" not in outcome.out
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_folder_that_is_here_is_looked_at(relit, data, tmp_path, monkeypatch):
-    data.rename(tmp_path / "relit-data")
-    monkeypatch.chdir(tmp_path)
-    assert "database" in lines_of(relit("doctor", "--device", "cpu"))
-
-
-def test_one_that_was_not_started_yet(relit, tmp_path):
+def test_the_folder_that_is_here_is_looked_at_and_none_is_made(relit, data, tmp_path, monkeypatch):
     (tmp_path / "new").mkdir()
-    outcome = relit("doctor", "--device", "cpu", "--data", tmp_path / "new")
-    assert outcome.code == 0 and "is not there yet" in lines_of(outcome)["database"]
+    monkeypatch.chdir(tmp_path / "new")
+    assert "database" not in relit("doctor", "--device", "cpu").well()  # nothing is asked of a service that is not there
+    assert "is not there yet" in lines_of(relit("doctor", "--device", "cpu", "--data", tmp_path / "new"))["database"]
     assert list((tmp_path / "new").iterdir()) == []
+    data.rename(tmp_path / "new" / "relit-data")
+    assert "database" in lines_of(relit("doctor", "--device", "cpu"))
 
 
 def wrong(relit, *arguments: object) -> list[str]:
@@ -86,15 +74,12 @@ def wrong(relit, *arguments: object) -> list[str]:
     return [line.split(maxsplit=1)[1] for line in outcome.out.splitlines() if line.startswith("wrong ")]
 
 
-def test_no_key(relit, data, database, monkeypatch):
+def test_no_key_and_jobs_that_wait_for_nobody(relit, data, database, monkeypatch):
     keys.revoke(database, keys.listing(database)[0]["id"])
     (line,) = wrong(relit, "--data", data)
     assert line.startswith("keys: none") and "relit keys create" in line
     monkeypatch.setenv("RELIT_ANONYMOUS", "true")
     assert relit("doctor", "--device", "cpu", "--data", data).code == 0
-
-
-def test_jobs_that_wait_for_nobody(relit, data, database):
     queue = JobQueue(database)
     database.transact(lambda connection: queue.submit(
         connection, project="larch", key=None, request=CheckJob(kind="check", intake=new_id(CAPTURE)), chunk_frames=1, inputs=[]))
@@ -102,32 +87,25 @@ def test_jobs_that_wait_for_nobody(relit, data, database):
     assert line.startswith("worker: none") and "1 jobs wait" in line
 
 
-def test_a_database_of_another_version(relit, data, database):
+def test_a_database_of_another_version_or_of_something_else(relit, data, database):
     database.transact(lambda connection: connection.exec_driver_sql(f"UPDATE {REVISIONS} SET version_num = '99'"))
     assert wrong(relit, "--data", data)[0].startswith("database: the database has the tables of a newer relit")
-
-
-def test_a_database_of_something_else(relit, data):
     (data / "relit.sqlite").unlink()
-    other = sa.create_engine(f"sqlite:///{data / 'relit.sqlite'}")
-    with other.begin() as connection:
-        connection.execute(sa.text("CREATE TABLE cats (name TEXT)"))
-    other.dispose()
+    with sqlite3.connect(data / "relit.sqlite") as other:
+        other.execute("CREATE TABLE cats (name TEXT)")
     (line,) = wrong(relit, "--data", data)
     assert line.startswith("database: the database has no tables of relit")
     (data / "relit.sqlite").write_bytes(b"no database" * 1000)
     assert wrong(relit, "--data", data)[0].startswith("database: does not answer: ")
 
 
-def test_a_database_server_that_is_not_there(relit, data, monkeypatch):
+def test_a_database_server_that_is_not_there_folders_and_variables(relit, data, monkeypatch, tmp_path):
     monkeypatch.setenv("RELIT_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/relit")
     found = wrong(relit, "--data", data)
     assert len(found) == 1 and found[0].startswith("database: does not answer: ") and "secret" not in found[0]
     monkeypatch.setenv("RELIT_DATABASE_URL", "mysql://u@h/x")
     assert "mysql is not supported" in wrong(relit, "--data", data)[0]
-
-
-def test_folders_and_variables(relit, data, tmp_path, monkeypatch):
+    monkeypatch.delenv("RELIT_DATABASE_URL")
     monkeypatch.setenv("RELIT_ROOTS", str(tmp_path / "gone"))
     monkeypatch.setenv("RELIT_PROT", "1")
     monkeypatch.setenv("RELIT_MIN_FREE_BYTES", str(10**18))

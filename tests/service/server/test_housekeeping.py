@@ -1,7 +1,6 @@
 """What the service clears away by itself, and what it leaves alone; days pass by an injected clock."""
 
 import os
-import time
 
 import sqlalchemy as sa
 
@@ -12,6 +11,7 @@ from service.server.process.housekeeping import DAY_S, HOUR_S, UNFINISHED_S
 from service.server.storage import layout
 from service.server.storage.part_files import PartFile, part_files_folder
 from tests.service.server.house import DAYS, PROJECT, House
+from tests.service.waiting import until
 
 
 def test_old_jobs_go_with_their_results_and_their_place_in_the_queue(house):
@@ -34,12 +34,19 @@ def test_old_jobs_go_with_their_results_and_their_place_in_the_queue(house):
     assert intakes.find(house.database, capture, PROJECT) and intakes.find(house.database, sky, PROJECT)
 
 
-def test_without_retention_jobs_stay(tmp_path):
+def test_without_retention_jobs_stay_and_marks_of_removed_ones_do_not(tmp_path):
     house = House(tmp_path / "data")
     job = house.job()
+    house.storage.remove(layout.results(PROJECT, house.job()))
+    for kind in (CAPTURE, ENVIRONMENT):  # without a file, of which no writer is under way
+        house.storage.remove(layout.intake(PROJECT, house.capture(kind)))
+    marks = [path for path in house.settings.data.glob("removed/**/*") if path.is_file()]
+    house.keeper.round()
+    assert len(marks) == 1 and marks[0].exists()
+    os.utime(marks[0], (0, 0))
     house.now += 100_000 * DAY_S
     house.keeper.round()
-    assert house.results(job).exists() and jobs.find(house.database, job)
+    assert house.results(job).exists() and jobs.find(house.database, job) and not marks[0].exists()
     house.database.close()
 
 
@@ -55,24 +62,28 @@ def test_results_that_a_waiting_job_reads_stay_until_it_has_ended(house):
 
 
 def test_uploads_that_nobody_goes_on_with_expire(house):
-    capture, upload, folder = house.capture(), new_id(UPLOAD), part_files_folder(house.settings)
-    house.database.transact(lambda connection: uploads.insert(
-        connection, identifier=upload, project=PROJECT, intake=capture, path="000.exr", length=10, sha256=None))
+    capture, folder = house.capture(), part_files_folder(house.settings)
+    upload, done = new_id(UPLOAD), new_id(UPLOAD)
+    for identifier in (upload, done):
+        house.database.transact(lambda connection, identifier=identifier: uploads.insert(
+            connection, identifier=identifier, project=PROJECT, intake=capture, path=identifier, length=10, sha256=None))
+    assert uploads.finish(house.database, done, 10)
     with PartFile.open(folder, upload) as part:
         part.append([b"12345"])
+    PartFile.open(folder, "up_orphan").close()
     house.now += 47 * HOUR_S
     house.keeper.round()
-    assert uploads.find(house.database, upload, PROJECT) and part.path.exists()
+    assert uploads.find(house.database, upload, PROJECT) and {path.stem for path in folder.iterdir()} == {upload, "up_orphan"}
     house.now += 2 * HOUR_S
     with PartFile.open(folder, upload):  # a request adds to it
         house.keeper.round()
         assert uploads.find(house.database, upload, PROJECT)
     house.keeper.round()
-    assert uploads.find(house.database, upload, PROJECT) is None and not part.path.exists()
-    assert intakes.find(house.database, capture, PROJECT)
+    assert uploads.find(house.database, upload, PROJECT) is None and list(folder.iterdir()) == []
+    assert uploads.find(house.database, done, PROJECT) and intakes.find(house.database, capture, PROJECT)
 
 
-def test_tokens_are_remembered_for_a_day(house):
+def test_tokens_are_remembered_for_a_day_and_lines_of_the_audit_log_for_audit_days(house):
     made: list[str] = []
 
     def make(_connection) -> str:
@@ -89,11 +100,8 @@ def test_tokens_are_remembered_for_a_day(house):
     house.now += 0.2 * DAY_S
     house.keeper.round()
     assert ask() == made[1]
-
-
-def test_lines_of_the_audit_log_are_kept_for_audit_days(house):
     house.database.transact(lambda connection: audit.record_operator(connection, PROJECT, "key.create", "key_1"))
-    house.now += 399 * DAY_S
+    house.now += 397.5 * DAY_S
     house.keeper.round()
     assert len(audit.listing(house.database, limit=9)) == 1
     house.now += 2 * DAY_S
@@ -121,16 +129,19 @@ def test_workers_that_are_gone_are_forgotten_and_those_that_come_back_are_not(ho
     assert (locks / "dead.lock").exists() != house.settings.is_sqlite  # on PostgreSQL locks are no files, and this is none of ours
 
 
-def test_stack_caches_go_with_their_captures(house):
+def test_stack_caches_go_with_their_captures_and_what_a_killed_worker_began_goes_later(house):
     kept, gone = house.capture(), house.capture()
     folders = house.cache(kept), house.cache(gone)
     half = house.settings.data / "cache" / f".{new_id(CAPTURE)}.removed"
     half.mkdir()
+    begun = folders[0] / ".stack.abc.npy"
+    begun.write_bytes(b"half")
     house.keeper.round()
-    assert folders[0].exists() and folders[1].exists() and not half.exists()
+    assert folders[0].exists() and folders[1].exists() and not half.exists() and begun.exists()  # it may be in the making
     house.database.transact(lambda connection: intakes.remove(connection, gone))
+    house.now += UNFINISHED_S + HOUR_S
     house.keeper.round()
-    assert folders[0].exists() and not folders[1].exists()
+    assert (folders[0] / "stack.npy").exists() and not folders[1].exists() and not begun.exists()
 
 
 def test_beyond_their_limit_the_caches_go_that_were_not_read_for_longest(tmp_path):
@@ -152,47 +163,18 @@ def test_beyond_their_limit_the_caches_go_that_were_not_read_for_longest(tmp_pat
     house.database.close()
 
 
-def test_what_was_half_removed_is_removed(house):
-    job = house.job()
-    half = house.results(job).with_name(f".{new_id('job')}.removed")
-    half.mkdir()
-    (half / "frame.0001.exr").write_bytes(b"x")
-    house.keeper.round()
-    assert not half.exists() and house.results(job).exists()
-
-
-def test_stacks_that_a_killed_worker_began_are_removed(house):
-    capture = house.capture()
-    begun = house.cache(capture) / ".stack.abc.npy"
-    begun.write_bytes(b"half")
-    house.keeper.round()
-    assert begun.exists()  # it may be in the making
-    house.now += UNFINISHED_S + HOUR_S
-    house.keeper.round()
-    assert not begun.exists() and (begun.parent / "stack.npy").exists()
-
-
 def test_the_thread_makes_a_round_at_once_and_ends_when_it_is_asked(house):
     folder = house.cache(new_id(CAPTURE))
     house.keeper.start()
-    deadline = time.monotonic() + 60
-    while folder.exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: not folder.exists())
     house.keeper.stop()
 
 
-def test_it_knows_only_its_own_database(house, tmp_path):
-    """Results that no job of the database knows stay: it may be another database that is pointed at them."""
-    stray = house.results("job_00000000000000000000")
-    stray.mkdir(parents=True)
-    house.now += 10 * DAYS * DAY_S
-    house.keeper.round()
-    assert stray.exists()
+def test_what_is_half_removed_or_made_again_of_a_deleted_job_is_removed(house):
+    """The worker deletes what it made again at the end of its step, unless it is killed before.
 
-
-def test_what_a_writer_made_again_of_a_deleted_job_is_removed(house):
-    """The worker deletes it at the end of its step, unless it is killed before."""
+    Results that no job of the database knows stay: it may be another database that is pointed at them.
+    """
     deleted, kept, restored = house.job(), house.job(), house.job()
     house.database.transact(lambda connection: jobs.remove(connection, deleted))
     for job in (deleted, restored):  # `restored` stands for one that a backup brought back
@@ -200,20 +182,13 @@ def test_what_a_writer_made_again_of_a_deleted_job_is_removed(house):
         assert not house.results(job).exists()
         house.results(job).mkdir()
         (house.results(job) / "frame.0001.exr").write_bytes(b"frame")
+    half, stray = house.results(kept).with_name(f".{new_id('job')}.removed"), house.results("job_00000000000000000000")
+    for folder in (half, stray):
+        folder.mkdir()
+        (folder / "frame.0001.exr").write_bytes(b"frame")
     house.keeper.round()
     assert [house.results(job).exists() for job in (deleted, kept, restored)] == [False, True, True]
-
-
-def test_marks_of_removed_jobs_do_not_stay_for_ever(tmp_path):
-    house = House(tmp_path / "data")
-    house.storage.remove(layout.results(PROJECT, house.job()))
-    for kind in (CAPTURE, ENVIRONMENT):  # without a file, of which no writer is under way
-        house.storage.remove(layout.intake(PROJECT, house.capture(kind)))
-    marks = [path for path in house.settings.data.glob("removed/**/*") if path.is_file()]
-    assert len(marks) == 1
+    assert not half.exists() and stray.exists()
+    house.now += 10 * DAYS * DAY_S
     house.keeper.round()
-    assert marks[0].exists()
-    os.utime(marks[0], (0, 0))
-    house.keeper.round()
-    assert not marks[0].exists()
-    house.database.close()
+    assert stray.exists()

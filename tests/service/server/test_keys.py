@@ -10,11 +10,22 @@ from service.requests.keys import Scope
 from service.server.base.settings import Settings
 from service.server.database import engine, keys, tables
 from service.server.database.engine import connect
+from service.server.jobs.queue import prepare
 
 
 @pytest.fixture
 def data(tmp_path):
     return tmp_path / "data"
+
+
+@pytest.fixture
+def database(data):
+    """Of the keys that a test makes."""
+    settings = Settings(data=data)
+    made = connect(settings.sqlalchemy_url)
+    prepare(settings, made)
+    yield made
+    made.close()
 
 
 @pytest.fixture
@@ -28,38 +39,32 @@ def made(relit, data):
     return make
 
 
-def test_a_key_is_printed_alone_and_opens_its_project(made, data):
+def test_a_key_is_printed_alone_and_opens_its_project(made, data, database):
     key = made()
-    database = connect(Settings(data=data).sqlalchemy_url)
     assert keys.find(database, key) == keys.Caller("larch", Scope.WRITE, key.partition(".")[0], None)
-    database.close()
 
 
 def test_keys_are_listed_without_their_secrets(relit, made, data):
     first, second = made(), made("willow", "render farm", "read")
-    outcome = relit("keys", "list", "--data", data)
-    assert (outcome.code, outcome.err) == (0, "")
-    lines = outcome.out.splitlines()
+    out = relit("keys", "list", "--data", data).well()
+    lines = out.splitlines()
     assert len(lines) == 3 and [line.split()[0] for line in lines[1:]] == [key.partition(".")[0] for key in (first, second)]
     assert all(word in lines[2] for word in ("willow", "read", "render farm"))
-    assert not any(key.partition(".")[2] in outcome.out for key in (first, second))
+    assert not any(key.partition(".")[2] in out for key in (first, second))
     assert len(relit("keys", "list", "--data", data, "--project", "willow").out.splitlines()) == 2
 
 
-def test_a_key_expires(relit, data):
+def test_a_key_expires(relit, data, database):
     key = relit("keys", "create", "--data", data, "--project", "larch", "--name", "x", "--scope", "read", "--expires-days", "2").out.strip()
-    database = connect(Settings(data=data).sqlalchemy_url)
     until = keys.listing(database)[0]["expires_at"]
     assert until == pytest.approx(time.time() + 2 * 86_400, abs=600)  # the time that this test takes
     assert keys.find(database, key).until == until and keys.still_valid(database, [key.partition(".")[0]])
     database.transact(lambda connection: connection.execute(tables.keys.update().values(expires_at=time.time() - 1)))
     assert keys.find(database, key) is None and not keys.still_valid(database, [key.partition(".")[0]])
-    database.close()
 
 
-def test_the_last_use_of_a_key_is_recorded_to_a_minute(relit, made, data):
+def test_the_last_use_of_a_key_is_recorded_to_a_minute(relit, made, data, database):
     key = made()
-    database = connect(Settings(data=data).sqlalchemy_url)
     assert keys.find(database, f"{key}x") is None
     assert keys.listing(database)[0]["used_at"] is None
     assert keys.find(database, key)
@@ -68,7 +73,6 @@ def test_the_last_use_of_a_key_is_recorded_to_a_minute(relit, made, data):
     assert keys.find(database, key) and keys.listing(database)[0]["used_at"] == first
     database.transact(lambda connection: connection.execute(tables.keys.update().values(used_at=first - 2 * keys.USED_S)))
     assert keys.find(database, key) and keys.listing(database)[0]["used_at"] >= first
-    database.close()
 
 
 def test_making_and_revoking_keys_is_audited(relit, made, data):
@@ -90,23 +94,18 @@ def test_a_database_that_cannot_be_written_is_one_sentence(relit, made, data, mo
         assert (outcome.code, outcome.out) == (2, "")
         assert outcome.err == f"relit: data {data}: the database in it cannot be used (database is locked)\n"
     holder.close()
+    (data / "relit.sqlite").write_bytes(b"no database" * 1000)
+    relit("keys", "list", "--data", data).refused("the database in it cannot be used")
 
 
-def test_a_key_is_revoked_once(relit, made, data):
+def test_a_key_is_revoked_once(relit, made, data, database):
     identifier = made().partition(".")[0]
     assert relit("keys", "revoke", identifier, "--data", data) == (0, f"revoked  {identifier}\n", "")
     again = relit("keys", "revoke", identifier, "--data", data)
     assert again.code == 2 and again.err == f"relit: {identifier}: there is no such key that is not revoked\n"
-    database = connect(Settings(data=data).sqlalchemy_url)
     assert [row["revoked_at"] is not None for row in keys.listing(database)] == [True]
-    database.close()
-
-
-def test_the_secret_may_stand_behind_the_identifier(relit, made, data):
-    """Who has only the key revokes with it; its secret is not shown again."""
-    key = made()
-    outcome = relit("keys", "revoke", key, "--data", data)
-    assert outcome.code == 0 and key.partition(".")[2] not in outcome.out
+    key = made()  # who has only the key revokes with it; its secret is not shown again
+    assert key.partition(".")[2] not in relit("keys", "revoke", key, "--data", data).well()
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -120,13 +119,5 @@ def test_the_secret_may_stand_behind_the_identifier(relit, made, data):
     (["revoke", "key_x"], "there is no service in this folder"),
 ])
 def test_what_cannot_be_is_one_sentence_and_makes_nothing(relit, data, arguments, words):
-    outcome = relit("keys", *arguments, "--data", data)
-    assert (outcome.code, outcome.out) == (2, "") and outcome.err.count("\n") == 1 and words in outcome.err
+    relit("keys", *arguments, "--data", data).refused(words)
     assert not data.exists()
-
-
-def test_a_database_that_cannot_be_used_is_one_sentence(relit, data):
-    data.mkdir()
-    (data / "relit.sqlite").write_bytes(b"no database" * 1000)
-    outcome = relit("keys", "list", "--data", data)
-    assert outcome.code == 2 and "the database in it cannot be used" in outcome.err and outcome.err.count("\n") == 1

@@ -13,16 +13,13 @@ import pytest
 
 from service.client import Client
 from service.requests.jobs import RelightJob
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.requests.relight import RelightOptions
-from service.server.base.settings import Settings
-from service.server.database import keys
-from service.server.database.engine import connect
 from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.service.server.jobs.harness import digests, relit_relight
 from tests.service.server.storage.conftest import s3, s3_server  # noqa: F401  (fixtures)
 from tests.service.server.tcp_proxy import tcp_proxy
-from tests.service.server_process import SABOTAGE, serving
+from tests.service.server_process import SABOTAGE, environment_with, serving
 
 FRAMES, SIZE = 24, 128
 
@@ -37,13 +34,10 @@ def test_cut_connections_lose_nothing_between_machines_that_share_no_folder(tmp_
     with (tcp_proxy(urlsplit(database_url).port) as to_database, tcp_proxy(store.port) as to_store,
           serving(tmp_path / "api", "--device", "none", database_url=database_url, **shared) as server,
           tcp_proxy(urlsplit(server.url).port) as to_api):
-        database = connect(Settings(database_url=database_url).sqlalchemy_url)
-        key = keys.create(database, NewKey(project="larch", name="test", scope=Scope.WRITE))
-        database.close()
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
-        environment |= {f"RELIT_{name.upper()}": value for name, value in shared.items()}
-        environment |= {"RELIT_DATABASE_URL": database_url.replace(f":{urlsplit(database_url).port}/", f":{to_database.port}/"),
-                        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{to_store.port}", "PYTHONPATH": SABOTAGE, "SABOTAGE": "slow"}
+        key = server.key(scope=Scope.WRITE)
+        environment = environment_with(
+            **shared, database_url=database_url.replace(f":{urlsplit(database_url).port}/", f":{to_database.port}/")) | {
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{to_store.port}", "PYTHONPATH": SABOTAGE, "SABOTAGE": "slow"}
         with open(tmp_path / "worker.log", "wb") as log:
             worker = subprocess.Popen([sys.executable, "-m", "service.cli.main", "worker", "--device", "cpu", "--data",
                                        str(tmp_path / "worker")], env=environment, stdout=log, stderr=log, start_new_session=True)

@@ -4,7 +4,6 @@ Without nginx these tests are skipped, unless RELIT_TEST_NGINX is `required`, as
 """
 
 import datetime
-import json
 import os
 import re
 import shutil
@@ -13,6 +12,7 @@ import ssl
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,20 +25,18 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from service.client import Client
 from service.requests.jobs import RelightJob
-from service.requests.keys import NewKey, Scope
+from service.requests.keys import Scope
 from service.requests.relight import RelightOptions
-from service.server.base.settings import Settings
-from service.server.database import keys
-from service.server.database.engine import connect
 from tests.scenes.captures import write_capture, write_exr
 from tests.service.server_process import Server, serving
+from tests.service.waiting import PATIENCE_S, free_port, until
 
 pytestmark = pytest.mark.long
 
 NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
 TEXT = (Path(__file__).parents[3] / "docs" / "service.md").read_text(encoding="utf-8")
-NAME, HEADER_S, PATIENCE_S = "relit.example", 1.0, 60.0
-"""Host of the sample; the time for a header in these tests, in place of ten seconds; time for nginx to act on a loaded machine."""
+NAME, HEADER_S = "relit.example", 1.0
+"""Host of the sample; the time for a header in these tests, in place of ten seconds."""
 
 
 class Proxied(NamedTuple):
@@ -51,11 +49,6 @@ class Proxied(NamedTuple):
 
     def client(self) -> httpx2.Client:
         return httpx2.Client(base_url=f"https://localhost:{self.port}", verify=self.tls, timeout=60)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 def write_certificate(folder: Path) -> tuple[Path, Path]:
@@ -94,23 +87,20 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     folder, port = tmp_path_factory.mktemp("nginx"), free_port()
     certificate, key = write_certificate(folder)
     tls = ssl.create_default_context(cafile=str(certificate))
-    with serving(folder / "service", "--device", "cpu", trusted_proxies="127.0.0.1", log_format="json",
-                 min_free_bytes="0") as server:
+    with serving(folder / "service", "--device", "cpu", trusted_proxies="127.0.0.1", log_format="json") as server:
         (folder / "nginx.conf").write_text(sample(folder, server.url.removeprefix("http://"), port, certificate, key))
         nginx = subprocess.Popen([NGINX, "-c", str(folder / "nginx.conf"), "-p", str(folder), "-e", str(folder / "error.log")])
         try:
-            deadline = time.monotonic() + PATIENCE_S
-            while True:
-                try:
+
+            def listens() -> bool:
+                with suppress(OSError):
                     socket.create_connection(("127.0.0.1", port), timeout=5).close()
-                    break
-                except OSError:
-                    assert nginx.poll() is None and time.monotonic() < deadline, (folder / "error.log").read_text()
-                    time.sleep(0.05)
-            database = connect(Settings(data=server.data).sqlalchemy_url)
-            made = keys.create(database, NewKey(project="larch", name="test", scope=Scope.WRITE))
-            database.close()
-            yield Proxied(server, port, tls, made)
+                    return True
+                assert nginx.poll() is None, (folder / "error.log").read_text()
+                return False
+
+            until(listens, "nginx does not listen")
+            yield Proxied(server, port, tls, server.key(scope=Scope.WRITE))
         finally:
             nginx.terminate()
             nginx.wait()
@@ -118,28 +108,20 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
 
 def logged(server: Server, path: str) -> list[str]:
     """Addresses of the clients that asked for a path, as the log has them."""
-    lines = [json.loads(line) for line in server.log.read_text().splitlines() if line.startswith("{")]
-    return [line["client"] for line in lines if line.get("event") == "request" and line.get("path") == path]
+    return [line["client"] for line in server.lines() if line.get("event") == "request" and line.get("path") == path]
 
 
-def test_pages_pass_and_metrics_do_not(proxied: Proxied):
+def test_pages_pass_metrics_do_not_and_a_client_cannot_say_where_it_comes_from(proxied: Proxied):
     with proxied.client() as client:
         assert "Content-Security-Policy" in client.get("/").raise_for_status().headers
         assert client.get("/static/base.css").status_code == 200
         assert client.get("/metrics").status_code == 404
     with proxied.server.client() as beside:
         assert beside.get("/metrics").status_code == 200
-
-
-def test_a_client_cannot_say_where_it_comes_from(proxied: Proxied):
     forged = {"X-Forwarded-For": "10.9.8.7", "X-Real-IP": "10.9.8.7", "Forwarded": "for=10.9.8.7"}
     with proxied.client() as client:
         client.get("/v1/captures/cap_0123456789abcdefghjk", headers=forged)
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := logged(proxied.server, "/v1/captures/cap_0123456789abcdefghjk")):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    assert found == ["127.0.0.1"]
+    assert until(lambda: logged(proxied.server, "/v1/captures/cap_0123456789abcdefghjk")) == ["127.0.0.1"]
 
 
 def test_a_header_that_never_ends_is_cut(proxied: Proxied):

@@ -24,14 +24,10 @@ paths = st.lists(parts, min_size=1, max_size=MAX_DEPTH).map("/".join)
 
 
 @given(paths)
-def test_a_good_path_stays_below_its_folder(path):
+def test_a_good_path_stays_below_its_folder_and_is_the_same_in_every_case_and_form(path):
     check_path(path)
     assert os.path.normpath(os.path.join("/folder", path)) == f"/folder/{path}"
     assert folders_of(path) == [path[:at] for at, character in enumerate(path) if character == "/"]
-
-
-@given(paths)
-def test_folding_tells_the_same_of_every_case_and_form(path):
     for other in (path.upper(), path.lower(), path.swapcase()):
         if other.casefold() == path.casefold():
             assert folded(other) == folded(path)

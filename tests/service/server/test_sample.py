@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from service.server.base.settings import Settings
-from service.server.database import jobs
+from service.server.database import intakes, jobs
 from service.server.database.engine import connect
 from service.server.database.keys import DEFAULT_PROJECT
 from service.server.jobs.queue import JobQueue, prepare
@@ -46,4 +46,7 @@ def test_the_results_of_the_demo_are_those_of_jobs_that_have_succeeded(tmp_path,
         stored = {file.name: storage.open(prefix, file.name).read_text() for file in storage.files(prefix)}
         assert stored == {path.name: f"{folder} {path.name}" for path in made[("demo", "capture", "maps").index(folder)]}
     assert "pages    http://x/" in capsys.readouterr().out
+    for _ in range(2):  # without results, too, it is registered once
+        show_sample("http://x", database, JobQueue(database), storage, SAMPLE, None)
+    assert len(intakes.latest(database, DEFAULT_PROJECT, "cap", limit=9)) == 1
     database.close()

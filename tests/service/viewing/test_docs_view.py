@@ -47,6 +47,7 @@ def test_every_option_is_described(relit):
     assert len(options) > 4 and {option for option in options if f"`{option}" not in TEXT} == set()
 
 
+@pytest.mark.long
 def test_the_sizes_of_the_format_are_those_of_the_code(written):
     facts = written[0]
     assert facts["relight"]["directions"] == [64, 32] and facts["layers"][0]["levels"][0]["tile"] == 256

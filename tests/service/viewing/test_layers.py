@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from kernels.status import Status
+from service.requests.captures import ViewRequest
+from service.viewing.view_files import view
 from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
@@ -26,9 +28,6 @@ class Shown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory) -> Shown:
-    from service.requests.captures import ViewRequest
-    from service.viewing.view_files import view
-
     folder = tmp_path_factory.mktemp("view")
     mask = np.ones((ROWS, COLS), dtype=bool)
     mask[:, :LEFT] = False
@@ -54,7 +53,7 @@ def shown(tmp_path_factory) -> Shown:
     return Shown(maps, exr.read(folder / "maps.exr")[0], View(folder / "out"))
 
 
-def test_tiles_of_level_0_hold_the_values_of_the_file(shown):
+def test_tiles_of_level_0_hold_the_values_of_the_file_and_every_code_has_a_name(shown):
     names = [layer["name"] for layer in shown.view.facts["layers"]]
     assert names == ["normal", "roughness", "height", "part", "status", "mask"]  # as a person looks at them
     for layer in shown.view.facts["layers"]:
@@ -62,26 +61,24 @@ def test_tiles_of_level_0_hold_the_values_of_the_file(shown):
         image = shown.view.image(layer["name"])
         assert image.dtype == stored.dtype == layer["dtype"]
         assert np.array_equal(image, stored)
+    codes = shown.view.facts["codes"]
+    assert {int(code): found["name"] for code, found in codes.items()} == {int(status): status.name.lower() for status in Status}
+    assert all(found["meaning"].endswith(".") for found in codes.values())
+    assert [code for code, found in codes.items() if found["estimate"]] == ["1", "8", "9", "12", "13", "14", "15"]
 
 
-def test_levels_halve_until_one_tile_holds_them(shown):
+def test_levels_halve_until_one_tile_holds_them_and_have_the_means_of_the_solved_pixels(shown):
     for layer in shown.view.facts["layers"]:
         assert [(level["rows"], level["cols"]) for level in layer["levels"]] == [(299, 513), (150, 257), (75, 129)]
         assert all(np.isfinite(shown.view.image(layer["name"], level)).all() for level in range(3))
-
-
-def test_a_value_of_a_lower_level_is_the_mean_of_the_solved_pixels(shown):
+    length = np.linalg.norm(shown.view.image("normal", 2), axis=0)
+    solved = np.arange(length.shape[1]) > LEFT // 4
+    assert np.allclose(length[:, solved], 1, atol=1e-6) and (length[:, : LEFT // 4] == 0).all()
     full, mask, half = shown.view.image("height")[0].astype(float), shown.maps.mask, shown.view.image("height", 1)[0]
     for row, col in ((0, 20), (0, 21), (UNSURE[0] // 2, UNSURE[1] // 2), (149, 256), (60, 99)):
         block = slice(2 * row, 2 * row + 2), slice(2 * col, 2 * col + 2)
         assert half[row, col] == pytest.approx(full[block][mask[block]].mean(), rel=1e-6)  # float32 rounding
     assert (half[:, : LEFT // 2] == 0).all()
-
-
-def test_normals_of_lower_levels_are_unit_vectors(shown):
-    length = np.linalg.norm(shown.view.image("normal", 2), axis=0)
-    solved = np.arange(length.shape[1]) > LEFT // 4
-    assert np.allclose(length[:, solved], 1, atol=1e-6) and (length[:, : LEFT // 4] == 0).all()
 
 
 @pytest.mark.parametrize("level", [1, 2])
@@ -110,10 +107,3 @@ def test_ranges_and_histograms_count_the_solved_pixels(shown):
     status = shown.view.layer("status")
     assert status["range"] == [Status.UNSOLVED, Status.OK, Status.DARK, Status.UNSURE]
     assert status["histogram"]["counts"][0][Status.OK] == len(solved) and sum(status["histogram"]["counts"][0]) == len(solved) + 2
-
-
-def test_every_code_has_a_name_and_what_it_means(shown):
-    codes = shown.view.facts["codes"]
-    assert {int(code): found["name"] for code, found in codes.items()} == {int(status): status.name.lower() for status in Status}
-    assert all(found["meaning"].endswith(".") for found in codes.values())
-    assert [code for code, found in codes.items() if found["estimate"]] == ["1", "8", "9", "12", "13", "14", "15"]

@@ -53,15 +53,12 @@ def test_points_are_those_of_the_cloud_and_then_the_unsure_ones(folder):
     assert found.facts["layers"][0]["name"] == "depth"
 
 
-def test_every_second_pixel_of_a_large_depth(folder, monkeypatch):
+def test_every_second_pixel_of_a_large_depth_and_grey_without_the_cloud(folder, monkeypatch):
     monkeypatch.setattr(points, "MOST_POINTS", 15000)
     found = show(folder)
     maps = DepthMaps.read(folder / "maps" / "depth.exr")
     assert found.facts["points"]["step"] == 2 and found.facts["points"]["count"] <= 15000
     assert np.array_equal(arrays(found)[2][: found.facts["points"]["count"]], maps.depth[::2, ::2][maps.mask[::2, ::2]])
-
-
-def test_without_the_cloud_the_amplitude_gives_grey(folder):
     (folder / "alone").mkdir()
     (folder / "alone" / "depth.exr").write_bytes((folder / "maps" / "depth.exr").read_bytes())
     colours = arrays(show(folder, "alone"))[1]

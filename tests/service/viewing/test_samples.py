@@ -37,7 +37,7 @@ def shown(tmp_path_factory) -> tuple[View, np.ndarray]:
     return show(folder), directions
 
 
-def test_measured_readings_are_those_of_the_images(shown):
+def test_measured_readings_are_those_of_the_images_and_lights_behind_are_told(shown):
     found, directions = shown
     facts = found.facts["samples"]
     assert (facts["rows"], facts["cols"], facts["step"], facts["lights"], facts["scale"]) == (24, 24, 1, 48, 1)
@@ -45,6 +45,10 @@ def test_measured_readings_are_those_of_the_images(shown):
     for light in (0, 17, 47):
         wanted = 2.0 * reflect(SURFACE.normal, directions[light]) * SURFACE.mask[..., None]
         np.testing.assert_allclose(measured[:, :, light], wanted, rtol=2 * HALF_ROUNDING, atol=1e-7)  # half in the stack and here
+    cosine = SURFACE.normal @ directions.T
+    clear = SURFACE.mask[..., None] & (np.abs(cosine) > 1e-3)
+    assert np.array_equal((found.samples("used") & BACKLIT != 0)[clear], (cosine < 0)[clear])
+    assert {name["name"] for name in found.facts["samples"]["codes"].values()} == {"saturated", "shadowed", "backlit"}
 
 
 def test_the_model_is_the_material_of_the_maps_under_the_lights(shown):
@@ -59,20 +63,8 @@ def test_the_model_is_the_material_of_the_maps_under_the_lights(shown):
     assert seen.mean() > 0.5
     np.testing.assert_allclose(found.samples("model")[mask][seen], wanted[seen], rtol=6 * HALF_ROUNDING, atol=2e-5)
     assert (found.samples("model")[~mask] == 0).all()
-
-
-def test_measured_and_model_agree_where_the_maps_are_right(shown):
-    found, _ = shown
-    seen = (found.samples("used") == 0) & SURFACE.mask[..., None]
-    np.testing.assert_allclose(found.samples("model")[seen], found.samples("measured")[seen], rtol=6 * HALF_ROUNDING, atol=2e-5)
-
-
-def test_lights_behind_the_surface_are_told(shown):
-    found, directions = shown
-    cosine = SURFACE.normal @ directions.T
-    clear = SURFACE.mask[..., None] & (np.abs(cosine) > 1e-3)
-    assert np.array_equal((found.samples("used") & BACKLIT != 0)[clear], (cosine < 0)[clear])
-    assert {name["name"] for name in found.facts["samples"]["codes"].values()} == {"saturated", "shadowed", "backlit"}
+    agree = (found.samples("used") == 0) & mask[..., None]
+    np.testing.assert_allclose(found.samples("model")[agree], found.samples("measured")[agree], rtol=6 * HALF_ROUNDING, atol=2e-5)
 
 
 def test_near_lights_are_where_they_are(tmp_path):
@@ -90,6 +82,7 @@ def test_near_lights_are_where_they_are(tmp_path):
     np.testing.assert_allclose(found.samples("model")[seen], wanted[seen], rtol=8 * HALF_ROUNDING, atol=1e-5)
 
 
+@pytest.mark.long
 def test_refined_intensities_of_the_solve_light_the_model(tmp_path):
     write_dome(tmp_path / "cap", SURFACE, lights=12)
     write_maps(tmp_path / "maps", SURFACE)
@@ -108,6 +101,7 @@ def test_refined_intensities_of_the_solve_light_the_model(tmp_path):
         show(tmp_path)
 
 
+@pytest.mark.long
 def test_every_second_pixel_of_a_large_image(tmp_path, monkeypatch):
     write_dome(tmp_path / "cap", SURFACE, lights=8)
     write_maps(tmp_path / "maps", SURFACE)
@@ -138,16 +132,13 @@ def test_saturated_readings_are_told_and_bright_ones_fit(tmp_path):
     assert frame["mean"] == pytest.approx(scene.images[2][scene.mask].mean(axis=0), rel=1e-5)
 
 
-def test_maps_of_other_images_give_no_samples(tmp_path):
+def test_maps_of_other_images_give_no_samples_and_other_lights_no_model(tmp_path):
     write_dome(tmp_path / "cap", SURFACE, lights=8)
     write_maps(tmp_path / "maps", SURFACE, provenance={"relit:inputs": "another", HASHING: str(LAYOUT)})
     found = show(tmp_path)
     assert found.facts["samples"] is None
     assert any("was solved from other images than the capture has" in finding for finding in found.facts["findings"])
-
-
-def test_lights_that_the_model_does_not_have(tmp_path):
-    """A gradient among the lights: what was measured is shown, without a model and without live relighting."""
+    tmp_path = tmp_path / "gradient"  # among the lights
     write_dome(tmp_path / "cap", SURFACE, lights=5)
     write_maps(tmp_path / "maps", SURFACE)
     edit_frame(tmp_path / "cap", 0, light={"type": "gradient", "axis": "full"})

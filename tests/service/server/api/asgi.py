@@ -1,14 +1,25 @@
 """An app asked without a server: paths are sent as they are, and the client can leave when a test wants it to."""
 
 import asyncio
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from functools import wraps
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
+from fastapi import FastAPI
+
+from service.server.api.app import create_app
+from service.server.base.settings import Settings
+from service.server.database.engine import connect
+from service.server.jobs.queue import prepare
+
 
 class Call:
-    """One request, and what came of it so far."""
+    """One request, and what came of it so far; with `sent` None its body does not come."""
 
-    def __init__(self, app: Any, path: str, *, method: str = "GET", headers: dict[str, str] | None = None, sent: bytes = b"") -> None:
+    def __init__(self, app: Any, path: str, *, method: str = "GET", headers: dict[str, str] | None = None,
+                 sent: bytes | None = b"") -> None:
         self._app, self.status, self.body, self._sent = app, 0, b"", sent
         self._left = asyncio.Event()
         self._asked = False
@@ -29,7 +40,7 @@ class Call:
         return self
 
     async def _receive(self) -> dict[str, Any]:
-        if not self._asked:
+        if not self._asked and self._sent is not None:
             self._asked = True
             return {"type": "http.request", "body": self._sent, "more_body": False}
         await self._left.wait()
@@ -40,3 +51,23 @@ class Call:
             self.status = message["status"]
         else:
             self.body += message.get("body", b"")
+
+
+@contextmanager
+def app_of(settings: Settings) -> Iterator[FastAPI]:
+    """The app over a database of its own, in this process and without workers."""
+    database = connect(settings.sqlalchemy_url)
+    prepare(settings, database)
+    try:
+        yield create_app(settings, database)
+    finally:
+        database.close()
+
+
+def asynchronous(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    """Run a test that is a coroutine."""
+    @wraps(test)
+    def run(**fixtures: object) -> None:
+        asyncio.run(asyncio.wait_for(test(**fixtures), 120))
+
+    return run

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.server.api.job_calls import finish, submit
+from tests.service.server.api.job_calls import admitted, finish, submit
 from tests.service.server.api.tus import Tus
 from tests.service.server_process import Server, serving
 
@@ -20,8 +20,7 @@ PEAK_BYTES = 1 << 30
 def server(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("server")
     with serving(folder, "--anonymous", "--device", "cpu", sabotage="long",
-                 roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")]), requests_per_second="10000", request_burst="10000",
-                 min_free_bytes="0") as running:
+                 roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")])) as running:
         yield running
 
 
@@ -33,14 +32,6 @@ def registered(server: Server):
     return folder
 
 
-def register(server: Server, client, name: str) -> str:
-    """A capture of the samples, registered and ready."""
-    made = client.post("/v1/captures", json={"name": name, "folder": str(SAMPLES / name)}).raise_for_status().json()
-    found = server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))
-    assert found["state"] == "ready", found["problem"]
-    return found["id"]
-
-
 @pytest.fixture(scope="session")
 def client(server: Server):
     with server.client() as made:
@@ -50,26 +41,25 @@ def client(server: Server):
 @pytest.fixture(scope="session")
 def owl(server: Server, client):
     """The sample capture, registered and ready."""
-    return register(server, client, "owl")
+    return admitted(server, client, SAMPLES / "owl")["id"]
 
 
 @pytest.fixture(scope="session")
 def dome(server: Server, client):
     """A small capture whose light directions and shape are known."""
-    return register(server, client, "lambert")
+    return admitted(server, client, SAMPLES / "lambert")["id"]
 
 
 @pytest.fixture(scope="session")
 def rig(server: Server, client):
     """A capture of projected patterns."""
-    return register(server, client, "rig")
+    return admitted(server, client, SAMPLES / "rig")["id"]
 
 
 @pytest.fixture(scope="session")
 def sky(server: Server, client):
     """An environment, registered and ready."""
-    made = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl" / "environment.exr")}).raise_for_status().json()
-    return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
+    return admitted(server, client, SAMPLES / "owl" / "environment.exr", kind="environments")["id"]
 
 
 @pytest.fixture(scope="session")
@@ -93,6 +83,24 @@ def tus(server: Server) -> Tus:
 @pytest.fixture
 def capture(client) -> str:
     return f"/v1/captures/{client.post('/v1/captures', json={'name': 'uploads'}).raise_for_status().json()['id']}"
+
+
+@pytest.fixture(scope="session")
+def keyed(tmp_path_factory: pytest.TempPathFactory):
+    """A server that asks for keys and has no worker, so that jobs stay as they were handed in."""
+    folder = tmp_path_factory.mktemp("keyed")
+    (folder / "of-willow" / "owl").mkdir(parents=True)
+    quotas = {"quota-larch": "max_project_captures=2", "quota-willow": "max_project_captures=3", "oak": "max_project_bytes=100",
+              "elm": "max_project_jobs=1"}
+    with serving(folder, "--device", "none", host="0.0.0.0", roots=str(SAMPLES), project_roots=f"willow={folder / 'of-willow'}",
+                 project_quotas=",".join(f"{project}:{quota}" for project, quota in quotas.items())) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def keyed_database(keyed: Server):
+    with keyed.database() as made:
+        yield made
 
 
 @pytest.fixture(scope="module")

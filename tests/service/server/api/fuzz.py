@@ -1,22 +1,18 @@
 """schemathesis against a server that holds one of everything: requests made of the OpenAPI document, good, bad, and in sequences."""
 
-import os
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
-from service.requests.jobs import RelightJob, SolveJob
+from service.requests.base.identifiers import ENVIRONMENT
+from service.requests.jobs import RelightJob
 from service.requests.keys import NewKey, Scope
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys, tables
-from service.server.database.engine import Database, connect
-from service.server.jobs.queue import JobQueue
-from service.server.storage import layout
-from tests.service.server_process import Server
+from tests.service.server.house import PROJECT, House
+from tests.service.server_process import Server, environment_with
 
-PROJECT = "fuzz"
 SEED = "7"
 CONFIG = """
 request-timeout = 20.0
@@ -56,25 +52,21 @@ checks.positive_data_acceptance.expected-statuses = ["204", "400", "401", "403",
 
 def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
     """A key, and captures, environments and jobs in several states; no worker is needed."""
-    database = connect(settings.sqlalchemy_url)
-    queue = JobQueue(database)
-    key = keys.create(database, NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN))
-    captures = [_intake(database, CAPTURE, ready=state) for state in (True, True, False)]
-    environments = [_intake(database, ENVIRONMENT, ready=state) for state in (True, False)]
-    solve = SolveJob(kind="solve", capture=captures[0])
+    house = House(settings.data, database_url=settings.database_url)
+    key = keys.create(house.database, NewKey(project=PROJECT, name="fuzz", scope=Scope.ADMIN))
+    captures, environments = [house.capture() for _ in range(3)], [house.capture(ENVIRONMENT) for _ in range(2)]
+    for ready in (*captures[:2], environments[0]):
+        house.database.transact(lambda connection, ready=ready: intakes.begin_check(connection, ready))
+        intakes.accept(house.database, ready, {"captures": 1, "frames": 96, "resolution": [320, 320]})
     relight = RelightJob(kind="relight", capture=captures[0], environment=environments[0])
-    made = [database.transact(lambda connection, request=request: queue.submit(
-        connection, project=PROJECT, key=key.partition(".")[0], request=request, chunk_frames=8, inputs=[captures[0]]))
-        for request in (solve, solve, relight, relight)]
-    for job, state in zip(made, (jobs.SUCCEEDED, jobs.FAILED, jobs.CANCELLED, jobs.QUEUED), strict=True):
-        folder = settings.data / layout.results(PROJECT, job)
-        folder.mkdir(parents=True)
-        (folder / "maps.exr").write_bytes(bytes(range(256)) * 40)
-        (folder / "report.json").write_text("{}")
-        _put(database, job, state)
-    database.transact(lambda connection: connection.execute(tables.workers.insert().values(  # one that is seen for the whole run
+    states = {jobs.SUCCEEDED: None, jobs.FAILED: None, jobs.CANCELLED: relight, jobs.QUEUED: relight}
+    made = [house.job(state, inputs=(captures[0],), request=request) for state, request in states.items()]
+    for job in made:
+        (house.results(job) / "maps.exr").write_bytes(bytes(range(256)) * 40)
+        (house.results(job) / "report.json").write_text("{}")
+    house.database.transact(lambda connection: connection.execute(tables.workers.insert().values(  # one that is seen for the whole run
         id="fuzz", host="fuzz", pid=1, device="cpu", started_at=time.time(), seen_at=time.time() + 86_400, state="ready")))
-    database.close()
+    house.database.close()
     return key, {"captures": captures, "environments": environments, "jobs": made}
 
 
@@ -84,29 +76,12 @@ def fuzz(server: Server, key: str, known: dict[str, list[str]], folder: Path, *,
     config = folder / "schemathesis.toml"
     config.write_text(CONFIG.format(**{name: str(values).replace("'", '"') for name, values in known.items()}))
     limits = ["--seed", SEED] if max_time_s is None else ["--max-time", str(max_time_s)]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
     return subprocess.run(
         [sys.executable, __file__, "--config-file", str(config), "run", f"{server.url}/v1/openapi.json",
          "--header", f"Authorization: Bearer {key}", "--phases", phases, "--max-examples", str(examples),
          "--checks", "all", "--continue-on-failure", "--no-color", "--warnings", "off", *limits,
          *(["--exclude-operation-id-regex", exclude] if exclude else [])],
-        cwd=folder, env=environment, capture_output=True, text=True)
-
-
-def _intake(database: Database, kind: str, *, ready: bool) -> str:
-    identifier = new_id(kind)
-    database.transact(lambda connection: intakes.insert(
-        connection, identifier=identifier, project=PROJECT, kind=kind, name="owl", folder=None))
-    if ready:
-        database.transact(lambda connection: intakes.begin_check(connection, identifier))
-        intakes.accept(database, identifier, {"captures": 1, "frames": 96, "resolution": [320, 320]})
-    return identifier
-
-
-def _put(database: Database, job: str, state: str) -> None:
-    ended = time.time() if state in jobs.ENDED else None
-    database.transact(lambda connection: connection.execute(tables.jobs.update().where(tables.jobs.c.id == job).values(
-        state=state, finished_at=ended, error="it is so" if state == jobs.FAILED else None)))
+        cwd=folder, env=environment_with(), capture_output=True, text=True)
 
 
 if __name__ == "__main__":  # the program of schemathesis, which also sends parts of files

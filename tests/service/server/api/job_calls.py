@@ -1,14 +1,16 @@
 """Jobs through the API, as tests ask for them and wait for them."""
 
-import time
+from pathlib import Path
 
 import httpx2
 
 from service.requests.base.identifiers import new_id
+from service.server.database import intakes, jobs
+from service.server.database.engine import Database
 from tests.service.server_process import Server
+from tests.service.waiting import until
 
 ENDED = ("succeeded", "failed", "cancelled")
-WAIT_S = 120.0
 NOBODY = new_id("job")
 
 
@@ -20,7 +22,7 @@ def submit(client: httpx2.Client, **request) -> dict:
 
 
 def finish(server: Server, client: httpx2.Client, job: dict, state: str = "succeeded") -> dict:
-    done = server.wait(client, f"/v1/jobs/{job['id']}", ENDED)
+    done = server.wait(client, f"/v1/jobs/{job['id']}", ENDED, timeout_s=300)
     assert done["state"] == state, done
     return done
 
@@ -37,7 +39,23 @@ def refused(response: httpx2.Response, status: int, words: str) -> None:
 
 def has_made(client: httpx2.Client, job: dict, count: int) -> None:
     """Wait until a job has made some frames."""
-    deadline = time.monotonic() + WAIT_S
-    while len(made_by(client, job)) < count:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    until(lambda: len(made_by(client, job)) >= count, f"{count} frames")
+
+
+def admitted(server: Server, client: httpx2.Client, folder: Path, state: str = "ready", *, kind: str = "captures") -> dict:
+    """Register a folder, or the file of an environment, and return it as it is when it was checked."""
+    where = {"captures": "folder", "environments": "file"}[kind]
+    made = client.post(f"/v1/{kind}", json={"name": folder.name, where: str(folder)}).raise_for_status().json()
+    found = server.wait(client, f"/v1/{kind}/{made['id']}", ("ready", "refused"))
+    assert found["state"] == state, found
+    return found
+
+
+def accepted(database: Database, client: httpx2.Client, project: str, folder: Path) -> str:
+    """Register a capture, and let it be ready, though there is no worker that would check it."""
+    made = client.post("/v1/captures", json={"name": folder.name, "folder": str(folder)}).raise_for_status().json()["id"]
+    intakes.accept(database, made, {"captures": 1})
+    for job in jobs.latest(database, project, limit=500):
+        if job["request"].get("intake") == made:
+            database.transact(lambda connection, job=job["id"]: jobs.cancel(connection, job))
+    return made

@@ -9,12 +9,12 @@ import httpx2
 import pytest
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, UPLOAD, new_id
-from service.requests.keys import NewKey, Scope
-from service.server.base.settings import Settings
-from service.server.database import intakes, keys
-from service.server.database.engine import Database, connect
+from service.requests.keys import Scope
+from service.server.database import keys
+from service.server.database.engine import Database
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server_process import Server, serving
+from tests.service.server.api.job_calls import accepted
+from tests.service.server_process import Server
 
 OPEN = {("get", "/healthz"), ("get", "/readyz")}
 """Need no key; nor does OPTIONS, which says what tus can do here."""
@@ -26,40 +26,30 @@ SECRET_NAME = "nightingale"
 
 
 class Site(NamedTuple):
-    """A server with keys, and two projects; the first has a capture, an environment, an upload and a job with a result."""
+    """A server with keys, and what its first project has: a capture, an environment, an upload and a job with a result."""
 
     server: Server
     database: Database
     ours: dict[str, str]
 
-    def key(self, project: str, scope: Scope) -> str:
-        return keys.create(self.database, NewKey(project=project, name="test", scope=scope))
-
     def client(self, project: str, scope: Scope = Scope.ADMIN) -> httpx2.Client:
-        return self.server.client(self.key(project, scope))
+        return self.server.client(self.server.key(project, scope))
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("access")
-    (folder / "of-willow" / "owl").mkdir(parents=True)
-    with serving(folder, "--device", "none", host="0.0.0.0", roots=str(SAMPLES), project_roots=f"willow={folder / 'of-willow'}",
-                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as server:
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        made = Site(server, database, {})
-        with made.client("larch") as client:
-            capture = client.post("/v1/captures", json={"name": SECRET_NAME, "folder": str(SAMPLES / "owl")}).json()["id"]
-            sky = client.post("/v1/environments", json={"name": SECRET_NAME}).json()["id"]
-            files = client.post(f"/v1/environments/{sky}/files", headers={
-                **TUS, "Upload-Length": "5", "Upload-Metadata": "path c2t5LmV4cg=="}).raise_for_status()
-            intakes.accept(database, capture, {"captures": 1})  # there is no worker that would
-            job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "name": SECRET_NAME}).raise_for_status().json()["id"]
-        results = server.data / "projects/larch/jobs" / job
-        results.mkdir(parents=True)
-        (results / "maps.exr").write_bytes(b"maps")
-        made.ours.update(capture=capture, environment=sky, upload=files.headers["Location"].rpartition("/")[2], job=job, name="maps.exr")
-        yield made
-        database.close()
+def site(keyed, keyed_database):
+    made = Site(keyed, keyed_database, {})
+    with made.client("larch") as client:
+        capture = accepted(keyed_database, client, "larch", SAMPLES / "owl")
+        sky = client.post("/v1/environments", json={"name": SECRET_NAME}).json()["id"]
+        files = client.post(f"/v1/environments/{sky}/files", headers={
+            **TUS, "Upload-Length": "5", "Upload-Metadata": "path c2t5LmV4cg=="}).raise_for_status()
+        job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "name": SECRET_NAME}).raise_for_status().json()["id"]
+    results = keyed.data / "projects/larch/jobs" / job
+    results.mkdir(parents=True)
+    (results / "maps.exr").write_bytes(b"maps")
+    made.ours.update(capture=capture, environment=sky, upload=files.headers["Location"].rpartition("/")[2], job=job, name="maps.exr")
+    return made
 
 
 def operations(site: Site) -> list[tuple[str, str]]:
@@ -104,10 +94,10 @@ def test_every_route_but_those_of_health_asks_for_a_key(site):
                 assert problem(response)["type"] == "urn:relit:problem:unauthenticated"
 
 
-def test_what_is_no_key_of_ours_is_refused(site):
-    good = site.key("larch", Scope.READ)
+def test_what_is_no_key_of_ours_or_revoked_is_refused(site):
+    good = site.server.key("larch", Scope.READ)
     identifier, _, secret = good.partition(".")
-    other = site.key("larch", Scope.READ)
+    other = site.server.key("larch", Scope.READ)
     with site.server.client() as client:
         assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {good}"}).status_code == 200
         for given in ("x", identifier, f"{identifier}.", f"{identifier}.{secret[:-1]}", f"{identifier}.{secret}x",
@@ -116,10 +106,7 @@ def test_what_is_no_key_of_ours_is_refused(site):
             assert response.status_code == 401, given
         assert client.get("/v1/jobs", headers={"Authorization": f"Basic {good}"}).status_code == 401
         assert client.get("/v1/jobs", params={"key": good}).status_code in (401, 422)
-
-
-def test_a_revoked_key_is_refused_at_once(site):
-    key = site.key("larch", Scope.ADMIN)
+    key = site.server.key("larch", Scope.ADMIN)
     with site.server.client(key) as client:
         assert client.get("/v1/jobs").status_code == 200
         assert keys.revoke(site.database, key.partition(".")[0])
@@ -127,12 +114,19 @@ def test_a_revoked_key_is_refused_at_once(site):
         assert not keys.revoke(site.database, key.partition(".")[0])
 
 
-def test_only_a_hash_of_a_key_is_kept(site):
-    identifier, _, secret = site.key("larch", Scope.READ).partition(".")
+def test_only_a_hash_of_a_key_is_kept_and_the_numbers_name_no_project(site):
+    identifier, _, secret = site.server.key("larch", Scope.READ).partition(".")
     kept = b"".join(path.read_bytes() for path in site.server.data.glob("relit.sqlite*"))
     assert identifier.encode() in kept and hashlib.sha256(secret.encode()).hexdigest().encode() in kept
     assert secret.encode() not in kept
     assert secret not in site.server.log.read_text()
+    with site.client("larch") as client:
+        client.get(f"/v1/jobs/{site.ours['job']}")
+        client.get(f"/v1/{SECRET_NAME}")
+        text = client.get("/metrics").text
+    assert 'route="/v1/jobs/{job}"' in text
+    for word in ("larch", "willow", SECRET_NAME, *(value for name, value in site.ours.items() if name != "name"), "key_"):
+        assert word not in text
 
 
 def test_a_key_that_reads_changes_nothing(site):
@@ -193,7 +187,7 @@ def in_general(response: httpx2.Response, names: dict[str, str]) -> dict:
     return json.loads(text) | {"request_id": ""}
 
 
-def test_a_project_lists_and_names_nothing_of_another(site):
+def test_a_project_lists_names_and_registers_nothing_of_another(site):
     with site.client("willow") as client:
         for path in ("/v1/captures", "/v1/environments", "/v1/jobs"):
             assert next(value for value in client.get(path).raise_for_status().json().values() if isinstance(value, list)) == []
@@ -203,9 +197,6 @@ def test_a_project_lists_and_names_nothing_of_another(site):
             nothing = client.get(f"/v1/{path}", params={"before": absent})
             assert theirs.status_code == nothing.status_code and theirs.status_code in (404, 422)
             assert in_general(theirs, {"it": site.ours[name]}) == in_general(nothing, {"it": absent})
-
-
-def test_a_project_registers_below_its_own_roots_alone(site):
     given = {"name": "owl", "folder": str(site.server.data.parent / "of-willow" / "owl")}
     with site.client("larch") as larch, site.client("willow") as willow:
         refused = larch.post("/v1/captures", json=given)
@@ -227,30 +218,16 @@ def test_a_job_cannot_read_what_is_anothers(site, job):
     assert in_general(theirs, {name: site.ours[name] for name in made}) == in_general(nothing, made)
 
 
-def test_the_same_token_of_two_projects_is_two_requests(site):
-    made = []
-    for project in ("larch", "willow", "willow"):
-        with site.client(project) as client:
-            made.append(client.post("/v1/captures", json={"name": "x"}, headers={"Idempotency-Key": "once"}).json()["id"])
-    assert made[0] != made[1] == made[2]
-
-
-def test_the_numbers_name_no_project_and_no_identifier(site):
-    with site.client("larch") as client:
-        client.get(f"/v1/jobs/{site.ours['job']}")
-        client.get(f"/v1/{SECRET_NAME}")
-        text = client.get("/metrics").text
-    assert 'route="/v1/jobs/{job}"' in text
-    for word in ("larch", "willow", SECRET_NAME, *(value for name, value in site.ours.items() if name != "name"), "key_"):
-        assert word not in text
-
-
-@pytest.mark.long
-def test_a_service_without_keys_answers_this_machine(server, client):
+def test_a_service_without_keys_answers_this_machine_and_no_form_of_another_site(server, client):
     port = server.url.rpartition(":")[2]
     for host in ("localhost", f"localhost:{port}", "127.0.0.1", "127.5.0.1:80", f"[::1]:{port}"):
         assert client.get("/v1/jobs", headers={"Host": host}).status_code == 200, host
     assert client.get("/v1/jobs", headers={"Origin": server.url}).status_code == 200
+    assert client.get("/v1/jobs", headers={"Authorization": "Bearer key_x.y"}).status_code == 401  # a wrong key is no anonymous request
+    # content types that a browser sends across sites without asking
+    for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
+        refused = client.post("/v1/captures", content=b'{"name": "x"}', headers={"Content-Type": kind})
+        assert refused.status_code in (415, 422), kind
 
 
 @pytest.mark.parametrize("headers", [
@@ -266,15 +243,3 @@ def test_a_service_without_keys_refuses_proxies_and_pages_of_other_sites(client,
     made = client.post("/v1/captures", json={"name": "x"}, headers=headers)
     assert made.status_code == 403
     assert client.get("/healthz", headers=headers).status_code == 200
-
-
-def test_a_key_is_looked_at_where_none_is_needed(client):
-    """A wrong key is refused, and no anonymous request."""
-    assert client.get("/v1/jobs", headers={"Authorization": "Bearer key_x.y"}).status_code == 401
-
-
-def test_what_a_form_of_another_site_can_send_is_no_json(client):
-    """Content types that a browser sends across sites without asking."""
-    for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
-        refused = client.post("/v1/captures", content=b'{"name": "x"}', headers={"Content-Type": kind})
-        assert refused.status_code in (415, 422), kind

@@ -1,7 +1,6 @@
 """Boards as jobs: captures are the tiles of an uploaded folder, and a board is compared with the result of another job."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from service.requests.base.identifiers import new_id
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.test_measuring import files_of, upload
 
 OTHER = new_id("job")
 
@@ -23,9 +22,10 @@ def tile(tmp_path_factory) -> dict[str, bytes]:
     write_patterns(folder / "tile", make_scene(sphere=False), patterns, noise=0.002)
     board = {"schema": "relit.board-scan/1", "name": "plane", "tiles": [{"path": "tile", "position_m": [0, 0]}]}
     (folder / "board.json").write_text(json.dumps(board))
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return files_of(folder)
 
 
+@pytest.mark.long
 def test_a_board_is_compared_with_the_result_of_a_job(server, client, tile):
     """The same images pass against themselves but for what has no depth."""
     board = upload(server, client, tile)
@@ -57,7 +57,7 @@ def study(*results: str, operators: int = 1) -> dict:
 
 
 @pytest.mark.long
-def test_inspections_of_regions_are_studied(server, client, tile):
+def test_inspections_of_regions_are_studied_and_boards_that_cannot_be_are_refused(server, client, tile, tmp_path):
     """Two inspections of the same images: what repeats to the last bit has no repeatability to speak of."""
     board = upload(server, client, tile)
     golden = submit(client, kind="inspect-board", capture=board["id"])
@@ -86,6 +86,13 @@ def test_inspections_of_regions_are_studied(server, client, tile):
     beyond = submit(client, kind="inspect-board", capture=board["id"], golden=golden["id"], regions=unfit, options=options)
     error = finish(server, client, beyond, "failed")["error"]
     assert "left lies beyond the height map" in error and str(server.data) not in error
+    away = upload(server, client, tile | {"board.json": tile["board.json"].replace(b'"tile"', b'"../tile"')}, "refused")
+    assert "leads out of the folder of the file" in away["problem"]
+    empty = upload(server, client, {"board.json": tile["board.json"]}, "refused")
+    assert "tile/capture.json is no file" in empty["problem"] and str(server.data) not in empty["problem"]
+    write_depth(tmp_path / "depth.exr", np.zeros((20, 20)))
+    depth = upload(server, client, tile | {"tile/depth.exr": (tmp_path / "depth.exr").read_bytes()}, "refused")
+    assert "the service takes captures as tiles" in depth["problem"]
 
 
 def test_studies_that_cannot_be(client):
@@ -96,14 +103,3 @@ def test_studies_that_cannot_be(client):
     refused(ask(kind="gauge-board", study=study(NOBODY)), 422, "runs")
     refused(ask(kind="gauge-board", study=study(NOBODY, OTHER)), 404, f"study.runs[0].result: {NOBODY} is not in this project")
     refused(ask(kind="inspect-board", capture=f"cap_{'0' * 20}", regions=REGIONS), 422, "regions are given without golden")
-
-
-@pytest.mark.long
-def test_boards_that_cannot_be(server, client, tile, tmp_path: Path):
-    away = upload(server, client, tile | {"board.json": tile["board.json"].replace(b'"tile"', b'"../tile"')}, "refused")
-    assert "leads out of the folder of the file" in away["problem"]
-    empty = upload(server, client, {"board.json": tile["board.json"]}, "refused")
-    assert "tile/capture.json is no file" in empty["problem"] and str(server.data) not in empty["problem"]
-    write_depth(tmp_path / "depth.exr", np.zeros((20, 20)))
-    depth = upload(server, client, tile | {"tile/depth.exr": (tmp_path / "depth.exr").read_bytes()}, "refused")
-    assert "the service takes captures as tiles" in depth["problem"]

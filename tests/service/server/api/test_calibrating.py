@@ -13,16 +13,7 @@ from service.calibrate.procam import procam
 from service.calibrate.response import response
 from service.calibrate.tof import calibrate_tof
 from service.calibrate.white_balance import white_balance
-from service.requests.calibrate import (
-    DarkRequest,
-    FlatFieldRequest,
-    LaserPlanesRequest,
-    ProcamRequest,
-    ResponseRequest,
-    SaturationRequest,
-    TofCalibrationRequest,
-    WhiteBalanceRequest,
-)
+from service.requests import calibrate as requests
 from tests.reference import tof
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
 from tests.service.calibrate.solvers import test_procam as boards
@@ -31,8 +22,8 @@ from tests.service.calibrate.test_laser_planes import boards as laser_boards
 from tests.service.calibrate.test_procam import write_view
 from tests.service.depth.tof.test_tof import pulsed_frames
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import finish, made_by, refused, submit
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
+from tests.service.server.api.test_measuring import files_of, upload
 
 LEVELS = np.linspace(0, 1, 5)
 BOARD = {"board": "9x6", "square_m": 0.03, "projector": "256x192"}
@@ -40,8 +31,7 @@ BOARD = {"board": "9x6", "square_m": 0.03, "projector": "256x192"}
 
 def sent(server, client, folder: Path) -> str:
     """The identifier of a folder, uploaded with all its files."""
-    files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-    return upload(server, client, files)["id"]
+    return upload(server, client, files_of(folder))["id"]
 
 
 def compare(client, job: dict, made: Path, names: dict[str, str], places: dict[Path, str]) -> None:
@@ -99,18 +89,19 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
     match kind:
         case "dark":
             fields, files = {"images": darks}, files | {"dark.exr"}
-            dark(DarkRequest(capture=here, images=tuple(here / name for name in darks)))
+            dark(requests.DarkRequest(capture=here, images=tuple(here / name for name in darks)))
         case "flat-field":
             fields, files = {"images": whites, "dark_images": darks[:1]}, files | {"flat.exr"}
-            flat_field(FlatFieldRequest(capture=here, images=tuple(here / name for name in whites), dark_images=(here / darks[0],)))
+            flat_field(requests.FlatFieldRequest(
+                capture=here, images=tuple(here / name for name in whites), dark_images=(here / darks[0],)))
         case "white-balance":
             fields = {"images": whites[:1], "options": {"region": [4, 0, 8, 16]}}
-            white_balance(WhiteBalanceRequest(capture=here, images=(here / whites[0],), region=(4, 0, 8, 16)))
+            white_balance(requests.WhiteBalanceRequest(capture=here, images=(here / whites[0],), region=(4, 0, 8, 16)))
         case "saturation":
-            saturation(SaturationRequest(capture=here, write=True))
+            saturation(requests.SaturationRequest(capture=here, write=True))
         case "response":
             fields = {"images": greys(), "options": {"levels": LEVELS.tolist()}}
-            response(ResponseRequest(capture=here, images=tuple(map(Path, greys(here))), levels=tuple(LEVELS.tolist())))
+            response(requests.ResponseRequest(capture=here, images=tuple(map(Path, greys(here))), levels=tuple(LEVELS.tolist())))
     job = submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
     finish(server, client, job)
     compare(client, job, here, {name: name for name in files}, {here: uploaded})
@@ -120,7 +111,7 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
 def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate((1.0, 8.0))]
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
-    calibrate_tof(TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
+    calibrate_tof(requests.TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
     job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
     finish(server, client, job)
     compare(client, job, tmp_path, {"tof.json": "camera.json"}, {})
@@ -142,6 +133,15 @@ def test_a_sweep_of_another_capture(server, client, tmp_path, away):
     assert "sweep: '../sweep.json' leads out" in finish(server, client, away_too, "failed")["error"]
 
 
+def calibrated(client, job: dict, ids: list[str], folders: list[Path]) -> dict:
+    """Compare the manifests of a job with those that the command wrote into folders, and return what was measured."""
+    assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
+    for identifier, folder in zip(ids, folders, strict=True):
+        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
+        same(found, json.loads((folder / "capture.json").read_text()))
+    return client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()
+
+
 @pytest.mark.long
 def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
     ids, folders = [], []
@@ -149,20 +149,14 @@ def test_a_rig_from_registered_poses(server, client, registered, tmp_path):
         folder = registered / f"pose{number}"
         write_view(folder, pose)
         folders.append(Path(shutil.copytree(folder, tmp_path / folder.name)))
-        made = client.post("/v1/captures", json={"name": folder.name, "folder": str(folder)}).raise_for_status().json()
-        ids.append(server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["id"])
+        ids.append(admitted(server, client, folder)["id"])
     before = {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
     job = submit(client, kind="calibrate-procam", captures=ids[:3], apply_to=ids[3:], options=BOARD)
     request = client.get(f"/v1/jobs/{job['id']}").json()["request"]
     assert request["options"]["board"] == [9, 6] and request["captures"] == ids[:3]
     finish(server, client, job)
-    procam(ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
-    assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
-    for identifier, folder in zip(ids, folders, strict=True):
-        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
-        same(found, json.loads((folder / "capture.json").read_text()))
-        assert found["name"] == folder.name and found["projector"]["resolution"] == [256, 192]
-    report = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["procam"]
+    procam(requests.ProcamRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **BOARD))
+    report = calibrated(client, job, ids, folders)["procam"]
     assert report["captures"] == [view["view"] for view in report["views"]] == ids[:3]
     assert report["options"]["apply_to"] == ids[3:]
     assert before == {path: path.read_bytes() for path in registered.glob("pose*/*.json")}
@@ -177,12 +171,8 @@ def test_the_planes_of_a_laser(server, client, tmp_path):
     board = {"board": "x".join(map(str, boards.BOARD)), "square_m": boards.SQUARE}
     job = submit(client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board)
     finish(server, client, job)
-    laser_planes(LaserPlanesRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **board))
-    assert made_by(client, job) == {"calibration.json", *(f"{identifier}.capture.json" for identifier in ids)}
-    for identifier, folder in zip(ids, folders, strict=True):
-        found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
-        same(found, json.loads((folder / "capture.json").read_text()))
-    report = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["laser-planes"]
+    laser_planes(requests.LaserPlanesRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **board))
+    report = calibrated(client, job, ids, folders)["laser-planes"]
     assert [board["capture"] for board in report["boards"]] == ids[:3]
 
 
@@ -191,25 +181,20 @@ def test_the_planes_of_a_laser(server, client, tmp_path):
     ({"kind": "calibrate-dark", "images": ["a\0b"]}, "images"),
     ({"kind": "calibrate-response", "images": ["a.exr", "b.exr"]}, "images"),
     ({"kind": "calibrate-response", "images": greys(), "options": {"levels": [0, 2]}}, "levels"),
-])
-def test_requests_that_are_refused(client, uploaded, fields, words):
-    answer = client.post("/v1/jobs", json={"capture": uploaded, **fields})
-    refused(answer, 422, "")
-    assert words in answer.text
-
-
-@pytest.mark.parametrize(("fields", "words"), [
     ({"captures": []}, "captures"), ({"captures": ["cap_x"]}, "captures"), ({"captures": None}, "captures"),
     ({"options": {"square_m": 0.03}}, "board"), ({"options": {"board": [9], "square_m": 0.03}}, "board"),
     ({"options": {"board": "9", "square_m": 0.03}}, "board"), ({"options": {"board": "9x6", "square_m": 75}}, "square"),
 ])
-def test_boards_that_are_refused(client, uploaded, fields, words):
-    answer = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [uploaded], "options": BOARD} | fields)
+def test_requests_that_are_refused(client, fields, words):
+    some = f"cap_{'0' * 20}"
+    good = {"capture": some} if "kind" in fields else {"kind": "calibrate-procam", "captures": [some], "options": BOARD}
+    answer = client.post("/v1/jobs", json=good | fields)
     refused(answer, 422, "")
     assert words in answer.text
 
 
-def test_images_that_are_not_there(server, client, uploaded):
+@pytest.mark.long
+def test_images_or_a_ball_that_are_not_there(server, client, uploaded, dome):
     for kind, names in (("dark", ["none.exr"]), ("dark", ["../x.exr"]), ("flat-field", ["/etc/passwd"])):
         error = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, images=names), "failed")["error"]
         assert error.startswith(f"images: {names[0]!r} ") and str(server.data) not in error
@@ -217,6 +202,10 @@ def test_images_that_are_not_there(server, client, uploaded):
     assert "--levels: has 2 values, there are 5 images" in finish(server, client, job, "failed")["error"]
     missing = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [f"cap_{'0' * 20}"], "options": BOARD})
     refused(missing, 404, "captures: cap_00000000000000000000 is not in this project")
+    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
+    assert "ball" in finish(server, client, job, "failed")["error"]
+    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
+    assert "leads out of the capture's folder" in finish(server, client, job, "failed")["error"]
 
 
 @pytest.mark.long
@@ -228,11 +217,3 @@ def test_the_brightness_of_lights(server, client, dome):
     assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
     assert str(server.data) not in json.dumps(measured) and str(SAMPLES) not in json.dumps(measured)
     assert measured["options"]["capture"] == measured["capture"] == dome
-
-
-@pytest.mark.long
-def test_a_ball_that_is_not_given(server, client, dome):
-    job = submit(client, kind="calibrate-mirror-ball", capture=dome)
-    assert "ball" in finish(server, client, job, "failed")["error"]
-    job = submit(client, kind="calibrate-grey-ball", capture=dome, masks=["../../x.png"])
-    assert "leads out of the capture's folder" in finish(server, client, job, "failed")["error"]

@@ -8,10 +8,8 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from service.requests.base.identifiers import new_id
-from service.server.base.settings import Settings
 from service.server.database import jobs
-from service.server.database.engine import connect
+from tests.service.server.api.job_calls import NOBODY, refused, submit
 from tests.service.server.api.test_watch import queue
 from tests.service.server_process import serving
 
@@ -86,32 +84,26 @@ def test_a_job_that_is_cancelled_and_resumed_is_told(server, client, dome, sky):
 def test_all_jobs_of_a_project_are_watched_at_once(server, client, dome):
     with client.stream("GET", "/v1/events") as response:
         found = told(response.iter_lines())
-        made = [client.post("/v1/jobs", json={"kind": "solve", "capture": dome, "options": {"method": "lambert"}}).json()["id"]
-                for _ in range(3)]
-        ended: set[str] = set()
+        left = {submit(client, kind="solve", capture=dome, options={"method": "lambert"})["id"] for _ in range(3)}
         deadline = time.monotonic() + WAIT_S
-        while ended < set(made):
+        while left:
             event = next(found)
             if event.get("event") == "job" and event["data"]["state"] == "succeeded":
-                ended.add(event["data"]["id"])
+                left.discard(event["data"]["id"])
             assert time.monotonic() < deadline
 
 
-def test_a_stream_that_cannot_be_is_refused(client, dome):
-    nobody = new_id("job")
-    response = client.get(f"/v1/jobs/{nobody}/events")
-    assert (response.status_code, response.headers["Content-Type"]) == (404, "application/problem+json")
-    job = client.post("/v1/jobs", json={"kind": "solve", "capture": dome, "options": {"method": "lambert"}}).json()["id"]
-    response = client.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "now"})
+def test_a_stream_that_cannot_be_is_refused(client, solved):
+    refused(client.get(f"/v1/jobs/{NOBODY}/events"), 404, NOBODY)
+    response = client.get(f"/v1/jobs/{solved}/events", headers={"Last-Event-ID": "now"})
     assert (response.status_code, response.json()["errors"][0]["field"]) == (422, "header.Last-Event-ID")
 
 
 @pytest.mark.long
 def test_streams_end_with_the_service(tmp_path: Path):
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        job = queue(database, "default")
-        database.close()
+    with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
+        with server.database() as database:
+            job = queue(database, "default")
         with (client.stream("GET", f"/v1/jobs/{job}/events") as one, client.stream("GET", "/v1/events") as whole):
             found = told(one.iter_lines()), told(whole.iter_lines())
             assert [next(stream)["data"]["id"] for stream in found] == [job, job]
@@ -122,16 +114,12 @@ def test_streams_end_with_the_service(tmp_path: Path):
 
 @pytest.mark.long
 def test_streams_stay_open_while_postgresql_restarts(tmp_path: Path, server_postgres):
-    url = server_postgres.new_database()
-    with (serving(tmp_path, "--anonymous", "--device", "none", database_url=url, min_free_bytes="0") as server,
-          server.client() as client):
-        database = connect(Settings(data=server.data, database_url=url).sqlalchemy_url)
+    with (serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server,
+          server.client() as client, server.database() as database):
         job = queue(database, "default")
         with client.stream("GET", f"/v1/jobs/{job}/events") as response:
             found = told(response.iter_lines())
             assert next(found)["data"]["state"] == "queued"
             server_postgres.restart("immediate", away_s=1.0)
             database.transact(lambda connection: jobs.cancel(connection, job), patience_s=WAIT_S)
-            rest = [event for event in found if "comment" not in event]
-        assert [event["data"]["state"] for event in rest] == ["cancelled"]
-        database.close()
+            assert [event["data"]["state"] for event in found if "comment" not in event] == ["cancelled"]

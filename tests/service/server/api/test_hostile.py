@@ -27,9 +27,7 @@ from tests.service.server.api.captures import (
     write_image,
 )
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.tus import Tus
-
-TOF = {"type": "cw", "modulation_hz": 3e7, "reference_phase_rad": 0.0}
+from tests.service.server.api.job_calls import admitted, finish, submit
 
 pytestmark = pytest.mark.usefixtures("worker_lives")
 
@@ -46,20 +44,16 @@ def named(name: str) -> Callable[[Path], None]:
     return edited(frames=[{"image": name, "light": {"type": "full"}}])
 
 
-def replaced(name: str, content: bytes) -> Callable[[Path], None]:
+def replaced(name: str, content: bytes, **entry: object) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
-        named(name)(folder)
+        edited(frames=[{"image": name, **(entry or {"light": {"type": "full"}})}])(folder)
         (folder / name).write_bytes(content)
 
     return change
 
 
-def timed(name: str, content: bytes) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        edited(frames=[{"image": name, "tof": TOF}])(folder)
-        (folder / name).write_bytes(content)
-
-    return change
+def timed(content: bytes) -> Callable[[Path], None]:
+    return replaced("a.npy", content, tof={"type": "cw", "modulation_hz": 3e7, "reference_phase_rad": 0.0})
 
 
 def linked(name: str, to: Path | str) -> Callable[[Path], None]:
@@ -121,12 +115,12 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "camera": (edited(camera=manifest([], side=HUGE)["camera"]), f"camera.resolution: {HUGE}x{HUGE}"),
     "text": (replaced("a.exr", b"no image"), "a.exr: is not an OpenEXR file"),
     "suffix": (replaced("a.svg", b"<svg/>"), "a.svg: has an unknown suffix"),
-    "pickle": (timed("a.npy", lying_npy("(8, 8)", "|O", pickle.dumps([1]))), "a.npy: is not an array of real numbers"),
-    "shape": (timed("a.npy", lying_npy("(99999999, 99999999)")), "a.npy: has 99999999x99999999 pixels"),
-    "bins": (timed("a.npy", lying_npy("(8, 8, 9999999999999)")), "a.npy: is not a whole .npy array"),
-    "empty type": (timed("a.npy", lying_npy("(8, 8, 9999999999999)", "|V0")), "a.npy: is not an array of real numbers"),
-    "negative": (timed("a.npy", lying_npy("(-8, 8)")), "a.npy: has the shape"),
-    "shape code": (timed("a.npy", lying_npy("__import__('os')")), "a.npy: is not a .npy array"),
+    "pickle": (timed(lying_npy("(8, 8)", "|O", pickle.dumps([1]))), "a.npy: is not an array of real numbers"),
+    "shape": (timed(lying_npy("(99999999, 99999999)")), "a.npy: has 99999999x99999999 pixels"),
+    "bins": (timed(lying_npy("(8, 8, 9999999999999)")), "a.npy: is not a whole .npy array"),
+    "empty type": (timed(lying_npy("(8, 8, 9999999999999)", "|V0")), "a.npy: is not an array of real numbers"),
+    "negative": (timed(lying_npy("(-8, 8)")), "a.npy: has the shape"),
+    "shape code": (timed(lying_npy("__import__('os')")), "a.npy: is not a .npy array"),
     "unknown": (edited(colour="red"), "capture.json: colour: is not a known key"),
     "nested": (text('{"schema":' + "[" * 200_000 + "]" * 200_000 + "}"), "capture.json: is nested too deeply"),
     "long": (text(" " * (MAX_MANIFEST_BYTES + 1)), f"capture.json: has {MAX_MANIFEST_BYTES + 1} bytes"),
@@ -168,24 +162,15 @@ def test_hostile_environments_are_refused_by_name(server, client, registered):
     hostile = {"big.exr": (lying_exr(2 * HUGE, HUGE), "big.exr: "), "a.txt": (b"text", "a.txt: an environment is a lat-long"),
                "cut.exr": ((SAMPLES / "owl/environment.exr").read_bytes()[:-9], "cut.exr: is truncated"),
                "square.exr": ((SAMPLES / "owl/000.exr").read_bytes(), "square.exr: is 320x320")}
-    made = {}
-    for name, (content, _) in hostile.items():
+    for name, (content, sentence) in hostile.items():
         (folder / name).write_bytes(content)
-        made[name] = client.post("/v1/environments", json={"name": "x", "file": str(folder / name)}).raise_for_status().json()["id"]
-    for name, (_, sentence) in hostile.items():
-        found = server.wait(client, f"/v1/environments/{made[name]}", ("ready", "refused"))
-        assert (found["state"], sentence in found["problem"]) == ("refused", True), found["problem"]
-
-
-def solve(client, capture: str) -> str:
-    asked = {"kind": "solve", "capture": capture, "options": {"method": "lambert"}}
-    return client.post("/v1/jobs", json=asked).raise_for_status().json()["id"]
+        assert sentence in admitted(server, client, folder / name, "refused", kind="environments")["problem"]
 
 
 @pytest.mark.long
-def test_fuzzed_images_through_uploads(server, client, tmp_path):
+def test_fuzzed_images_through_uploads(server, client, tus, tmp_path):
     """A quarter is cut short, which the check always sees; of the others it lets through what only decoding tells."""
-    source, tus = write_capture(tmp_path / "source"), Tus(server.url)
+    source = write_capture(tmp_path / "source")
     good = (source / "001.exr").read_bytes()
     made = []
     for seed in range(16):
@@ -207,22 +192,20 @@ def test_fuzzed_images_through_uploads(server, client, tmp_path):
             assert "001.exr" in found["problem"], found["problem"]
         else:
             assert seed % 4, "a file that is cut short was taken for whole"
-            solves.append(solve(client, capture.rpartition("/")[2]))
+            solves.append(submit(client, kind="solve", capture=capture.rpartition("/")[2], options={"method": "lambert"}))
     for job in solves:
-        ended = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
+        ended = server.wait(client, f"/v1/jobs/{job['id']}", ("succeeded", "failed"))
         assert ended["error"] is None or "001.exr" in ended["error"], ended["error"]
 
 
 @pytest.mark.long
 def test_a_registered_capture_that_changed_is_not_read(server, client, registered):
     folder = write_capture(registered / "changing")
-    capture = client.post("/v1/captures", json={"name": "changing", "folder": str(folder)}).raise_for_status().json()["id"]
-    assert server.wait(client, f"/v1/captures/{capture}", ("ready", "refused"))["state"] == "ready"
+    capture = admitted(server, client, folder)["id"]
 
     def solve_error() -> str:
-        ended = server.wait(client, f"/v1/jobs/{solve(client, capture)}", ("succeeded", "failed"))
-        assert ended["state"] == "failed"
-        return ended["error"]
+        job = submit(client, kind="solve", capture=capture, options={"method": "lambert"})
+        return finish(server, client, job, "failed")["error"]
 
     shutil.copy(folder / "001.exr", registered / "elsewhere.exr")
     linked("001.exr", registered / "elsewhere.exr")(folder)

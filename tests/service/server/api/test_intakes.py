@@ -11,11 +11,10 @@ from service.server.database.engine import connect
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
 from tests.service.server.api.captures import write_capture
-from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.job_calls import finish, submit
+from tests.service.server.api.job_calls import admitted, finish, submit
 
 
-def test_a_capture_is_created_looked_at_and_deleted(client):
+def test_captures_are_created_looked_at_deleted_and_listed_in_pages(client):
     answer = client.post("/v1/captures", json={"name": "new"})
     made = answer.json()
     assert (answer.status_code, answer.headers["location"]) == (201, f"/v1/captures/{made['id']}")
@@ -24,39 +23,43 @@ def test_a_capture_is_created_looked_at_and_deleted(client):
     assert client.delete(f"/v1/captures/{made['id']}").status_code == 204
     assert client.get(f"/v1/captures/{made['id']}").status_code == 404
     assert client.delete(f"/v1/captures/{made['id']}").status_code == 404
+    made = [client.post("/v1/captures", json={"name": f"page {number}"}).json()["id"] for number in range(3)]
+    first = client.get("/v1/captures", params={"limit": 2}).json()
+    second = client.get("/v1/captures", params={"limit": 2, "before": first["next"]}).json()
+    assert [item["id"] for item in first["items"] + second["items"]][:3] == made[::-1]
+    assert all(item["id"].startswith("env_") for item in client.get("/v1/environments").json()["items"])
 
 
 def test_a_registered_capture_is_checked_at_once_and_stays_where_it_lies(server, client, registered):
     folder = write_capture(registered / "kept")
-    asked = {"name": "kept", "folder": str(folder)}
-    made = client.post("/v1/captures", json=asked, headers={"Idempotency-Key": "kept"}).json()
-    again = client.post("/v1/captures", json=asked, headers={"Idempotency-Key": "kept"}).json()
-    assert again["id"] == made["id"]
-    ready = server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))
+    ready = admitted(server, client, folder)
     assert ready["facts"] == {"captures": 1, "frames": 4, "resolution": [8, 8], "color_space": "lin_rec709_scene", "name": "small"}
-    assert client.post(f"/v1/captures/{made['id']}/validate").status_code == 409
-    assert client.delete(f"/v1/captures/{made['id']}").status_code == 204
+    assert client.post(f"/v1/captures/{ready['id']}/validate").status_code == 409
+    assert client.delete(f"/v1/captures/{ready['id']}").status_code == 204
     assert (folder / "capture.json").is_file()
+    for step in ("step1", "step2"):
+        write_capture(registered / "sequence" / step)
+    facts = admitted(server, client, registered / "sequence")["facts"]
+    assert (facts["captures"], facts["frames"]) == (2, 8)
 
 
 @pytest.mark.long
-def test_a_registered_capture_that_was_mended_is_checked_again(server, client, registered):
+def test_a_registered_capture_is_checked_again_when_mended_and_not_deleted_while_a_job_reads_it(server, client, registered, sky):
     folder = write_capture(registered / "mended")
     kept = (folder / "001.exr").read_bytes()
     (folder / "001.exr").unlink()
-    made = client.post("/v1/captures", json={"name": "mended", "folder": str(folder)}).json()["id"]
-    assert "001.exr is not in the folder" in server.wait(client, f"/v1/captures/{made}", ("ready", "refused"))["problem"]
+    made = admitted(server, client, folder, "refused")
+    assert "001.exr is not in the folder" in made["problem"]
     (folder / "001.exr").write_bytes(kept)
-    client.post(f"/v1/captures/{made}/validate").raise_for_status()
-    assert server.wait(client, f"/v1/captures/{made}", ("ready", "refused"))["state"] == "ready"
-
-
-def test_a_sequence_of_captures_is_one(server, client, registered):
-    for step in ("step1", "step2"):
-        write_capture(registered / "sequence" / step)
-    made = client.post("/v1/captures", json={"name": "sequence", "folder": str(registered / "sequence")}).json()["id"]
-    ready = server.wait(client, f"/v1/captures/{made}", ("ready", "refused"))
-    assert (ready["facts"]["captures"], ready["facts"]["frames"]) == (2, 8)
+    client.post(f"/v1/captures/{made['id']}/validate").raise_for_status()
+    assert server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["state"] == "ready"
+    made = admitted(server, client, write_capture(registered / "read"))["id"]
+    job = submit(client, kind="relight", capture=made, environment=sky, priority=0, options={"frames": "1-300"})["id"]
+    refused = client.delete(f"/v1/captures/{made}")
+    assert (refused.status_code, job in refused.json()["detail"]) == (409, True)
+    client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
+    server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
+    assert client.delete(f"/v1/captures/{made}").status_code == 204
 
 
 @pytest.mark.long
@@ -65,30 +68,6 @@ def test_what_has_no_file_is_refused(server, client, kind):
     made = client.post(f"/v1/{kind}", json={"name": "empty"}).json()["id"]
     client.post(f"/v1/{kind}/{made}/validate").raise_for_status()
     assert server.wait(client, f"/v1/{kind}/{made}", ("ready", "refused"))["state"] == "refused"
-
-
-def test_captures_are_listed_in_pages(client):
-    made = [client.post("/v1/captures", json={"name": f"page {number}"}).json()["id"] for number in range(3)]
-    first = client.get("/v1/captures", params={"limit": 2}).json()
-    second = client.get("/v1/captures", params={"limit": 2, "before": first["next"]}).json()
-    assert [item["id"] for item in first["items"] + second["items"]][:3] == made[::-1]
-    assert all(item["id"].startswith("env_") for item in client.get("/v1/environments").json()["items"])
-
-
-@pytest.mark.long
-def test_a_capture_that_a_job_reads_is_not_deleted(server, client, registered):
-    folder = write_capture(registered / "read")
-    made = client.post("/v1/captures", json={"name": "read", "folder": str(folder)}).json()["id"]
-    sky = client.post("/v1/environments", json={"name": "sky", "file": str(SAMPLES / "owl/environment.exr")}).json()["id"]
-    server.wait(client, f"/v1/captures/{made}", ("ready",))
-    server.wait(client, f"/v1/environments/{sky}", ("ready",))
-    job = client.post("/v1/jobs", json={"kind": "relight", "capture": made, "environment": sky, "priority": 0,
-                                        "options": {"frames": "1-300"}}).raise_for_status().json()["id"]
-    refused = client.delete(f"/v1/captures/{made}")
-    assert (refused.status_code, job in refused.json()["detail"]) == (409, True)
-    client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
-    server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
-    assert client.delete(f"/v1/captures/{made}").status_code == 204
 
 
 def test_a_check_begins_again_by_another_validation_alone(server, client):
@@ -130,9 +109,8 @@ def test_a_check_that_ends_unseen_leaves_nothing_waiting(tmp_path, end):
 
 
 @pytest.mark.parametrize(("kind", "more"), [
-    ("solve", {}), ("depth", {}), ("scan", {"options": {"near_m": 1}}), ("basis", {}), ("inspect-board", {}),
-    ("calibrate-saturation", {}),
-])
+    ("solve", {}), *(pytest.param(kind, more, marks=pytest.mark.long) for kind, more in (
+        ("depth", {}), ("scan", {"options": {"near_m": 1}}), ("basis", {}), ("inspect-board", {}), ("calibrate-saturation", {})))])
 def test_a_job_whose_registered_capture_is_gone_does_not_say_where_it_was(server, client, gone, kind, more):
     job = submit(client, kind=kind, capture=gone[0], **more)
     error = finish(server, client, job, "failed")["error"]
@@ -145,7 +123,6 @@ def test_a_job_whose_registered_capture_is_gone_does_not_say_where_it_was(server
 def gone(server, client, registered):
     """A capture that was registered and checked, whose folder was deleted since, and its folder."""
     folder = write_capture(registered / "gone")
-    made = client.post("/v1/captures", json={"name": "gone", "folder": str(folder)}).raise_for_status().json()
-    assert server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["state"] == "ready"
+    made = admitted(server, client, folder)["id"]
     shutil.rmtree(folder)
-    return made["id"], folder
+    return made, folder

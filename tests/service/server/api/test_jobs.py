@@ -19,16 +19,13 @@ def test_a_pipeline_solves_exports_and_relights(server, client, dome, sky):
     assert made_by(client, job) == {"maps.exr", "report.json", "asset.usdz", "frame.0001.exr", "frame.0002.exr", "frame.0003.exr"}
 
 
-def test_a_solve(server, client, dome, solved):
+def test_a_solve_and_an_export_that_brings_lights_along(server, client, dome, solved, sky):
     job = client.get(f"/v1/jobs/{solved}").json()
     assert job["request"]["options"] == {"align": False, "align_to": None, "crop": None, "clip_negative": False, "method": "lambert",
                                          "lights": "declared", "intensities": "chosen", "max_sigma": None, "least_confidence": None}
     assert made_by(client, job) == {"maps.exr", "report.json"}
     report = client.get(f"/v1/jobs/{solved}/results/report.json").raise_for_status().json()
     assert report["method"] == "lambert"
-
-
-def test_an_export_brings_lights_along(server, client, dome, sky, solved):
     exported = submit(client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky)
     finish(server, client, exported)
     lights = {"asset_lights/rig.usda", "asset_lights/environment.usda", "asset_lights/environment.exr"}
@@ -38,7 +35,7 @@ def test_an_export_brings_lights_along(server, client, dome, sky, solved):
 
 
 @pytest.mark.long
-def test_a_depth(server, client, rig):
+def test_a_depth_and_views_of_it_of_maps_and_of_a_capture_alone(server, client, rig, dome, solved):
     job = submit(client, kind="depth", capture=rig, options={"normals": True, "max_residual_px": 2.5}, name="the rig")
     assert (job["request"]["name"], job["request"]["options"]["max_residual_px"]) == ("the rig", 2.5)
     finish(server, client, job)
@@ -47,37 +44,13 @@ def test_a_depth(server, client, rig):
     finish(server, client, exported)
     layers = {f"asset_layers/{name}" for name in ("payload.usda", "geometry.usdc", "materials.usda")}
     assert made_by(client, exported) == {"asset.usdc", *layers, "asset_textures/base_color.png"}
-
-
-@pytest.mark.long
-def test_a_relight_guided_by_maps_and_lit_by_keys(server, client, dome, solved):
-    keys = {"schema": "relit.keys/1", "lights": [{"name": "sun", "keys": [
-        {"frame": 3, "direction": [0, 0, 1], "irradiance": [1, 1, 1]}, {"frame": 5, "direction": [0.5, 0, 1], "irradiance": [2, 1, 1]}]}]}
-    job = submit(client, kind="relight", capture=dome, keys=keys, maps=solved, options={"frames": "3-5", "exposure": 1, "aov": ["beauty"]})
-    finish(server, client, job)
-    assert made_by(client, job) == {"keys.json", "frame.0003.exr", "frame.0004.exr", "frame.0005.exr"}
-
-
-@pytest.mark.long
-def test_a_shade_under_near_lights(server, client, solved, sky):
-    lamp = {"position_m": [0, 0, 300], "intensity": [1e5, 1e5, 1e5]}
-    for light in (lamp, "0,0,300,1e5,1e5,1e5"):
-        job = submit(client, kind="shade", maps=solved, environment=sky, options={"light": [light], "turn_degrees": 90})
-        finish(server, client, job)
-        assert made_by(client, job) == {"picture.exr"}
-
-
-@pytest.mark.long
-def test_a_view_of_maps_of_a_depth_and_of_a_capture_alone(server, client, dome, solved, rig):
-    depth = submit(client, kind="depth", capture=rig)
-    finish(server, client, depth)
     shown = {}
     for name, request in {"maps": {"capture": dome, "maps": solved, "options": {"terms": 4}},
-                          "depth": {"capture": rig, "maps": depth["id"]}, "capture": {"capture": dome}}.items():
-        job = submit(client, kind="view", **request)
-        finish(server, client, job)
-        assert made_by(client, job) == {"view.json", "view.bin", "thumbnails.jpg"}
-        results = f"/v1/jobs/{job['id']}/results"
+                          "depth": {"capture": rig, "maps": job["id"]}, "capture": {"capture": dome}}.items():
+        view = submit(client, kind="view", **request)
+        finish(server, client, view)
+        assert made_by(client, view) == {"view.json", "view.bin", "thumbnails.jpg"}
+        results = f"/v1/jobs/{view['id']}/results"
         shown[name] = client.get(f"{results}/view.json").raise_for_status().json()
         for offset, length in [place for layer in shown[name]["layers"] for place in layer["levels"][0]["tiles"]]:
             tile = client.get(f"{results}/view.bin", headers={"Range": f"bytes={offset}-{offset + length - 1}"})
@@ -87,18 +60,29 @@ def test_a_view_of_maps_of_a_depth_and_of_a_capture_alone(server, client, dome, 
     assert shown["depth"]["layers"][0]["name"] == "depth" and shown["depth"]["relight"] is None
 
 
+@pytest.mark.long
+def test_a_relight_guided_by_maps_and_lit_by_keys_and_a_shade_under_near_lights(server, client, dome, solved, sky):
+    keys = {"schema": "relit.keys/1", "lights": [{"name": "sun", "keys": [
+        {"frame": 3, "direction": [0, 0, 1], "irradiance": [1, 1, 1]}, {"frame": 5, "direction": [0.5, 0, 1], "irradiance": [2, 1, 1]}]}]}
+    job = submit(client, kind="relight", capture=dome, keys=keys, maps=solved, options={"frames": "3-5", "exposure": 1, "aov": ["beauty"]})
+    finish(server, client, job)
+    assert made_by(client, job) == {"keys.json", "frame.0003.exr", "frame.0004.exr", "frame.0005.exr"}
+    lamp = {"position_m": [0, 0, 300], "intensity": [1e5, 1e5, 1e5]}
+    for light in (lamp, "0,0,300,1e5,1e5,1e5"):
+        job = submit(client, kind="shade", maps=solved, environment=sky, options={"light": [light], "turn_degrees": 90})
+        finish(server, client, job)
+        assert made_by(client, job) == {"picture.exr"}
+
+
 def test_an_export(server, client, solved):
     job = submit(client, kind="export", maps=solved, format="usda", options={"name": "dome"})
+    gltf = submit(client, kind="export", maps=solved, format="glb")
     finish(server, client, job)
     usda = client.get(f"/v1/jobs/{job['id']}/results/asset.usda").raise_for_status().text
     assert usda.startswith("#usda") and "dome" in usda and "@./asset_layers/payload.usda@" in usda
     assert {"asset.usda", *(f"asset_layers/{name}" for name in ("payload.usda", "materials.usda", "geometry.usdc"))} <= made_by(client, job)
-
-
-def test_an_export_as_gltf(server, client, solved):
-    job = submit(client, kind="export", maps=solved, format="glb")
-    finish(server, client, job)
-    glb = client.get(f"/v1/jobs/{job['id']}/results/asset.glb").raise_for_status()
+    finish(server, client, gltf)
+    glb = client.get(f"/v1/jobs/{gltf['id']}/results/asset.glb").raise_for_status()
     assert glb.content[:4] == b"glTF" and glb.headers["Content-Type"] == "model/gltf-binary"
 
 

@@ -9,7 +9,9 @@ from tests.reference import projector as reference
 from tests.scenes.captures import write_exr, write_manifest
 from tests.scenes.depth import BLACK_WHITE, CENTRE, NORMAL, RADIUS, entry_of, gray_patterns, make_scene, phase_patterns, write_patterns
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.test_measuring import files_of, upload
+
+pytestmark = pytest.mark.long
 
 CAMERA = reference.Device(96, 72, 140.0)
 TILT = 0.6
@@ -35,8 +37,7 @@ def view(tmp_path_factory, server, client) -> dict[str, str]:
     write_manifest(folder / "lights", {"schema": "relit.capture/1", "name": "lights", "camera": camera, "frames": frames})
     jobs = {}
     for name, kind, options in (("lights", "solve", {"method": "lambert"}), ("patterns", "depth", {})):
-        files = {path.name: path.read_bytes() for path in (folder / name).iterdir()}
-        jobs[name] = submit(client, kind=kind, capture=upload(server, client, files)["id"], options=options)
+        jobs[name] = submit(client, kind=kind, capture=upload(server, client, files_of(folder / name))["id"], options=options)
     return {name: finish(server, client, job)["id"] for name, job in jobs.items()}
 
 
@@ -45,7 +46,6 @@ def maps_of(client, job: str, folder) -> SurfaceMaps:
     return SurfaceMaps.read(folder / f"{job}.exr")
 
 
-@pytest.mark.long
 def test_the_joined_maps_lie_where_the_depth_is_and_are_exported(server, client, view, tmp_path):
     job = submit(client, kind="join", maps=view["lights"], depth=view["patterns"])
     finish(server, client, job)

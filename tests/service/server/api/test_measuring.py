@@ -1,31 +1,32 @@
 """Jobs that make no maps: bases, scans and patterns to project."""
 
-import base64
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from service.depth.patterns.projection import make_patterns
 from service.requests.patterns import PatternsRequest
-from tests.service.server.api.job_calls import finish, made_by, refused, submit
-
-TUS = {"Tus-Resumable": "1.0.0"}
+from tests.scenes.captures import files_in
+from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
+from tests.service.server.api.tus import Tus
 
 
 def upload(server, client, files: dict[str, bytes], state: str = "ready") -> dict:
     """A capture of these files, checked."""
-    capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
+    capture, tus = f"/v1/captures/{client.post('/v1/captures', json={'name': 'x'}).raise_for_status().json()['id']}", Tus(server.url)
     for name, content in files.items():
-        place = client.post(f"/v1/captures/{capture}/files", headers={
-            **TUS, "Upload-Length": str(len(content)), "Upload-Metadata": f"path {base64.b64encode(name.encode()).decode()}"})
-        client.patch(place.raise_for_status().headers["Location"], content=content, headers={
-            **TUS, "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"}).raise_for_status()
-    client.post(f"/v1/captures/{capture}/validate").raise_for_status()
-    found = server.wait(client, f"/v1/captures/{capture}", ("ready", "refused"))
+        tus.send(capture, name, content)
+    client.post(f"{capture}/validate").raise_for_status()
+    found = server.wait(client, capture, ("ready", "refused"))
     assert found["state"] == state, found
     return found
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in sorted(files_in(folder))}
 
 
 def scan_files(shots: int = 90) -> dict[str, bytes]:
@@ -44,15 +45,13 @@ def test_a_basis(server, client, dome, options, file):
     assert made_by(client, job) == {file, f"{file}.json"}
 
 
-def test_a_separation(server, client, rig):
+@pytest.mark.long
+def test_a_separation_and_a_scan(server, client, rig):
     job = submit(client, kind="separate", capture=rig, options={"period_px": 16})
     finish(server, client, job)
     assert made_by(client, job) == {"separation.exr", "report.json"}
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert report["options"]["period_px"] == 16 and str(server.data) not in json.dumps(report)
-
-
-def test_a_scan(server, client):
     capture = upload(server, client, scan_files())
     assert capture["facts"]["shots"] == 90
     job = submit(client, kind="scan", capture=capture["id"], options={"near_m": 1})
@@ -74,9 +73,7 @@ def test_scans_that_cannot_be(server, client, registered):
     folder.mkdir()
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    made = client.post("/v1/captures", json={"name": "scan", "folder": str(folder)}).raise_for_status().json()
-    found = server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))
-    assert found["problem"] == "a scan is not registered: upload its folder"
+    assert admitted(server, client, folder, "refused")["problem"] == "a scan is not registered: upload its folder"
 
 
 def test_patterns_are_those_of_the_command(server, client, tmp_path):
@@ -86,11 +83,8 @@ def test_patterns_are_those_of_the_command(server, client, tmp_path):
     assert made_by(client, job) == {path.name for path in tmp_path.iterdir()}
     for path in tmp_path.glob("*.png"):
         assert client.get(f"/v1/jobs/{job['id']}/results/{path.name}").content == path.read_bytes()
-
-
-def test_an_option_of_another_code_is_refused(server, client):
-    job = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "micro_periods": 4})
-    assert "micro_periods" in finish(server, client, job, "failed")["error"].replace(" ", "_")
+    other = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "micro_periods": 4})
+    assert "micro_periods" in finish(server, client, other, "failed")["error"].replace(" ", "_")
 
 
 @pytest.mark.parametrize("request_", [{"kind": "patterns"}, {"kind": "patterns", "options": {"code": "gray", "projector": [0, 4]}},

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePath
 
 import pytest
+from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel, TypeAdapter
 
 from service import __version__
@@ -19,30 +20,29 @@ from service.requests.answers import IntakeView, JobView, ResultView
 from service.requests.base.identifiers import pattern
 from service.requests.depth import DepthRequest
 from service.requests.jobs import UserJob
-from service.server.api.app import create_app
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority
 from service.server.api.problems import KINDS
 from service.server.base.settings import Settings
-from service.server.database.engine import connect
-from service.server.jobs.queue import prepare
+from tests.service.server.api.asgi import app_of
 from tests.service.server.api.fuzz import fuzz, seed
 from tests.service.server_process import serving
 
 LONG_S = int(os.environ.get("FUZZ_SECONDS", "0"))
 FREE = {"get_health", "get_readiness", "abilities"}
 """Operations that need no key."""
-NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000", "min_free_bytes": "0"}
+NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000"}
 
 
 @pytest.fixture(scope="module")
-def document(tmp_path_factory) -> dict:
-    settings = Settings(data=tmp_path_factory.mktemp("data"))
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    made = create_app(settings, database).openapi()
-    database.close()
-    return made
+def app(tmp_path_factory):
+    with app_of(Settings(data=tmp_path_factory.mktemp("data"))) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def document(app) -> dict:
+    return app.openapi()
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_the_document_is_served_and_says_what_it_is_of(server, client, document)
     assert {tag for tags in used for tag in tags} == {tag["name"] for tag in served["tags"]}
 
 
-def test_every_operation_is_described(operations):
+def test_every_operation_is_described_and_its_parameters_say_what_they_may_be(operations):
     for name, operation in operations.items():
         assert re.fullmatch(r"[a-z]+(_[a-z]+)*", name), name
         assert operation["summary"] and not operation["summary"].endswith("."), name
@@ -70,6 +70,13 @@ def test_every_operation_is_described(operations):
         assert len(operation["tags"]) == 1, name
         assert all(response["description"] for response in operation["responses"].values()), name
         assert (operation.get("security", []) != []) == (name not in FREE), name
+    patterns = {kind: pattern(prefix) for kind, prefix in
+                {"capture": "cap", "environment": "env", "job": "job", "upload": "up"}.items()}
+    for name, operation in operations.items():
+        for parameter in operation.get("parameters", []):
+            if parameter["in"] == "path" and parameter["name"] != "name":
+                assert parameter["schema"]["pattern"] == patterns[parameter["name"]], name
+            assert parameter["schema"].get("type") not in (None, "null"), (name, parameter)  # one type, and never null
 
 
 def test_every_refusal_is_a_problem_with_an_example(document, operations):
@@ -94,26 +101,13 @@ def test_every_refusal_is_a_problem_with_an_example(document, operations):
             assert {"404", "422"} <= operation["responses"].keys(), name
 
 
-def test_parameters_say_what_they_may_be(operations):
-    patterns = {kind: pattern(prefix) for kind, prefix in
-                {"capture": "cap", "environment": "env", "job": "job", "upload": "up"}.items()}
-    for name, operation in operations.items():
-        for parameter in operation.get("parameters", []):
-            if parameter["in"] == "path" and parameter["name"] != "name":
-                assert parameter["schema"]["pattern"] == patterns[parameter["name"]], name
-            assert parameter["schema"].get("type") not in (None, "null"), (name, parameter)  # one type, and never null
-
-
-def test_schemas_name_their_fields_and_take_no_others(document):
+def test_schemas_name_their_fields_and_take_no_others_and_the_examples_of_jobs_are_jobs(document):
     schemas = document["components"]["schemas"]
     assert "HTTPValidationError" not in schemas
     for name, schema in schemas.items():
         if name.endswith(("Job", "Options", "Choices", "Light", "Key", "Keys", "Track", "Capture", "Environment", "Priority")):
             assert schema.get("additionalProperties") is False or "enum" in schema, name
     assert schemas["RelightOptions"]["properties"]["frames"]["description"].startswith("A number, or first-last; null:")
-
-
-def test_the_examples_of_jobs_are_jobs():
     adapter = TypeAdapter(UserJob)
     kinds = {adapter.validate_python(example["value"]).kind for example in EXAMPLES.values()}
     assert kinds == {"solve", "depth", "relight", "shade", "export", "view", "pipeline"}
@@ -146,25 +140,16 @@ def paths_in(kind: object) -> set[str]:
             if holds_path(field.annotation)}
 
 
-def test_no_request_of_the_api_has_a_path_of_the_server():
+def test_no_request_or_parameter_of_the_api_has_a_path_of_the_server(app):
     assert paths_in(DepthRequest) == {
         "DepthRequest.beside", "DepthRequest.cache", "DepthRequest.capture", "DepthRequest.out", "TofOptions.calibration"}
     for body in (UserJob, NewCapture, NewEnvironment, Priority):
         assert len(list(models_in(body))) >= 1 and paths_in(body) == set()
-
-
-def test_no_parameter_of_the_api_is_a_path_of_the_server(tmp_path):
-    from fastapi.routing import iter_route_contexts
-
-    settings = Settings(data=tmp_path)
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    routes = [route for route in iter_route_contexts(create_app(settings, database).routes) if route.path.startswith("/v1/")]
+    routes = [route for route in iter_route_contexts(app.routes) if route.path.startswith("/v1/")]
     assert len(routes) > 20
     for route in routes:
         for parameter in inspect.signature(route.endpoint).parameters.values():
             assert not holds_path(parameter.annotation), (route.path, parameter)
-    database.close()
 
 
 def test_methods_that_are_not_there_are_refused_with_those_that_are(client, document):
@@ -187,22 +172,15 @@ def run(folder: Path, *, phases: str, examples: int, exclude: str | None = None,
 
 @pytest.mark.long
 @pytest.mark.skipif(LONG_S > 0, reason="FUZZ_SECONDS asks for the long run")
-def test_schemathesis_finds_nothing_at_the_edges_of_every_value(tmp_path):
-    run(tmp_path, phases="examples,coverage", examples=1, exclude="^(create_job|list_.*)$")  # of these there are thousands: the next test
-
-
-@pytest.mark.long
-@pytest.mark.skipif(LONG_S > 0, reason="FUZZ_SECONDS asks for the long run")
-def test_schemathesis_finds_nothing_in_random_requests_and_sequences(tmp_path):
-    run(tmp_path, phases="fuzzing,stateful", examples=6)
+@pytest.mark.parametrize(("phases", "examples", "exclude"), [
+    ("examples,coverage", 1, "^(create_job|list_.*)$"),  # of these there are thousands at the edges of values: the others are random
+    ("fuzzing,stateful", 6, None)])
+def test_schemathesis_finds_nothing(tmp_path, phases, examples, exclude):
+    run(tmp_path, phases=phases, examples=examples, exclude=exclude)
 
 
 @pytest.mark.long
 @pytest.mark.skipif(LONG_S == 0, reason="set FUZZ_SECONDS to run schemathesis for that long")
-@pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-def test_schemathesis_finds_nothing_for_long(tmp_path, database, request):
-    if database == "sqlite":
-        run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000)
-        return
-    url = request.getfixturevalue("server_postgres").new_database()
-    run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000, database_url=url)
+def test_schemathesis_finds_nothing_for_long(tmp_path, database_url):
+    url = {} if database_url is None else {"database_url": database_url}
+    run(tmp_path, phases="examples,coverage,fuzzing,stateful", examples=1000, **url)

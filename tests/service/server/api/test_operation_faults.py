@@ -1,6 +1,5 @@
 """A service whose database or worker goes and comes back, and which ends when it is asked to."""
 
-import os
 import re
 import signal
 import subprocess
@@ -13,12 +12,11 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from service.server.base.settings import Settings
 from service.server.database import jobs, workers
-from service.server.database.engine import connect
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.test_operations import PATIENCE_S, until
-from tests.service.server_process import Server, serving
+from tests.service.server.api.job_calls import admitted, submit
+from tests.service.server_process import Server, environment_with, serving
+from tests.service.waiting import PATIENCE_S, until
 
 DRAIN_S = 4.0
 """Of the server that is ended while it works; its step takes longer."""
@@ -26,8 +24,8 @@ DRAIN_S = 4.0
 
 @pytest.mark.long
 def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):
-    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database(),
-                 min_free_bytes="0") as server, server.client() as client:
+    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server, \
+            server.client() as client:
         assert client.get("/v1/jobs").status_code == 200
         server_postgres.stop("immediate")
         refused = client.get("/v1/jobs")
@@ -42,12 +40,11 @@ def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):
 
 @pytest.mark.long
 def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+    with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
         assert "no worker" in client.get("/readyz").json()["detail"]
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
         with open(tmp_path / "worker.txt", "w") as errors:
             worker = subprocess.Popen([sys.executable, "-m", "service.cli.main", "worker", "--data", str(server.data), "--device", "cpu"],
-                                      stderr=errors, env=environment)
+                                      stderr=errors, env=environment_with())
         try:
             until(lambda: client.get("/readyz").status_code == 200, "never ready")
         finally:
@@ -60,11 +57,9 @@ def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
 @pytest.fixture
 def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
     """A server whose worker is in a step that takes longer than it may take to drain."""
-    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S), min_free_bytes="0") as server, \
+    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S)) as server, \
             server.client() as client:
-        capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).json()["id"]
-        server.wait(client, f"/v1/captures/{capture}", ("ready",))
-        job = client.post("/v1/jobs", json={"kind": "solve", "capture": capture, "options": {"method": "svbrdf"}}).json()["id"]
+        job = submit(client, kind="solve", capture=admitted(server, client, SAMPLES / "owl")["id"], options={"method": "svbrdf"})["id"]
         server.wait(client, f"/v1/jobs/{job}", ("running",))
         yield server, client, job
 
@@ -95,9 +90,8 @@ def test_the_service_drains_and_ends_clean(busy):
     assert "interrupted" not in text and "Traceback" not in text
     assert server.lines()[-1]["event"] == "service ended"
     assert not list((server.data / "locks").glob("*.lock"))
-    database = connect(Settings(data=server.data).sqlalchemy_url)
-    assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
-    database.close()
+    with server.database() as database:
+        assert jobs.find(database, job)["state"] == "queued" and workers.seen_lately(database) == []
 
 
 @pytest.mark.long

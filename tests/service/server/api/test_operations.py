@@ -3,32 +3,19 @@
 import json
 import shutil
 import socket
-import time
 
 import httpx2
 import pytest
 from fastapi.testclient import TestClient
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.server.api.app import create_app
 from service.server.base import log
 from service.server.base.settings import Settings
-from service.server.database.engine import connect
-from service.server.jobs.queue import prepare
-
-PATIENCE_S = 60.0
+from tests.service.server.api.asgi import app_of
+from tests.service.waiting import until
 
 
-def until(look, what: str):
-    """Look again and again until there is something."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (found := look()):
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-    return found
-
-
-def numbers_of(client: httpx2.Client) -> dict[str, list]:
+def numbers_of(client: httpx2.Client | TestClient) -> dict[str, list]:
     return {family.name: family.samples for family in text_string_to_metric_families(client.get("/metrics").raise_for_status().text)}
 
 
@@ -39,12 +26,8 @@ def number(numbers: dict[str, list], family: str, sample: str | None = None, **l
 
 @pytest.fixture
 def app(tmp_path):
-    """The app over a database of its own, in this process and without workers."""
-    settings = Settings(data=tmp_path / "data", anonymous=True, min_free_bytes=0)
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    yield create_app(settings, database)
-    database.close()
+    with app_of(Settings(data=tmp_path / "data", anonymous=True, min_free_bytes=0)) as made:
+        yield made
 
 
 @pytest.fixture
@@ -104,7 +87,7 @@ def test_requests_are_counted_by_route_and_not_by_path(server, client):
 
 
 @pytest.mark.long
-def test_numbers_of_jobs_workers_and_the_process(server, client, owl, sky):
+def test_numbers_of_jobs_workers_and_the_process_and_the_log_of_a_job(server, client, owl, sky):
     done = client.post("/v1/jobs", json={"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-2"}}).json()
     server.wait(client, f"/v1/jobs/{done['id']}", ("succeeded",))
     numbers = numbers_of(client)
@@ -115,17 +98,19 @@ def test_numbers_of_jobs_workers_and_the_process(server, client, owl, sky):
     assert number(numbers, "relit_database_up") == 1
     assert number(numbers, "relit_storage_free_bytes") > 0 and number(numbers, "process_resident_memory_bytes") > 0
     assert number(numbers, "relit_queue_age_seconds") >= 0
+    job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
+    server.wait(client, f"/v1/jobs/{job}", ("succeeded",))
+    events = until(lambda: [line["event"] for line in server.lines() if line.get("job") == job][2:] and [
+        line["event"] for line in server.lines() if line.get("job") == job], "not logged")
+    assert events[:2] == ["step begins", "step done"]
 
 
-def test_the_queue_ages(inside, app):
-    service = app.state.service
+def test_the_queue_ages(inside):
     assert "relit_queue_age_seconds 0.0" in inside.get("/metrics").text
-    inside.post("/v1/captures", json={"name": "x"}).raise_for_status()
-    capture = inside.get("/v1/captures").json()["items"][0]["id"]
+    capture = inside.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
     inside.post(f"/v1/captures/{capture}/validate").raise_for_status()
-    numbers = {family.name: family.samples for family in text_string_to_metric_families(inside.get("/metrics").text)}
+    numbers = numbers_of(inside)
     assert number(numbers, "relit_queue_age_seconds") > 0 and number(numbers, "relit_jobs", state="queued") == 1
-    assert service.database is not None
 
 
 def test_every_request_is_one_line_of_the_log(server, client):
@@ -152,25 +137,6 @@ def test_what_libraries_say_is_in_the_same_log(server):
         connection.sendall(b"\x16\x03\x01\x00\xff no http\r\n\r\n")
         connection.recv(100)
     until(lambda: [line for line in server.lines() if line.get("logger") == "uvicorn.error"], "nothing of uvicorn")
-
-
-def test_a_job_that_is_cancelled_while_it_runs_is_no_error(server, client, owl, sky):
-    request = {"kind": "relight", "capture": owl, "environment": sky, "options": {"frames": "1-300"}}
-    job = client.post("/v1/jobs", json=request).json()["id"]
-    server.wait(client, f"/v1/jobs/{job}", ("running",))
-    client.post(f"/v1/jobs/{job}/cancel").raise_for_status()
-    until(lambda: [line for line in server.lines() if line.get("job") == job and line["event"] == "step stopped"], "not stopped")
-    time.sleep(1.5)  # in which DBOS looks at the workflow's status
-    assert [line for line in server.lines() if line["level"] == "error"] == []
-
-
-@pytest.mark.long
-def test_a_job_is_followed_through_the_log(server, client, owl):
-    job = client.post("/v1/jobs", json={"kind": "solve", "capture": owl, "options": {"method": "lambert"}}).json()["id"]
-    server.wait(client, f"/v1/jobs/{job}", ("succeeded",))
-    events = until(lambda: [line["event"] for line in server.lines() if line.get("job") == job][2:] and [
-        line["event"] for line in server.lines() if line.get("job") == job], "not logged")
-    assert events[:2] == ["step begins", "step done"]
 
 
 def test_a_fault_of_our_own_is_a_problem_too_and_logged_once(app, capfd):

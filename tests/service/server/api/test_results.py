@@ -3,7 +3,9 @@
 import asyncio
 import http.client
 import os
+import shutil
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -12,36 +14,42 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.requests.base.identifiers import new_id
-from service.requests.jobs import SolveJob
-from service.server.api.app import create_app
 from service.server.api.problems import ApiError
 from service.server.api.results import Opened, _names, _part
 from service.server.base.settings import Settings
-from service.server.database.engine import connect
-from service.server.jobs.queue import JobQueue, prepare
 from service.server.storage.folder import FolderStorage
 from stage.errors import StorageError
-from tests.service.server.api.asgi import Call
+from tests.service.server.api.asgi import Call, app_of
 from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.job_calls import ENDED, NOBODY, finish, made_by, refused, submit
+from tests.service.server.api.test_watch import queue
 from tests.service.server_process import Server
 
-ENDED = ("succeeded", "failed", "cancelled")
 LARGE = 64 << 20
 """More than the sockets between server and client hold, so that a download of it is under way for as long as nobody reads."""
 
 
 @pytest.fixture(scope="module")
-def frames(server, client, dome, sky) -> str:
-    """A job that made frames, with what a listing saw while it did."""
-    made = client.post("/v1/jobs", json={"kind": "relight", "capture": dome, "environment": sky, "options": {"frames": "1-40"}})
-    return made.raise_for_status().json()["id"]
+def frames(client, dome, sky) -> str:
+    """A job that makes frames."""
+    return submit(client, kind="relight", capture=dome, environment=sky, options={"frames": "1-40"})["id"]
 
 
 @pytest.fixture(scope="module")
 def folder(server, client, frames) -> Path:
-    assert server.wait(client, f"/v1/jobs/{frames}", ENDED)["state"] == "succeeded"
+    finish(server, client, {"id": frames})
     return server.data / "projects/default/jobs" / frames
+
+
+@pytest.fixture
+def results(folder) -> Iterator[Path]:
+    """The folder of the results, from which all that a test puts beside the frames goes afterwards."""
+    yield folder
+    for path in folder.iterdir():
+        if path.is_symlink() or (path.is_file() and not path.name.startswith("frame.")):
+            path.unlink()
+        elif path.is_dir():
+            shutil.rmtree(path)
 
 
 def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
@@ -59,19 +67,16 @@ def raw(server: Server, method: str, path: str) -> tuple[int, bytes]:
 @pytest.mark.long
 def test_results_name_no_place_of_the_server(server, client, dome, sky):
     """Whoever may read a project need not learn where the server keeps it; captures are named by their identifiers."""
-    jobs = [{"kind": "pipeline", "capture": dome, "environment": sky, "guided": True, "relight": {"frames": "1-2"},
-             "solve": {"method": "lambert"}}]
-    made = [client.post("/v1/jobs", json=job).raise_for_status().json()["id"] for job in jobs]
-    for job in made:
-        assert server.wait(client, f"/v1/jobs/{job}", ENDED)["state"] == "succeeded"
-        names = [result["name"] for result in client.get(f"/v1/jobs/{job}/results").json()["results"]]
-        assert {"report.json", "maps.exr", "frame.0001.exr"} <= set(names)
-        for name in names:
-            content = client.get(f"/v1/jobs/{job}/results/{name}").content
-            for place in (str(server.data.parent), str(SAMPLES), os.getcwd()):
-                assert place.encode() not in content, (name, place)
-    report = client.get(f"/v1/jobs/{made[0]}/results/report.json").json()
-    assert report["options"]["capture"] == dome
+    job = submit(client, kind="pipeline", capture=dome, environment=sky, guided=True, relight={"frames": "1-2"},
+                 solve={"method": "lambert"})
+    finish(server, client, job)
+    names = made_by(client, job)
+    assert {"report.json", "maps.exr", "frame.0001.exr"} <= names
+    for name in names:
+        content = client.get(f"/v1/jobs/{job['id']}/results/{name}").content
+        for place in (str(server.data.parent), str(SAMPLES), os.getcwd()):
+            assert place.encode() not in content, (name, place)
+    assert client.get(f"/v1/jobs/{job['id']}/results/report.json").json()["options"]["capture"] == dome
 
 
 @pytest.mark.long
@@ -90,7 +95,7 @@ def test_what_is_listed_while_a_job_runs_is_complete(server, client, frames):
         assert client.get(f"/v1/jobs/{frames}/results/{name}").content == content
 
 
-def test_the_listing_comes_a_page_at_a_time(client, frames, folder):
+def test_the_listing_comes_a_page_at_a_time_of_a_job_that_is_there(client, frames, folder):
     whole = client.get(f"/v1/jobs/{frames}/results").json()
     assert whole["next"] is None
     found, after = [], {}
@@ -99,9 +104,13 @@ def test_the_listing_comes_a_page_at_a_time(client, frames, folder):
         found += page["results"]
         after = None if page["next"] is None else {"after": page["next"]}
     assert found == whole["results"] and len(found) == 40
+    for path in ("", "/frame.0001.exr"):
+        refused(client.get(f"/v1/jobs/{NOBODY}/results{path}"), 404, "")
+    assert client.request("DELETE", f"/v1/jobs/{frames}/results/frame.0001.exr").headers["Allow"] == "GET, HEAD"
+    refused(client.get(f"/v1/jobs/{frames}/results", params={"limit": 1001}), 422, "query.limit")
 
 
-def test_a_file_is_downloaded_with_what_clients_need(client, frames, folder):
+def test_a_file_is_downloaded_with_what_clients_need_and_not_sent_again(client, frames, folder):
     url, content = f"/v1/jobs/{frames}/results/frame.0001.exr", (folder / "frame.0001.exr").read_bytes()
     response = client.get(url)
     assert (response.status_code, response.content) == (200, content)
@@ -114,36 +123,6 @@ def test_a_file_is_downloaded_with_what_clients_need(client, frames, folder):
     assert (head.status_code, head.content) == (200, b"")
     same = ("Content-Type", "Content-Length", "Content-Disposition", "ETag", "Last-Modified", "Accept-Ranges")
     assert {name: head.headers[name] for name in same} == {name: response.headers[name] for name in same}
-
-
-@pytest.mark.parametrize("name, media_type", [
-    ("maps.exr", "image/x-exr"), ("asset.usdz", "model/vnd.usdz+zip"), ("asset.usda", "model/vnd.usda"),
-    ("asset.glb", "model/gltf-binary"),
-    ("asset.usdc", "application/octet-stream"), ("report.json", "application/json"), ("preview.png", "image/png"),
-    ("points.ply", "application/octet-stream"), ("page.html", "application/octet-stream"), ("none", "application/octet-stream")])
-def test_media_types(client, frames, folder, name, media_type):
-    (folder / name).write_bytes(b"{}")
-    try:
-        assert client.get(f"/v1/jobs/{frames}/results/{name}").headers["Content-Type"] == media_type
-    finally:
-        (folder / name).unlink()
-
-
-def test_a_name_beyond_ascii_keeps_its_name(client, frames, folder):
-    (folder / "step 1").mkdir()
-    (folder / "step 1" / "Über.exr").write_bytes(b"x")
-    try:
-        file = client.get(f"/v1/jobs/{frames}/results", params={"after": "step"}).json()["results"][0]
-        assert (file["name"], file["url"]) == ("step 1/Über.exr", f"/v1/jobs/{frames}/results/step%201/%C3%9Cber.exr")
-        response = client.get(file["url"])
-        assert response.content == b"x"
-        assert response.headers["Content-Disposition"] == "attachment; filename*=UTF-8''%C3%9Cber.exr"
-    finally:
-        (folder / "step 1" / "Über.exr").unlink()
-        (folder / "step 1").rmdir()
-
-
-def test_what_the_client_has_is_not_sent_again(client, frames, folder):
     url = f"/v1/jobs/{frames}/results/frame.0002.exr"
     etag = client.get(url).headers["ETag"]
     for method in ("GET", "HEAD"):
@@ -154,6 +133,26 @@ def test_what_the_client_has_is_not_sent_again(client, frames, folder):
         assert client.request(method, url, headers={"If-Match": etag}).status_code == 200
         response = client.request(method, url, headers={"If-Match": f'W/{etag}, "other"'})  # weak tags are never the same
         assert (response.status_code, response.headers["ETag"]) == (412, etag)
+
+
+@pytest.mark.parametrize("name, media_type", [
+    ("maps.exr", "image/x-exr"), ("asset.usdz", "model/vnd.usdz+zip"), ("asset.usda", "model/vnd.usda"),
+    ("asset.glb", "model/gltf-binary"),
+    ("asset.usdc", "application/octet-stream"), ("report.json", "application/json"), ("preview.png", "image/png"),
+    ("points.ply", "application/octet-stream"), ("page.html", "application/octet-stream"), ("none", "application/octet-stream")])
+def test_media_types(client, frames, results, name, media_type):
+    (results / name).write_bytes(b"{}")
+    assert client.get(f"/v1/jobs/{frames}/results/{name}").headers["Content-Type"] == media_type
+
+
+def test_a_name_beyond_ascii_keeps_its_name(client, frames, results):
+    (results / "step 1").mkdir()
+    (results / "step 1" / "Über.exr").write_bytes(b"x")
+    file = client.get(f"/v1/jobs/{frames}/results", params={"after": "step"}).json()["results"][0]
+    assert (file["name"], file["url"]) == ("step 1/Über.exr", f"/v1/jobs/{frames}/results/step%201/%C3%9Cber.exr")
+    response = client.get(file["url"])
+    assert response.content == b"x"
+    assert response.headers["Content-Disposition"] == "attachment; filename*=UTF-8''%C3%9Cber.exr"
 
 
 def test_parts(client, frames, folder):
@@ -174,22 +173,19 @@ def test_parts(client, frames, folder):
         assert response.headers["Content-Type"] == "application/problem+json"
 
 
-def test_a_download_is_gone_on_with_only_where_the_file_is_the_same(client, frames, folder):
-    path = folder / "other.bin"
+def test_a_download_is_gone_on_with_only_where_the_file_is_the_same(client, frames, results):
+    path = results / "other.bin"
     path.write_bytes(b"0123456789")
     url = f"/v1/jobs/{frames}/results/other.bin"
-    try:
-        etag = client.get(url).headers["ETag"]
-        response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
-        assert (response.status_code, response.content) == (206, b"456789")
-        replace(path, b"abcdefghij")
-        response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
-        assert (response.status_code, response.content) == (200, b"abcdefghij")
-        assert response.headers["ETag"] != etag
-        for unclear in (f"W/{response.headers['ETag']}", response.headers["Last-Modified"]):
-            assert client.get(url, headers={"Range": "bytes=4-", "If-Range": unclear}).status_code == 200
-    finally:
-        path.unlink()
+    etag = client.get(url).headers["ETag"]
+    response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
+    assert (response.status_code, response.content) == (206, b"456789")
+    replace(path, b"abcdefghij")
+    response = client.get(url, headers={"Range": "bytes=4-", "If-Range": etag})
+    assert (response.status_code, response.content) == (200, b"abcdefghij")
+    assert response.headers["ETag"] != etag
+    for unclear in (f"W/{response.headers['ETag']}", response.headers["Last-Modified"]):
+        assert client.get(url, headers={"Range": "bytes=4-", "If-Range": unclear}).status_code == 200
 
 
 def replace(path: Path, content: bytes) -> None:
@@ -199,19 +195,16 @@ def replace(path: Path, content: bytes) -> None:
     os.replace(new, path)
 
 
-def test_a_download_is_of_one_file_whatever_takes_its_place(client, frames, folder):
-    path = folder / "large.bin"
+def test_a_download_is_of_one_file_whatever_takes_its_place(client, frames, results):
+    path = results / "large.bin"
     path.write_bytes(b"a" * LARGE)
-    try:
-        with client.stream("GET", f"/v1/jobs/{frames}/results/large.bin") as response:
-            pieces = response.iter_bytes()
-            got = [next(pieces)]
-            replace(path, b"b" * 10)
-            got += pieces
-        whole = b"".join(got)
-        assert len(whole) == LARGE and whole.count(b"a") == LARGE
-    finally:
-        path.unlink()
+    with client.stream("GET", f"/v1/jobs/{frames}/results/large.bin") as response:
+        pieces = response.iter_bytes()
+        got = [next(pieces)]
+        replace(path, b"b" * 10)
+        got += pieces
+    whole = b"".join(got)
+    assert len(whole) == LARGE and whole.count(b"a") == LARGE
 
 
 TRICKS = ["..", "../", "../../../../relit.sqlite", "..%2f..%2f..%2f..%2frelit.sqlite", "%2e%2e/%2e%2e/%2e%2e/%2e%2e/relit.sqlite",
@@ -231,18 +224,14 @@ def test_names_with_tricks_are_not_there(server, frames, folder, method, name):
     assert method == "HEAD" or b"has no such result" in body
 
 
-def test_links_out_of_the_results_are_not_followed(server, client, frames, folder):
-    (folder / "link.exr").symlink_to(server.data / "relit.sqlite")
-    (folder / "inner").symlink_to(server.data, target_is_directory=True)
-    try:
-        listed = {file["name"] for file in client.get(f"/v1/jobs/{frames}/results").json()["results"]}
-        assert not any(name.startswith(("link", "inner")) for name in listed)
-        assert client.get(f"/v1/jobs/{frames}/results/link.exr").status_code == 404
-        assert client.get(f"/v1/jobs/{frames}/results/inner/relit.sqlite").status_code == 404
-        assert client.get(f"/v1/jobs/{frames}/results/inner/projects/default/jobs/{frames}/frame.0001.exr").status_code == 404
-    finally:
-        (folder / "link.exr").unlink()
-        (folder / "inner").unlink()
+def test_links_out_of_the_results_are_not_followed(server, client, frames, results):
+    (results / "link.exr").symlink_to(server.data / "relit.sqlite")
+    (results / "inner").symlink_to(server.data, target_is_directory=True)
+    listed = {file["name"] for file in client.get(f"/v1/jobs/{frames}/results").json()["results"]}
+    assert not any(name.startswith(("link", "inner")) for name in listed)
+    assert client.get(f"/v1/jobs/{frames}/results/link.exr").status_code == 404
+    assert client.get(f"/v1/jobs/{frames}/results/inner/relit.sqlite").status_code == 404
+    assert client.get(f"/v1/jobs/{frames}/results/inner/projects/default/jobs/{frames}/frame.0001.exr").status_code == 404
 
 
 class Untouched(FolderStorage):
@@ -253,29 +242,15 @@ class Untouched(FolderStorage):
 
 
 def test_names_with_tricks_never_reach_the_storage(tmp_path):
-    settings = Settings(data=tmp_path, anonymous=True)
-    database = connect(settings.sqlalchemy_url)
-    prepare(settings, database)
-    app = create_app(settings, database)
-    job = database.transact(lambda connection: JobQueue(database).submit(
-        connection, project="default", key=None, request=SolveJob(kind="solve", capture=new_id("cap")), chunk_frames=1, inputs=[]))
-    app.state.service = app.state.service._replace(storage=Untouched(tmp_path))
+    with app_of(Settings(data=tmp_path, anonymous=True)) as app:
+        job = queue(app.state.service.database, "default")
+        app.state.service = app.state.service._replace(storage=Untouched(tmp_path))
 
-    def status(name: str) -> int:
-        return asyncio.run(Call(app, f"/v1/jobs/{job}/results/{name}").run()).status
+        def status(name: str) -> int:
+            return asyncio.run(Call(app, f"/v1/jobs/{job}/results/{name}").run()).status
 
-    assert status("maps.exr") == 507
-    assert {name: status(name) for name in TRICKS} == dict.fromkeys(TRICKS, 404)
-    database.close()
-
-
-def test_only_results_of_a_job_that_is_there(client, frames):
-    nobody = new_id("job")
-    for path in ("", "/frame.0001.exr"):
-        response = client.get(f"/v1/jobs/{nobody}/results{path}")
-        assert (response.status_code, response.headers["Content-Type"]) == (404, "application/problem+json")
-    assert client.request("DELETE", f"/v1/jobs/{frames}/results/frame.0001.exr").headers["Allow"] == "GET, HEAD"
-    assert client.get(f"/v1/jobs/{frames}/results", params={"limit": 1001}).json()["errors"][0]["field"] == "query.limit"
+        assert status("maps.exr") == 507
+        assert {name: status(name) for name in TRICKS} == dict.fromkeys(TRICKS, 404)
 
 
 @given(st.integers(0, 120), st.integers(0, 120), st.integers(0, 100))

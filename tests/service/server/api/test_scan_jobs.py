@@ -8,7 +8,9 @@ import pytest
 from tests.reference import projector as reference
 from tests.scenes.depth import BLACK_WHITE, POSE, PROJECTOR, Scene, gray_patterns, phase_patterns, write_patterns
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.test_measuring import files_of, upload
+
+pytestmark = pytest.mark.long
 
 CAMERA = reference.Device(96, 72, 140.0)
 ASIDE_M = 0.1
@@ -44,8 +46,7 @@ def depths(tmp_path_factory, server, client) -> list[str]:
         scene, pose = seen_from(aside)
         write_patterns(folder, scene, [*gray_patterns("column", stripe=8), *phase_patterns("column", 16.0), *BLACK_WHITE],
                        noise=0.001, camera=CAMERA, pose=pose)
-        files = {path.name: path.read_bytes() for path in folder.iterdir()}
-        jobs.append(submit(client, kind="depth", capture=upload(server, client, files)["id"], name=f"view {number}"))
+        jobs.append(submit(client, kind="depth", capture=upload(server, client, files_of(folder))["id"], name=f"view {number}"))
     return [finish(server, client, job)["id"] for job in jobs]
 
 
@@ -54,7 +55,6 @@ def registered(server, client, depths) -> str:
     return finish(server, client, submit(client, kind="register", depths=depths, options={"reference": depths[0]}))["id"]
 
 
-@pytest.mark.long
 def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, registered):
     assert made_by(client, {"id": registered}) == {"scan-set.json", "report.json"}
     found = client.get(f"/v1/jobs/{registered}/results/scan-set.json").json()
@@ -66,7 +66,6 @@ def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, regis
     assert str(server.data) not in json.dumps(report) and "/relit-scans-" not in json.dumps(report)
 
 
-@pytest.mark.long
 def test_registered_depths_become_one_mesh(client, server, depths, registered):
     job = submit(client, kind="fuse", registered=registered, options={"texture_px": 128, "texture_faces": 1000})
     finish(server, client, job)

@@ -1,7 +1,6 @@
 """Sequences as jobs: an uploaded folder of captures is solved or measured step by step, exported with time samples, and relit."""
 
 import json
-from pathlib import Path
 
 import pytest
 from pxr import Usd, UsdGeom
@@ -9,13 +8,11 @@ from pxr import Usd, UsdGeom
 from tests.scenes import depth as depths
 from tests.scenes.sequence import write_sequence
 from tests.service.server.api.job_calls import finish, made_by, refused, submit
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.test_measuring import files_of, upload
+
+pytestmark = pytest.mark.long
 
 TIMES = [0.0, 0.1, 0.2]
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +63,6 @@ def test_the_results_become_one_asset_with_time_samples(server, client, solved, 
                 f"format: is {unfit}, the asset of a sequence is one of usdz")
 
 
-@pytest.mark.long
 def test_one_step_is_looked_at(server, client, sequence, solved, dome):
     def ask(**request):
         return client.post("/v1/jobs", json={"kind": "view", "capture": sequence, **request})
@@ -86,7 +82,6 @@ def test_one_step_is_looked_at(server, client, sequence, solved, dome):
     refused(ask(maps=one, step=1), 422, f"maps: {one} is of one capture, and {sequence} is a sequence")
 
 
-@pytest.mark.long
 def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
     job = submit(client, kind="pipeline", capture=sequence, environment=sky, format="usdz", guided=True, solve={"method": "lambert"},
                  sequence={"temporal": False})
@@ -97,7 +92,6 @@ def test_a_pipeline_of_a_sequence(server, client, sequence, sky):
     assert not any("alone" in name for name in made)
 
 
-@pytest.mark.long
 def test_a_depth_of_a_sequence(server, client, tmp_path):
     patterns = [*depths.BLACK_WHITE, *depths.phase_patterns("column", 16), *depths.gray_patterns("column", stripe=16)]
     for step in range(2):
@@ -129,7 +123,6 @@ def test_what_takes_one_capture_is_given_one(server, client, sequence, solved, d
     assert "frames_per_second: is 30, --frame-rate 12: leave one out" in finish(server, client, other, "failed")["error"]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("path", "words"), [
     ("../step00", "steps[0].path leads out of the capture's folder"), ("/etc", "steps[0].path leads out of the capture's folder"),
     ("nothing", "nothing/capture.json"),

@@ -13,6 +13,7 @@ from service.errors import RequestError
 from service.server.base import telemetry
 from service.server.base.settings import Settings
 from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.job_calls import admitted
 from tests.service.server_process import serving
 
 PATIENCE_S = 60.0
@@ -52,12 +53,11 @@ def collector() -> Iterator[tuple[str, list]]:
 @pytest.mark.long
 def test_a_request_and_the_steps_of_its_job_are_one_trace(collector, tmp_path):
     address, spans = collector
-    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), otel_endpoint=address, min_free_bytes="0") as server, \
+    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), otel_endpoint=address) as server, \
             server.client() as client:
         ours = "4bf92f3577b34da6a3ce929d0e0e4736"
-        made = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")},
-                           headers={"traceparent": f"00-{ours}-00f067aa0ba902b7-01"}).json()
-        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
+        client.headers["traceparent"] = f"00-{ours}-00f067aa0ba902b7-01"
+        admitted(server, client, SAMPLES / "owl")
         client.get("/healthz")
         server.process.send_signal(signal.SIGTERM)
         assert server.process.wait(PATIENCE_S) == 0

@@ -1,79 +1,42 @@
 """Two API processes over one database: quotas and the queue are those of the service, not of a process."""
 
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator
 
+import httpx2
 import pytest
 
-from service.requests.keys import NewKey, Scope
-from service.server.base.settings import Settings
-from service.server.database import intakes, jobs, keys
-from service.server.database.engine import Database, connect
 from tests.service.server.api.conftest import SAMPLES
+from tests.service.server.api.job_calls import accepted
 from tests.service.server_process import Server, serving
+from tests.service.waiting import at_once
 
 pytestmark = pytest.mark.long
 
 CAPTURES, QUEUED, AT_ONCE = 4, 3, 8
 
 
-class Apis(NamedTuple):
-    """Two processes and their database."""
-
-    servers: tuple[Server, Server]
-    database: Database
-
-    def key(self, project: str) -> str:
-        return keys.create(self.database, NewKey(project=project, name="x", scope=Scope.ADMIN))
-
-
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def apis(request, tmp_path_factory) -> Iterator[Apis]:
-    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
+def apis(request, tmp_path_factory) -> Iterator[tuple[Server, Server]]:
+    """Two processes over one database; with SQLite also over one data folder."""
+    url = {} if request.param == "sqlite" else {"database_url": request.getfixturevalue("server_postgres").new_database()}
     settings = {"min_free_bytes": "0", "roots": str(SAMPLES), "max_queued": str(QUEUED),
-                "project_quotas": f"rowan:max_project_captures={CAPTURES}"}
-    settings |= {} if url is None else {"database_url": url}
+                "project_quotas": f"rowan:max_project_captures={CAPTURES}"} | url
     folder = tmp_path_factory.mktemp("apis")
-    second_folder = folder if url is None else folder / "second"  # SQLite: two processes over one data folder
-    with serving(folder, "--device", "none", **settings) as first, serving(second_folder, "--device", "none", **settings) as second:
-        database = connect(Settings(data=first.data, database_url=url).sqlalchemy_url)
-        yield Apis((first, second), database)
-        database.close()
+    with (serving(folder, "--device", "none", **settings) as first,
+          serving(folder / "second" if url else folder, "--device", "none", **settings) as second):
+        yield first, second
 
 
-def at_once(calls: Sequence[Callable[[], int]]) -> Counter[int]:
-    """Make requests at the same time, and count their statuses."""
-    found: list[int] = []
-    together = threading.Barrier(len(calls))
-
-    def run(call: Callable[[], int]) -> None:
-        together.wait()
-        found.append(call())
-
-    threads = [threading.Thread(target=run, args=(call,)) for call in calls]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return Counter(found)
+def statuses(clients: list[httpx2.Client], path: str, body: dict) -> Counter[int]:
+    """Send a request many times at once to the two in turn, and count what they answer."""
+    return Counter(at_once(2 * AT_ONCE, lambda number: clients[number % 2].post(path, json=body).status_code))
 
 
-def test_captures_that_are_created_at_once_keep_within_the_quota(apis):
-    with apis.servers[0].client(apis.key("rowan")) as one, apis.servers[1].client(apis.key("rowan")) as two:
-        calls = [lambda client=client: client.post("/v1/captures", json={"name": "x"}).status_code for client in (one, two)]
-        assert at_once(calls * AT_ONCE) == {201: CAPTURES, 429: 2 * AT_ONCE - CAPTURES}
-
-
-def test_jobs_that_are_submitted_at_once_keep_within_the_queue(apis):
-    key = apis.key("larch")
-    with apis.servers[0].client(key) as one, apis.servers[1].client(key) as two:
-        capture = one.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).raise_for_status().json()["id"]
-        intakes.accept(apis.database, capture, {"captures": 1})  # there is no worker that would check it
-        for job in jobs.latest(apis.database, "larch", limit=100):
-            apis.database.transact(lambda connection, job=job["id"]: jobs.cancel(connection, job))
-        calls = [lambda client=client: client.post("/v1/jobs", json={"kind": "solve", "capture": capture}).status_code
-                 for client in (one, two)]
-        assert at_once(calls * AT_ONCE) == {202: QUEUED, 429: 2 * AT_ONCE - QUEUED}
-
+def test_what_is_created_at_once_keeps_within_the_quota_and_the_queue(apis):
+    with apis[0].client(apis[0].key("rowan")) as one, apis[1].client(apis[1].key("rowan")) as two:
+        assert statuses([one, two], "/v1/captures", {"name": "x"}) == {201: CAPTURES, 429: 2 * AT_ONCE - CAPTURES}
+    key = apis[0].key()
+    with apis[0].client(key) as one, apis[1].client(key) as two, apis[0].database() as database:
+        job = {"kind": "solve", "capture": accepted(database, one, "larch", SAMPLES / "owl")}
+        assert statuses([one, two], "/v1/jobs", job) == {202: QUEUED, 429: 2 * AT_ONCE - QUEUED}

@@ -12,20 +12,16 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from fastapi.testclient import TestClient
 
-from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.keys import NewKey, Scope
 from service.server.api import uploads as api_uploads
-from service.server.api.app import create_app
 from service.server.base.settings import Settings
-from service.server.database import keys, tables, uploads
-from service.server.database.engine import connect
-from service.server.database.intakes import insert as insert_intake
-from service.server.database.schema import upgrade
+from service.server.database import keys, tables
 from service.server.storage.part_files import PartFile, PartFileLocked
-from service.server.storage.upload_parts import FolderParts
-from tests.service.server.api.test_uploads import at_once, begun, made, part, soon, stored
+from tests.service.server.api.asgi import app_of
+from tests.service.server.api.test_uploads import begun, made, part, stored
 from tests.service.server.api.tus import Tus, checksum, encoded
 from tests.service.server_process import serving
+from tests.service.waiting import at_once
 
 KIB, MIB = 1 << 10, 1 << 20
 PATIENCE_S = 30.0
@@ -33,12 +29,11 @@ PATIENCE_S = 30.0
 
 @pytest.mark.long
 def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
-    settings = {"requests_per_second": "10000", "request_burst": "10000", "min_free_bytes": "0"}
     contents = {f"{number}.bin": random.Random(number).randbytes(4 * MIB + number) for number in range(4)}
     told: dict[str, int] = {}
     place, uploads_of = "", {}
     for delay in (0.15, 0.4, None):
-        with serving(tmp_path, "--anonymous", "--device", "none", **settings) as server, server.client() as client:
+        with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
             tus = Tus(server.url)
             place = place or made(client, "captures")
             for name, content in contents.items():
@@ -70,8 +65,8 @@ def test_a_killed_server_loses_nothing_that_it_told(tmp_path):
 
 @pytest.mark.long
 def test_postgresql_tells_the_same_paths_and_requests(tmp_path, server_postgres):
-    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database(), min_free_bytes="0",
-                 requests_per_second="10000", request_burst="10000") as server, server.client() as client:
+    with serving(tmp_path, "--anonymous", "--device", "none", database_url=server_postgres.new_database()) as server, \
+            server.client() as client:
         place, tus = made(client, "captures"), Tus(server.url)
         answers = at_once(8, lambda number: tus.create(place, 10 + number, encoded(path="same.bin")))
         assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
@@ -125,7 +120,7 @@ def test_a_part_that_is_lost_begins_again(server, tus, capture):
 @pytest.mark.long
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="the limit of another process can be set on Linux alone")
 def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes="0") as server, server.client() as client:
+    with serving(tmp_path, "--anonymous", "--device", "none") as server, server.client() as client:
         place, tus = made(client, "captures"), Tus(server.url)
         content = random.Random(5).randbytes(12 * MIB)
         upload = begun(tus, place, len(content))
@@ -140,40 +135,15 @@ def test_a_disk_that_refuses_is_said_and_the_part_is_cut_back(tmp_path):
         assert stored(server, place, "file.bin").read_bytes() == content
 
 
-@pytest.mark.long
-def test_limits_and_projects(tmp_path):
-    with serving(tmp_path, "--device", "none", max_upload_bytes=str(MIB), max_capture_files="2", min_free_bytes="0",
-                 upload_hours="0.0005") as server:
-        database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
-        ours, theirs = (keys.create(database, NewKey(project=project, name="test", scope=Scope.WRITE)) for project in ("ours", "theirs"))
-        with server.client(ours) as client:
-            place, tus, key = made(client, "captures"), Tus(server.url), {"Authorization": f"Bearer {ours}"}
-            large = tus.create(place, MIB + 1, encoded(path="a"), **key)
-            assert (large.status, str(MIB).encode() in large.body) == (413, True)
-            upload = tus.create(place, 8, encoded(path="a"), **key).headers["location"]
-            assert tus.create(place, 8, encoded(path="b"), **key).status == 201
-            many = tus.create(place, 8, encoded(path="c"), **key)
-            assert (many.status, b"2 files" in many.body) == (413, True)
-            other = {"Authorization": f"Bearer {theirs}"}
-            assert tus.create(place, 8, encoded(path="d"), **other).status == 404
-            assert tus.ask("HEAD", upload, **other).status == tus.ask("DELETE", upload, **other).status == 404
-            assert tus.patch(upload, 0, b"12345678", **other).status == 404
-            assert tus.ask("HEAD", upload).status == 401
-            soon(lambda: tus.ask("HEAD", upload, **key).status == 410)  # 1.8 s after it was touched
-            assert tus.patch(upload, 0, b"data", **key).status == 410
-        database.close()
-
-
 @pytest.mark.parametrize("headers", [{}, {"Idempotency_Key": "once"}], ids=["plain", "with a token"])
 def test_an_expired_upload_is_begun_again_at_once(server, client, tus, capture, headers):
     """410 says so; it was 409 until the next housekeeping."""
     content = b"12345678"
     first = tus.create(capture, len(content), encoded(path="a.bin"), **headers).headers["location"]
     assert tus.patch(first, 0, content[:3]).offset == 3
-    database = connect(f"sqlite:///{server.data / 'relit.sqlite'}")
-    database.transact(lambda connection: connection.execute(tables.uploads.update().where(
-        tables.uploads.c.id == first.rpartition("/")[2]).values(touched_at=time.time() - 49 * 3600)))
-    database.close()
+    with server.database() as database:
+        database.transact(lambda connection: connection.execute(tables.uploads.update().where(
+            tables.uploads.c.id == first.rpartition("/")[2]).values(touched_at=time.time() - 49 * 3600)))
     assert tus.patch(first, 3, content[3:]).status == tus.head(first).status == 410
     again = tus.create(capture, len(content), encoded(path="a.bin"), **headers)
     assert (again.status, again.offset) == (201, 0)
@@ -207,46 +177,6 @@ def test_files_are_not_for_everybody(server, tus, capture):
     assert len(files) >= 3 and [path for path in (*files, *folders) if path.stat().st_mode & 0o027] == []
 
 
-@pytest.mark.long
-def test_a_server_without_space_takes_nothing(tmp_path):
-    with serving(tmp_path, "--anonymous", "--device", "none", min_free_bytes=str(1 << 60)) as server, server.client() as client:
-        database, capture = connect(f"sqlite:///{server.data / 'relit.sqlite'}"), new_id(CAPTURE)
-        database.transact(lambda connection: insert_intake(  # a request for one is refused, too
-            connection, identifier=capture, project="default", kind=CAPTURE, name="test", folder=None))
-        database.close()
-        answer = Tus(server.url).create(f"/v1/captures/{capture}", 1, encoded(path="a"))
-        assert (answer.status, "retry-after" in answer.headers) == (507, True)
-        assert client.get(f"/v1/captures/{capture}/files").json()["files"] == []
-
-
-def test_what_nobody_adds_to_expires(tmp_path):
-    database, folder = connect(f"sqlite:///{tmp_path / 'test.sqlite'}"), tmp_path / "uploads"
-    upgrade(database)
-    ids = {name: f"up_{name:0>20}" for name in ("old", "busy", "new", "done")}
-
-    def fill(connection) -> None:
-        insert_intake(connection, identifier="cap_1", project="p", kind="cap", name="test", folder=None)
-        for name, identifier in ids.items():
-            uploads.insert(connection, identifier=identifier, project="p", intake="cap_1", path=name, length=4, sha256=None)
-
-    database.transact(fill)
-    assert uploads.finish(database, ids["done"], 4)
-    for identifier in ids.values():
-        PartFile.open(folder, identifier).close()
-    limit = time.time()
-    assert uploads.advance(database, ids["new"], 2)
-    PartFile.open(folder, "up_orphan").close()
-    os.utime(folder / "up_orphan.part", (limit + 1, limit + 1))  # the clock of files is a coarse one
-    with PartFile.open(folder, ids["busy"]):
-        assert FolderParts(folder, database).expire(limit) == 1
-    assert {name for name, identifier in ids.items() if uploads.find(database, identifier, "p") is not None} == {"busy", "new", "done"}
-    assert {path.stem for path in folder.iterdir()} == {ids["busy"], ids["new"], "up_orphan"}
-    assert FolderParts(folder, database).expire(time.time() + 60) == 2
-    assert list(folder.iterdir()) == []
-    assert uploads.find(database, ids["done"], "p") is not None
-    database.close()
-
-
 def test_a_part_is_locked_once(tmp_path):
     with PartFile.open(tmp_path, "up_1") as first, pytest.raises(PartFileLocked):
         first.append([b"da", b"", b"ta"])
@@ -257,26 +187,22 @@ def test_a_part_is_locked_once(tmp_path):
 
 @pytest.mark.parametrize("checked", [False, True], ids=["plain", "with a checksum"])
 def test_a_patch_whose_key_is_revoked_meanwhile_is_refused(tmp_path, monkeypatch, checked):
-    settings = Settings(data=tmp_path / "data", min_free_bytes=0)
-    settings.data.mkdir()
-    database = connect(settings.sqlalchemy_url)
-    upgrade(database)
-    key, other = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.WRITE)) for _ in range(2))
     write_body = api_uploads.write_body
+    with app_of(Settings(data=tmp_path / "data", min_free_bytes=0)) as app:
+        database = app.state.service.database
+        key, other = (keys.create(database, NewKey(project="larch", name="x", scope=Scope.WRITE)) for _ in range(2))
 
-    async def write_and_revoke(*arguments) -> None:
-        await write_body(*arguments)
-        keys.revoke(database, key.partition(".")[0])
+        async def write_and_revoke(*arguments) -> None:
+            await write_body(*arguments)
+            keys.revoke(database, key.partition(".")[0])
 
-    monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
-    tus = {"Tus-Resumable": "1.0.0"}
-    with TestClient(create_app(settings, database), headers={"Authorization": f"Bearer {key}", **tus}) as client:
-        capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
-        place = client.post(f"/v1/captures/{capture}/files", headers={
-            "Upload-Length": "5", "Upload-Metadata": encoded(path="a.bin")}).raise_for_status().headers["Location"]
-        response = client.patch(place, content=b"hello", headers={
-            "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream",
-            **({"Upload-Checksum": checksum("sha256", b"hello")} if checked else {})})
-        assert response.status_code == 401 and "revoked" in response.json()["detail"]
-        assert client.head(place, headers={"Authorization": f"Bearer {other}"}).headers["Upload-Offset"] == "0"
-    database.close()
+        monkeypatch.setattr(api_uploads, "write_body", write_and_revoke)
+        with TestClient(app, headers={"Authorization": f"Bearer {key}", "Tus-Resumable": "1.0.0"}) as client:
+            capture = client.post("/v1/captures", json={"name": "x"}).raise_for_status().json()["id"]
+            place = client.post(f"/v1/captures/{capture}/files", headers={
+                "Upload-Length": "5", "Upload-Metadata": encoded(path="a.bin")}).raise_for_status().headers["Location"]
+            response = client.patch(place, content=b"hello", headers={
+                "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream",
+                **({"Upload-Checksum": checksum("sha256", b"hello")} if checked else {})})
+            assert response.status_code == 401 and "revoked" in response.json()["detail"]
+            assert client.head(place, headers={"Authorization": f"Bearer {other}"}).headers["Upload-Offset"] == "0"

@@ -3,22 +3,17 @@
 import hashlib
 import random
 import socket
-import threading
-import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.service.server.api.conftest import SAMPLES
-from tests.service.server.api.tus import VERSION, Answer, Tus, checksum, encoded
+from tests.service.server.api.tus import VERSION, Tus, checksum, encoded
 from tests.service.server_process import Server
+from tests.service.waiting import at_once, until
 
 KIB, MIB = 1 << 10, 1 << 20
-PATIENCE_S = 30.0
-
-
 def made(client, kind: str) -> str:
     return f"/v1/{kind}/{client.post(f'/v1/{kind}', json={'name': 'test'}).raise_for_status().json()['id']}"
 
@@ -37,14 +32,6 @@ def part(server: Server, upload: str) -> Path:
     return server.data / "uploads" / f"{upload.rpartition('/')[2]}.part"
 
 
-def soon(found: Callable[[], object]) -> object:
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := found()):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return value
-
-
 def half_sent(tus: Tus, upload: str, offset: int, body: bytes, sent: int, *more: str) -> socket.socket:
     """A PATCH of which only the first bytes are sent."""
     connection = socket.create_connection((tus.host, tus.port))
@@ -54,16 +41,13 @@ def half_sent(tus: Tus, upload: str, offset: int, body: bytes, sent: int, *more:
     return connection
 
 
-def test_the_server_says_what_it_speaks(tus):
+def test_the_server_says_what_it_speaks_and_refuses_another_version(tus, capture):
     answer = tus.ask("OPTIONS", "/v1/uploads", version=None)
     assert answer.status == 204
     assert answer.headers["tus-version"] == VERSION
     assert set(answer.headers["tus-extension"].split(",")) == {"creation", "checksum", "termination", "expiration"}
     assert set(answer.headers["tus-checksum-algorithm"].split(",")) == {"sha1", "sha256"}
     assert int(answer.headers["tus-max-size"]) > 0
-
-
-def test_another_version_is_refused_and_every_answer_names_ours(tus, capture):
     upload = begun(tus, capture, 4)
     other = tus.ask("PATCH", upload, b"data", version="0.2.2", Upload_Offset="0", Content_Type="application/offset+octet-stream")
     assert (other.status, other.headers["tus-version"]) == (412, VERSION)
@@ -86,14 +70,6 @@ def test_a_file_comes_in_pieces(server, client, tus, capture, length):
     listed = client.get(f"{capture}/files").raise_for_status().json()
     assert listed == {"files": [{"upload": upload.rpartition("/")[2], "path": "step 1/görl.bin", "length": length, "received": length,
                                  "done": True, "sha256": None}], "next": None}
-
-
-def test_the_method_may_come_in_a_header(server, tus, capture):
-    upload = begun(tus, capture, 4)
-    answer = tus.ask("POST", upload, b"data", Upload_Offset="0", Content_Type="application/offset+octet-stream",
-                     X_HTTP_Method_Override="PATCH")
-    assert (answer.status, answer.offset) == (204, 4)
-    assert stored(server, capture, "file.bin").read_bytes() == b"data"
 
 
 def test_a_wrong_offset_length_or_type_changes_nothing(tus, capture):
@@ -156,9 +132,9 @@ def test_a_broken_connection_keeps_what_needs_no_check(server, tus, capture, che
     content = random.Random(3).randbytes(3 * MIB)
     upload = begun(tus, capture, len(content))
     connection = half_sent(tus, upload, 0, content, MIB + 5, *([f"Upload-Checksum: {checksum('sha1', content)}"] if checked else []))
-    soon(lambda: part(server, upload).exists() and part(server, upload).stat().st_size >= MIB)  # a block of it is written
+    until(lambda: part(server, upload).exists() and part(server, upload).stat().st_size >= MIB)  # a block of it is written
     connection.close()
-    soon(lambda: tus.patch(upload, len(content), b"").status == 409)  # until it is noticed the upload is locked
+    until(lambda: tus.patch(upload, len(content), b"").status == 409)  # until it is noticed the upload is locked
     kept = tus.head(upload).offset
     assert kept == part(server, upload).stat().st_size == (0 if checked else MIB + 5)
     assert tus.patch(upload, kept, content[kept:]).status == 204
@@ -169,8 +145,8 @@ def test_an_upload_is_written_by_one_request_at_a_time(server, tus, capture):
     content = random.Random(4).randbytes(2 * MIB)
     upload = begun(tus, capture, len(content))
     with half_sent(tus, upload, 0, content, MIB) as first:
-        soon(lambda: part(server, upload).exists())
-        soon(lambda: tus.patch(upload, 0, content).status == 423)
+        until(lambda: part(server, upload).exists())
+        until(lambda: tus.patch(upload, 0, content).status == 423)
         assert tus.ask("DELETE", upload).status == 423
         assert tus.head(upload).offset == 0
         first.sendall(content[MIB:])
@@ -178,39 +154,18 @@ def test_an_upload_is_written_by_one_request_at_a_time(server, tus, capture):
     assert stored(server, capture, "file.bin").read_bytes() == content
 
 
-def at_once(count: int, ask: Callable[[int], Answer]) -> list[Answer]:
-    ready = threading.Barrier(count)
-
-    def one(number: int) -> Answer:
-        ready.wait()
-        return ask(number)
-
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(one, range(count)))
-
-
-def test_of_many_uploads_of_a_path_at_once_one_begins(client, tus, capture):
-    answers = at_once(8, lambda number: tus.create(capture, 10 + number, encoded(path="same.bin")))
+def test_requests_at_once_are_one_upload(client, tus, capture):
+    answers = at_once(8, lambda number: tus.create(capture, 10 + number, encoded(path="path.bin")))
     assert sorted(answer.status for answer in answers) == [201] + 7 * [409]
-    assert len(client.get(f"{capture}/files").json()["files"]) == 1
-
-
-def test_the_same_request_at_once_is_one_upload(client, tus, capture):
-    answers = at_once(8, lambda _: tus.create(capture, 10, encoded(path="same.bin"), Idempotency_Key=f"once-{capture}"))
+    token = f"once-{capture}"
+    answers = at_once(8, lambda _: tus.create(capture, 10, encoded(path="token.bin"), Idempotency_Key=token))
     assert {answer.status for answer in answers} == {201}
-    assert len({answer.headers["location"] for answer in answers}) == 1
-    assert tus.create(capture, 11, encoded(path="same.bin"), Idempotency_Key=f"once-{capture}").status == 422
-
-
-def test_a_token_whose_upload_was_deleted_makes_another(tus, capture):
-    def ask() -> str:
-        return tus.create(capture, 4, encoded(path="a"), Idempotency_Key=f"again-{capture}").headers["location"]
-
-    first = ask()
+    first, = {answer.headers["location"] for answer in answers}
+    assert len(client.get(f"{capture}/files").json()["files"]) == 2
+    assert tus.create(capture, 11, encoded(path="token.bin"), Idempotency_Key=token).status == 422
     assert tus.ask("DELETE", first).status == 204
-    second = ask()
-    assert second != first
-    assert tus.patch(second, 0, b"data").status == 204
+    again = tus.create(capture, 10, encoded(path="token.bin"), Idempotency_Key=token).headers["location"]
+    assert again != first and tus.patch(again, 0, b"0123456789").status == 204
 
 
 def test_many_files_come_at_once(server, tus, capture):
@@ -221,7 +176,7 @@ def test_many_files_come_at_once(server, tus, capture):
         assert stored(server, capture, name).read_bytes() == content
 
 
-def test_a_deleted_upload_leaves_nothing(server, client, tus, capture):
+def test_a_deleted_upload_leaves_nothing_and_files_are_listed_in_pages(server, client, tus, capture):
     halfway, whole = begun(tus, capture, 8, "half/way"), tus.send(capture, "whole/file", b"whole")
     assert tus.patch(halfway, 0, b"data").status == 204
     for upload in (halfway, whole):
@@ -230,11 +185,17 @@ def test_a_deleted_upload_leaves_nothing(server, client, tus, capture):
         assert not part(server, upload).exists()
     assert client.get(f"{capture}/files").json()["files"] == []
     assert not stored(server, capture, "whole").exists()
-
-
+    for name in ("b", "a", "C"):
+        begun(tus, capture, 1, name)
+    first = client.get(f"{capture}/files", params={"limit": 2}).json()
+    second = client.get(f"{capture}/files", params={"limit": 2, "after": first["next"]}).json()
+    assert [file["path"] for file in first["files"] + second["files"]] == ["a", "b", "C"]
+    assert second["next"] is None
 def test_a_deleted_capture_takes_its_uploads_along(server, client, tus, capture):
     halfway = begun(tus, capture, 8)
-    assert tus.patch(halfway, 0, b"data").status == 204
+    answer = tus.ask("POST", halfway, b"data", Upload_Offset="0", Content_Type="application/offset+octet-stream",
+                     X_HTTP_Method_Override="PATCH")  # the method may come in a header
+    assert (answer.status, answer.offset) == (204, 4)
     tus.send(capture, "whole", b"whole")
     with half_sent(tus, begun(tus, capture, 2 * MIB, "late"), 0, bytes(2 * MIB), MIB) as late:
         client.delete(capture).raise_for_status()
@@ -243,15 +204,6 @@ def test_a_deleted_capture_takes_its_uploads_along(server, client, tus, capture)
     assert tus.head(halfway).status == 404
     assert not part(server, halfway).exists()
     assert not stored(server, capture, "").exists()
-
-
-def test_files_are_listed_in_pages(client, tus, capture):
-    for name in ("b", "a", "C"):
-        begun(tus, capture, 1, name)
-    first = client.get(f"{capture}/files", params={"limit": 2}).json()
-    second = client.get(f"{capture}/files", params={"limit": 2, "after": first["next"]}).json()
-    assert [file["path"] for file in first["files"] + second["files"]] == ["a", "b", "C"]
-    assert second["next"] is None
 
 
 @pytest.mark.long
@@ -278,7 +230,7 @@ def test_a_capture_that_was_refused_is_mended(server, client, tus, capture):
     assert tus.ask("DELETE", f"/v1/uploads/{listed['000.exr']}").status == 409
 
 
-def test_an_environment_is_one_file(server, client, tus):
+def test_an_environment_is_one_file_and_a_registered_capture_takes_none(server, client, tus, owl):
     environment = made(client, "environments")
     sky = (SAMPLES / "owl/environment.exr").read_bytes()
     tus.send(environment, "sky.exr", sky)
@@ -286,8 +238,5 @@ def test_an_environment_is_one_file(server, client, tus):
     tus.send(environment, "sky.exr", sky)
     client.post(f"{environment}/validate").raise_for_status()
     assert server.wait(client, environment, ("ready", "refused"))["state"] == "ready"
-
-
-def test_a_registered_capture_takes_no_files(tus, owl):
     answer = tus.create(f"/v1/captures/{owl}", 1, encoded(path="a"))
     assert (answer.status, b"registered" in answer.body) == (409, True)

@@ -5,23 +5,10 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DBAPIError
 
 from service.requests.keys import Scope
-from service.server.base.settings import Settings
 from service.server.database import audit
-from service.server.database.engine import connect
 from service.server.database.keys import DAY_S, Caller
-from service.server.database.schema import upgrade
 
 CALLER = Caller("larch", Scope.WRITE, "key_0123456789abcdefghjk")
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request, tmp_path):
-    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
-    settings = Settings(data=tmp_path, database_url=url)
-    made = connect(settings.sqlalchemy_url)
-    upgrade(made)
-    yield made
-    made.close()
 
 
 def test_lines_are_listed_by_project_the_newest_first(database):

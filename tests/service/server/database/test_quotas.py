@@ -1,6 +1,5 @@
 """Quotas of projects, and that two requests at once do not both take the last place."""
 
-import threading
 from contextlib import suppress
 
 import pytest
@@ -10,17 +9,8 @@ from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
 from service.requests.jobs import CheckJob, SolveJob
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, quotas, tables, uploads
-from service.server.database.engine import Database, connect
-from service.server.database.schema import upgrade
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database(request, tmp_path) -> Database:
-    url = None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
-    made = connect(Settings(data=tmp_path, database_url=url).sqlalchemy_url)
-    upgrade(made)
-    yield made
-    made.close()
+from service.server.database.engine import Database
+from tests.service.waiting import at_once
 
 
 def capture(connection, project: str) -> str:
@@ -86,22 +76,15 @@ def test_a_project_may_have_a_quota_of_its_own(database):
     assert not allowed(database, quotas.CAPTURES, "willow", 1, **own)
 
 
-def at_once(database: Database, work) -> list[str]:
-    """Run a transaction eight times at once, as several API processes do, each of which counts what the others have not yet written."""
-    made: list[str] = []
-    together = threading.Barrier(8)
-
-    def run():
-        together.wait()
+def taken(database: Database, work) -> int:
+    """How many of eight transactions at once succeed: as in several API processes, each counts what others have not yet written."""
+    def one(_: int) -> bool:
         with suppress(RequestError):
-            made.append(database.transact(work))
+            database.transact(work)
+            return True
+        return False
 
-    threads = [threading.Thread(target=run) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return made
+    return sum(at_once(8, one))
 
 
 def test_several_at_once_do_not_all_take_the_last_place(database):
@@ -111,7 +94,7 @@ def test_several_at_once_do_not_all_take_the_last_place(database):
         quotas.require(connection, settings, quotas.CAPTURES, "larch", 1)
         return capture(connection, "larch")
 
-    assert len(at_once(database, work)) == 1
+    assert taken(database, work) == 1
 
 
 def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
@@ -123,7 +106,7 @@ def test_several_at_once_do_not_all_take_the_last_place_in_the_queue(database):
             raise RequestError("too many")
         return job
 
-    assert len(at_once(database, work)) == 3
+    assert taken(database, work) == 3
 
 
 @pytest.mark.parametrize("given", ["larch", "larch:max_project_jobs", "larch:max_frames=1", "larch:max_project_jobs=-1",

@@ -23,12 +23,6 @@ class Undisturbed(NamedTuple):
     digests: dict[str, str]
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    """Of each kind of database; those on PostgreSQL are a new one each."""
-    return None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
-
-
 @pytest.fixture
 def on_postgres(server_postgres) -> str:
     return server_postgres.new_database()

@@ -1,12 +1,10 @@
 """A data folder with a database, jobs in it, and real worker processes (`relit worker`) that do them; no API between."""
 
 import hashlib
-import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +22,8 @@ from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
 from service.server.jobs.queue import JobQueue, prepare, workflow_id
 from service.server.storage import layout
+from tests.service.server_process import JsonLog, environment_with
+from tests.service.waiting import until
 
 PROJECT = "tests"
 CAPTURES = ("capture", "registered", "undisturbed")
@@ -44,12 +44,8 @@ class Harness:
         prepare(self.settings, self.database)
         self.queue = JobQueue(self.database)
         self.log = folder / "log.txt"
-        self._events: list[dict[str, Any]] = []
-        self._log_read = 0
-        self._environment = {name: value for name, value in os.environ.items() if not name.startswith("RELIT_")}
-        self._environment |= {f"RELIT_{name.upper()}": str(value) for name, value in settings.items()}
-        if database_url is not None:
-            self._environment["RELIT_DATABASE_URL"] = database_url
+        self.events = JsonLog(self.log, b"{").lines
+        self._environment = environment_with(**settings, **({} if database_url is None else {"database_url": database_url}))
         self.supervisors: list[subprocess.Popen[bytes]] = []
 
     def start(self, **environment: str) -> subprocess.Popen[bytes]:
@@ -95,11 +91,11 @@ class Harness:
 
     def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float = 0.05) -> Any:
         """Wait for something, and return it."""
-        deadline = time.monotonic() + within_s
-        while not (found := true()):
-            assert time.monotonic() < deadline, f"not {what} within {within_s:g} s: {self.tail()}"
-            time.sleep(every_s)
-        return found
+        try:
+            return until(true, f"not {what} within {within_s:g} s", within_s=within_s, every_s=every_s)
+        except AssertionError as error:
+            error.add_note(self.tail())
+            raise
 
     def ended(self, job: str, **options: float) -> sa.RowMapping:
         """The job, when it has ended."""
@@ -165,15 +161,6 @@ class Harness:
             if line.get("job") == job and line["event"] in ("step done", "step stopped"):
                 at = None
 
-    def events(self) -> list[dict[str, Any]]:
-        """The lines of the workers' logs, in their order; each is parsed once."""
-        with open(self.log, "rb") as log:
-            log.seek(self._log_read)
-            whole, end, _ = log.read().rpartition(b"\n")
-        self._log_read += len(whole + end)
-        self._events += [json.loads(line) for line in whole.splitlines() if line.startswith(b"{")]
-        return self._events
-
     def tail(self) -> str:
         return self.log.read_text()[-6000:] if self.log.exists() else ""
 
@@ -185,6 +172,32 @@ def harness(folder: Path, database_url: str | None = None, **settings: Any) -> I
         yield made
     finally:
         made.close()
+
+
+def begun(made: Harness, job: str) -> dict[str, list[str]]:
+    """The pieces that each worker has begun, by the log."""
+    found: dict[str, list[str]] = {}
+    for event in made.events():
+        if event["event"] == "piece begins" and event["job"] == job:
+            found.setdefault(event["worker"], []).append(event["piece"])
+    return found
+
+
+def shared(made: Harness, job: str, count: int) -> sa.RowMapping:
+    """Wait for a job that so many workers share, and that nothing is left of its pieces."""
+    row = made.ended(job)
+    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
+    shares = begun(made, job)
+    assert len(shares) == count
+    pieces = [piece for share in shares.values() for piece in share]
+    assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
+    no_pieces(made, job)
+    return row
+
+
+def no_pieces(made: Harness, job: str) -> None:
+    """Wait until the pieces of a job are removed; a worker that helped may end after the job."""
+    made.until(lambda: not (made.settings.data / layout.shared(PROJECT, job)).exists(), "pieces removed")
 
 
 def digests(folder: Path) -> dict[str, str]:

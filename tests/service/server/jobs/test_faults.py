@@ -34,7 +34,7 @@ def test_restarts_of_postgresql_cost_nothing(tmp_path, server_postgres, on_postg
         for frames, mode, away_s in ((4, "fast", 0.0), (13, "immediate", 0.0), (22, "fast", 3.0)):
             frames_there(made, job, frames)
             server_postgres.restart(mode, away_s=away_s)
-        row = made.until(lambda: found if (found := made.row(job))["state"] in jobs.ENDED else None, "ended")
+        row = made.ended(job)
         assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
         assert digests(made.results(job)) == undisturbed.digests
         made.never_two_at_once(job)

@@ -3,6 +3,8 @@
 These tests fail where DBOS names or uses the columns otherwise that service.server.jobs.queue writes.
 """
 
+import pytest
+
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
 from service.requests.jobs import SolveJob
 from service.server.database import jobs
@@ -13,6 +15,7 @@ from tests.service.server.jobs.harness import harness
 MANY = 16
 
 
+@pytest.mark.long
 def test_workers_take_jobs_by_priority_and_time_and_projects_take_turns(tmp_path):
     """The next project is drawn by lot, so that the job of `willow` is the last of all once in 2**16 runs."""
     with harness(tmp_path) as made:

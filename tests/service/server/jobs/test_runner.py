@@ -48,20 +48,13 @@ def do_nothing(monkeypatch, run=lambda progress: None):
     monkeypatch.setattr(runner_module, "steps_of", lambda job, context: [JobStep(name, run) for name in NAMES])
 
 
-def test_a_job_is_done_step_by_step(idle_harness, runner, monkeypatch):
+@pytest.mark.parametrize("function", [None, *(
+    pytest.param(name, marks=pytest.mark.long) for name in ("begin", "find", "is_claimed", "finish_step", "end"))])
+def test_a_job_is_done_step_by_step_though_the_database_is_away_for_a_moment(idle_harness, runner, monkeypatch, function):
     made, claim = runner
     do_nothing(monkeypatch)
-    assert made.run(claim) == DONE
-    row = idle_harness.row(claim.job)
-    assert (row["state"], row["finished_steps"]) == (jobs.SUCCEEDED, NAMES)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("function", ["begin", "find", "is_claimed", "finish_step", "end"])
-def test_a_database_that_is_away_for_a_moment_is_waited_for(idle_harness, runner, monkeypatch, function):
-    made, claim = runner
-    do_nothing(monkeypatch)
-    monkeypatch.setattr(runner_module.jobs, function, once(NO_ANSWER, getattr(jobs, function)))
+    if function is not None:
+        monkeypatch.setattr(runner_module.jobs, function, once(NO_ANSWER, getattr(jobs, function)))
     assert (made.run(claim), idle_harness.row(claim.job)["state"]) == (DONE, jobs.SUCCEEDED)
     assert idle_harness.row(claim.job)["finished_steps"] == NAMES
 

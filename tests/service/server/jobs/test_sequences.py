@@ -21,8 +21,8 @@ from service.server.storage.objects import open_storage
 from stage.errors import ManifestError
 from tests.scenes.captures import files_in
 from tests.scenes.sequence import LIGHTS, moment, write_step
+from tests.service.recording import Recording
 from tests.service.server.jobs.harness import PROJECT, harness
-from tests.service.server.jobs.test_steps import Silent
 
 STEPS = 4
 
@@ -63,8 +63,8 @@ def context_of(harness, settings: Settings, sequence) -> WorkerContext:
 def run(job: Job, context: WorkerContext, name: str) -> None:
     """What the worker does in a step."""
     with places_named():
-        next(step for step in steps_of(job, context) if step.name == name).run(Silent())
-    context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Silent())
+        next(step for step in steps_of(job, context) if step.name == name).run(Recording())
+    context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Recording())
 
 
 @pytest.mark.long
@@ -85,18 +85,6 @@ def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence
     assert maps_in(store) == undisturbed
     assert {"sequence.json", "report.json", "step03/report.json", "step03/alone/report.json"} <= files_in(store)
     assert str(tmp_path).encode() not in (store / "step03" / "alone" / "report.json").read_bytes()
-
-
-@pytest.mark.long
-def test_without_joining_there_are_the_steps_alone(idle_harness, sequence):
-    job = solve_of(idle_harness, sequence, temporal=False, frame_rate=12.5)
-    context = context_of(idle_harness, idle_harness.settings, sequence)
-    for step in steps_of(job, context):
-        run(job, context, step.name)
-    out = idle_harness.results(job.id)
-    assert {name for name in files_in(out) if name.startswith("step01")} == {"step01/maps.exr", "step01/report.json", "step01/step.json"}
-    assert b'"frames_per_second": 12.5' in (out / "sequence.json").read_bytes()
-    assert not (sequence / "step00" / ".relit").exists()
 
 
 def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):

@@ -2,45 +2,33 @@
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
 
-from service.server.base.settings import Settings
-from service.server.database import jobs, workers
-from service.server.database.engine import connect
-from tests.service.server.jobs.harness import WAIT_S, digests
+from service.server.database import jobs
+from tests.service.server.api.job_calls import admitted, submit
+from tests.service.server.jobs.harness import digests
 from tests.service.server.jobs.test_faults import fill, small_disk  # noqa: F401  (a fixture)
 from tests.service.server_process import Server, serving
+from tests.service.waiting import until
 
 pytestmark = pytest.mark.long
 
 OPTIONS = ("--anonymous", "--device", "cpu")
-SETTINGS = {"chunk_frames": "6", "requests_per_second": "1000", "min_free_bytes": "0"}
+SETTINGS = {"chunk_frames": "6"}
 
 
 def begin(server: Server, client, undisturbed, *, frames: int | None = None) -> str:
     """A relight of the undisturbed capture: of so many frames, or of all."""
-    made = client.post("/v1/captures", json={"name": "cap", "folder": str(undisturbed.capture)}).raise_for_status().json()
-    sky = client.post("/v1/environments", json={"name": "sky", "file": str(undisturbed.environment)}).raise_for_status().json()
-    for kind, found in (("captures", made), ("environments", sky)):
-        assert server.wait(client, f"/v1/{kind}/{found['id']}", ("ready", "refused"))["state"] == "ready"
-    job = client.post("/v1/jobs", json={"kind": "relight", "capture": made["id"], "environment": sky["id"], "options": {
-        "frames": f"1-{frames or undisturbed.frames}", "spin_degrees": 360}}).raise_for_status().json()
-    return job["id"]
+    capture = admitted(server, client, undisturbed.capture)["id"]
+    sky = admitted(server, client, undisturbed.environment, kind="environments")["id"]
+    return submit(client, kind="relight", capture=capture, environment=sky,
+                  options={"frames": f"1-{frames or undisturbed.frames}", "spin_degrees": 360})["id"]
 
 
 def results(server: Server, job: str) -> Path:
     return server.data / "projects" / "default" / "jobs" / job
-
-
-def until(true, what: str):
-    deadline = time.monotonic() + WAIT_S
-    while not (found := true()):
-        assert time.monotonic() < deadline, f"not {what}"
-        time.sleep(0.02)
-    return found
 
 
 def frames_there(server: Server, job: str, count: int) -> None:
@@ -71,28 +59,13 @@ def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
         os.kill(server.process.pid, signal.SIGKILL)
         server.process.wait()
         until(lambda: "worker ended" in server.log.read_text(), "ended")  # after its step
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        row = jobs.find(database, job)
-        database.close()
+        with server.database() as database:
+            row = jobs.find(database, job)
         assert (row["state"], row["lost"], row["finished_steps"]) == (jobs.QUEUED, 0, ["frames 1-6", "frames 7-12"])
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
         assert digests(results(server, job)) == undisturbed.digests
         assert_workers_are_spawned(server)
-
-
-def test_the_service_drains_when_it_is_asked_to_end(tmp_path, undisturbed):
-    settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
-    with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
-        job = begin(server, client, undisturbed)
-        frames_there(server, job, 8)
-        server.process.send_signal(signal.SIGTERM)
-        assert server.process.wait(WAIT_S) == 0
-        database = connect(Settings(data=server.data).sqlalchemy_url)
-        row = jobs.find(database, job)
-        assert (row["state"], row["worker"], row["finished_steps"]) == (jobs.QUEUED, None, ["frames 1-6", "frames 7-12"])
-        assert workers.seen_lately(database) == []
-        database.close()
 
 
 def test_the_service_stays_when_its_database_has_no_space(small_disk, undisturbed):  # noqa: F811

@@ -21,8 +21,8 @@ from stage.results.depth_maps import DepthMaps
 from stage.sets.scan_set import ScanEntry, ScanSet, read_scan_set, write_scan_set
 from tests.scenes.turntable import View, figure
 from tests.service.scans.registration.test_registration import seen
-from tests.service.server.jobs.harness import PROJECT, Harness, harness
-from tests.service.server.jobs.test_sharing import WORKERS, begun, both_at_work, pieces_folder
+from tests.service.server.jobs.harness import PROJECT, Harness, harness, no_pieces, shared
+from tests.service.server.jobs.test_sharing import WORKERS, both_at_work
 from tests.service.server_process import SABOTAGE
 
 pytestmark = pytest.mark.long
@@ -31,29 +31,6 @@ pytestmark = pytest.mark.long
 @pytest.fixture(scope="module")
 def views() -> list[View]:
     return seen(figure, *range(0, 150, 30), rows=120)
-
-
-def put_depths(made: Harness, views: list[View]) -> list[str]:
-    """The results of depth jobs, of which the poses are known to 3 mm."""
-    names = []
-    rng = np.random.default_rng(3)
-    for view in views:
-        name = new_id(JOB)
-        pose = view.world_from_scan.copy()
-        pose[:3, 3] += rng.normal(scale=0.003, size=3)
-        camera = view.camera.model_copy(update={"world_from_camera": tuple(tuple(map(float, row)) for row in pose)})
-        DepthMaps(camera=camera, mask=view.mask, depth=view.depth, sigma=view.sigma).write(
-            made.settings.data / layout.results(PROJECT, name) / "depth.exr")
-        names.append(name)
-    return names
-
-
-def registered_alone(made: Harness, names: list[str], out: Path) -> Path:
-    """What `relit register` makes of the same scans in one process."""
-    folder = made.settings.data / layout.results(PROJECT, names[0])
-    file = folder.parent / "scan-set.json"
-    write_scan_set(ScanSet(schema="relit.scan-set/1", name="alone", scans=tuple(ScanEntry(name=name, path=name) for name in names)), file)
-    return register_scans(RegisterRequest(scan_set=file, out=out, threads=1)).scan_set_path
 
 
 def put_registered(made: Harness, names: list[str], views: list[View]) -> Path:
@@ -87,12 +64,27 @@ def both(pair: Harness) -> Harness:
 
 @pytest.fixture(scope="module")
 def depths(pair: Harness, views: list[View]) -> list[str]:
-    return put_depths(pair, views)
+    """The results of depth jobs, of which the poses are known to 3 mm."""
+    names = []
+    rng = np.random.default_rng(3)
+    for view in views:
+        name = new_id(JOB)
+        pose = view.world_from_scan.copy()
+        pose[:3, 3] += rng.normal(scale=0.003, size=3)
+        camera = view.camera.model_copy(update={"world_from_camera": tuple(tuple(map(float, row)) for row in pose)})
+        DepthMaps(camera=camera, mask=view.mask, depth=view.depth, sigma=view.sigma).write(
+            pair.settings.data / layout.results(PROJECT, name) / "depth.exr")
+        names.append(name)
+    return names
 
 
 @pytest.fixture(scope="module")
 def alone(pair: Harness, depths: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return registered_alone(pair, depths, tmp_path_factory.mktemp("alone"))
+    """What `relit register` makes of the same scans in one process."""
+    file = pair.settings.data / layout.results(PROJECT, "scan-set.json")
+    entries = tuple(ScanEntry(name=name, path=name) for name in depths)
+    write_scan_set(ScanSet(schema="relit.scan-set/1", name="alone", scans=entries), file)
+    return register_scans(RegisterRequest(scan_set=file, out=tmp_path_factory.mktemp("alone"), threads=1)).scan_set_path
 
 
 def poses_of(path: Path) -> list[object]:
@@ -101,16 +93,10 @@ def poses_of(path: Path) -> list[object]:
 
 def test_two_workers_find_the_same_poses_as_one_process(both, depths, alone):
     job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
-    row = both.ended(job)
-    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-    shares = begun(both, job)
-    assert len(shares) == WORKERS
-    pieces = [piece for share in shares.values() for piece in share]
-    assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
+    shared(both, job, WORKERS)
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
     assert json.loads((both.results(job) / "report.json").read_text())["pairs"] == json.loads(
         (alone.parent / "report.json").read_text())["pairs"]
-    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
 
 
 def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tmp_path):
@@ -118,13 +104,10 @@ def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tm
     options = {"tiles": True, "voxel_m": 6e-3}
     expected = fuse(FuseRequest(scan_set=registered, out=tmp_path / "alone", device="cpu", **options)).report_path.parent
     job = both.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
-    row = both.ended(job)
-    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-    assert len(begun(both, job)) == WORKERS
+    shared(both, job, WORKERS)
     tiles = {path.name: path.read_bytes() for path in (expected / "tiles").glob("*.ply")}
     assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (both.results(job) / "tiles").glob("*.ply")} == tiles
     assert (both.results(job) / "site.usda").exists()
-    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
 
 
 def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths, alone):
@@ -134,4 +117,4 @@ def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths
     row = both.ended(job)
     assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
     assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
-    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")  # a worker that helped may end after the job
+    no_pieces(both, job)

@@ -19,7 +19,7 @@ from service.solve.base import batches
 from service.solve.solve import solve
 from stage.stack import stack
 from tests.scenes.captures import make_scene, write_capture, write_exr
-from tests.service.server.jobs.harness import PROJECT, digests, harness, relit_relight
+from tests.service.server.jobs.harness import PROJECT, begun, digests, harness, no_pieces, relit_relight, shared
 from tests.service.server_process import SABOTAGE
 
 pytestmark = pytest.mark.long
@@ -81,19 +81,6 @@ def begin(made, capture: Path, method: str) -> str:
     return made.submit(SolveJob(kind="solve", capture=made.register(capture, CAPTURE), options=SolveOptions(method=method)), chunk_frames=8)
 
 
-def pieces_folder(made, job: str) -> Path:
-    return made.settings.data / layout.shared(PROJECT, job)
-
-
-def begun(made, job: str) -> dict[str, list[str]]:
-    """The pieces that each worker has begun, by the log."""
-    found: dict[str, list[str]] = {}
-    for event in made.events():
-        if event["event"] == "piece begins" and event["job"] == job:
-            found.setdefault(event["worker"], []).append(event["piece"])
-    return found
-
-
 def both_at_work(made, job: str) -> tuple[str, str]:
     """The worker that has the job, and the one that helps, when each has begun a piece and neither waits for the other any more."""
     made.until(lambda: len(begun(made, job)) == WORKERS == len(list(together(made).glob("*"))), "shared")
@@ -108,15 +95,8 @@ def events_of(made, job: str, *names: str) -> list[str]:
 
 def made_by_both(made, job: str, expected: bytes) -> None:
     """Wait for a solve that two workers share."""
-    row = made.ended(job)
-    assert (row["state"], row["error"], row["lost"]) == (jobs.SUCCEEDED, None, 0)
-    assert row["done"] == row["total"]
-    shares = begun(made, job)
-    assert len(shares) == WORKERS
-    pieces = [piece for share in shares.values() for piece in share]
-    assert len(pieces) - len(set(pieces)) <= len(set(pieces)) // 4  # two that claim one at the same moment both do it
-    assert (made.results(job) / layout.MAPS).read_bytes() == expected
-    made.until(lambda: not pieces_folder(made, job).exists(), "pieces removed")  # a worker that helped may end after the job
+    row = shared(made, job, WORKERS)
+    assert row["done"] == row["total"] and (made.results(job) / layout.MAPS).read_bytes() == expected
     made.until(lambda: events_of(made, job, "help done", "help stopped"), "helped")
 
 
@@ -135,13 +115,13 @@ def test_the_pieces_of_a_killed_worker_are_done_by_another(both, capture, alone,
     job = begin(both, capture, "svbrdf")
     holder, helper = both_at_work(both, job)
     victim = holder if whom == "who has the job" else helper
-    done = {path.name for path in pieces_folder(both, job).rglob("*") if path.is_file()}
+    done = {path.name for path in (both.settings.data / layout.shared(PROJECT, job)).rglob("*") if path.is_file()}
     os.kill(both.pid_of(victim), signal.SIGKILL)
     row = both.ended(job)
     assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
     assert (row["worker"] == holder) == (whom == "who helps")
     assert done and (both.results(job) / layout.MAPS).read_bytes() == alone("svbrdf")
-    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")
+    no_pieces(both, job)
     later = [event["worker"] for event in both.events() if event["event"] == "piece begins" and event["job"] == job]
     assert later[-1] != victim
 
@@ -152,7 +132,7 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture
     assert both.database.transact(lambda connection: jobs.cancel(connection, job))
     both.queue.cancel(job, 1)
     both.until(lambda: {"step stopped", "help stopped"} <= set(events_of(both, job, "step stopped", "help stopped")), "stopped")
-    both.until(lambda: not pieces_folder(both, job).exists(), "removed")
+    no_pieces(both, job)
     assert both.row(job)["state"] == jobs.CANCELLED
     shutil.rmtree(together(both))  # the first piece waits for both once more
     other = begin(both, capture, "lambert")  # both are free again
@@ -172,11 +152,9 @@ def test_frames_are_made_by_both_workers(both, capture, tmp_path):
     sky = write_exr(capture.parent / "sky.exr", np.random.default_rng(7).random((16, 32, 3)))
     expected = relit_relight(capture, sky, FRAMES, tmp_path / "expected")
     job = both.relight(both.register(capture, CAPTURE), both.register(sky, ENVIRONMENT), FRAMES, chunk_frames=2)
-    row = both.ended(job)
-    assert (row["state"], row["error"], row["done"], row["total"]) == (jobs.SUCCEEDED, None, FRAMES, FRAMES)
+    row = shared(both, job, WORKERS)
+    assert (row["done"], row["total"]) == (FRAMES, FRAMES)
     assert sorted(row["finished_steps"]) == sorted(f"frames {first}-{first + 1}" for first in range(1, FRAMES, 2))
-    shares = begun(both, job)
-    assert len(shares) == WORKERS
-    assert sorted(piece for share in shares.values() for piece in share) == sorted(f"steps/{step}" for step in row["finished_steps"])
+    pieces = [piece for share in begun(both, job).values() for piece in share]
+    assert sorted(pieces) == sorted(f"steps/{step}" for step in row["finished_steps"])
     assert digests(both.results(job)) == expected
-    both.until(lambda: not pieces_folder(both, job).exists(), "pieces removed")

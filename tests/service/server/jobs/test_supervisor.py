@@ -53,18 +53,15 @@ def watch(monkeypatch, tmp_path, worker, until, stall_s=WAIT_S):
 
 
 @pytest.mark.long
-def test_one_that_is_never_ready_waits_longer_each_time(monkeypatch, tmp_path, log):
-    watch(monkeypatch, tmp_path, stand_ins.never_ready, lambda _: len(log.of("worker is gone")) == 4)
-    assert [facts["again_in_s"] for facts in log.of("worker is gone")][:4] == [PAUSES_S[1], PAUSES_S[2], PAUSES_S[2], PAUSES_S[2]]
+@pytest.mark.parametrize(("worker", "pauses"), [
+    (stand_ins.never_ready, [PAUSES_S[1], PAUSES_S[2], PAUSES_S[2], PAUSES_S[2]]), (stand_ins.ready_and_dead, [0.0] * 4)])
+def test_one_that_is_never_ready_waits_longer_each_time_and_one_that_was_is_started_at_once(monkeypatch, tmp_path, log, worker, pauses):
+    watch(monkeypatch, tmp_path, worker, lambda _: len(log.of("worker is gone")) == 4)
+    assert [facts["again_in_s"] for facts in log.of("worker is gone")][:4] == pauses
 
 
-@pytest.mark.long
-def test_one_that_was_ready_is_started_again_at_once_however_often_it_dies(monkeypatch, tmp_path, log):
-    watch(monkeypatch, tmp_path, stand_ins.ready_and_dead, lambda _: len(log.of("worker is gone")) == 4)
-    assert [facts["again_in_s"] for facts in log.of("worker is gone")][:4] == [0.0] * 4
-
-
-@pytest.mark.parametrize("worker", [stand_ins.stuck_at_the_start, stand_ins.without_a_beat, stand_ins.stuck_in_a_step])
+@pytest.mark.parametrize("worker", [stand_ins.stuck_in_a_step, *(
+    pytest.param(worker, marks=pytest.mark.long) for worker in (stand_ins.stuck_at_the_start, stand_ins.without_a_beat))])
 def test_one_that_gives_no_sign_is_killed(monkeypatch, tmp_path, log, worker):
     watch(monkeypatch, tmp_path, worker, lambda _: log.of("worker is gone"), stall_s=STALL_S)
     assert len(log.of("worker hangs: it is killed")) == len(log.of("worker is gone")) == 1

@@ -26,42 +26,46 @@ def job(idle_harness):
     return job
 
 
-def takeover(made, name, *, running=frozenset(), lock_lost=lambda: None):
-    lock = open_worker_lock(made.database, made.settings.locks, name)
-    assert lock.hold() is LockState.TAKEN
-    return lock, Takeover(made.database, made.queue, lock, name, every_s=1, max_lost=MAX_LOST, running=lambda: frozenset(running),
-                          beat=lambda: None, lock_lost=lock_lost)
+@pytest.fixture
+def takeover(idle_harness):
+    """Make the takeover of a worker of this name, whose lock is held to the end of the test."""
+    locks = []
+
+    def make(name, *, running=frozenset(), lock_lost=lambda: None):
+        locks.append(open_worker_lock(idle_harness.database, idle_harness.settings.locks, name))
+        assert locks[-1].hold() is LockState.TAKEN
+        return locks[-1], Takeover(idle_harness.database, idle_harness.queue, locks[-1], name, every_s=1, max_lost=MAX_LOST,
+                                   running=lambda: frozenset(running), beat=lambda: None, lock_lost=lock_lost)
+
+    yield make
+    for lock in locks:
+        lock.close()
 
 
-def let_go(made, lock, name):
-    """Close a lock, and wait until the server, too, has ended the session."""
-    lock.close()
-    other = open_worker_lock(made.database, made.settings.locks, name)
-    made.until(lambda: other.hold() is not LockState.REFUSED, "let go")
-    return other
-
-
-def test_a_dead_workers_job_waits_for_another(idle_harness, job):
-    lock, one = takeover(idle_harness, "one")
+@pytest.mark.parametrize("cancelled", [False, True], ids=["going on", "cancelled"])
+def test_a_dead_workers_job_waits_for_another_or_is_called_off(idle_harness, takeover, job, cancelled):
+    if cancelled:
+        idle_harness.database.transact(lambda connection: jobs.cancel(connection, job))
+    _, one = takeover("one")
     one.round()
     row = idle_harness.row(job)
-    assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 1)
-    assert idle_harness.in_queue(job) == ("ENQUEUED", "work")
-    lock.close()
+    if cancelled:
+        assert row["state"] == jobs.CANCELLED and idle_harness.in_queue(job)[0] == "CANCELLED"
+    else:
+        assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 1)
+        assert idle_harness.in_queue(job) == ("ENQUEUED", "work")
 
 
-def test_a_living_workers_job_stays(idle_harness, job):
-    gone, _ = takeover(idle_harness, "gone")
-    lock, one = takeover(idle_harness, "one")
+def test_a_living_workers_job_stays(idle_harness, takeover, job):
+    takeover("gone")
+    _, one = takeover("one")
     one.round()
     assert idle_harness.row(job)["worker"] == "gone"
     assert idle_harness.in_queue(job)[0] == "PENDING"
-    lock.close()
-    gone.close()
 
 
-def test_nobody_is_given_up_for_dead_soon_after_the_own_lock_was_lost(idle_harness, job, monkeypatch):
-    lock, one = takeover(idle_harness, "one")
+def test_nobody_is_given_up_for_dead_soon_after_the_own_lock_was_lost(idle_harness, takeover, job, monkeypatch):
+    lock, one = takeover("one")
     found = iter([LockState.REFUSED, LockState.TAKEN])
     monkeypatch.setattr(lock, "hold", lambda: next(found, LockState.KEPT))
     for _ in range(1 + GRACE_ROUNDS):
@@ -69,12 +73,11 @@ def test_nobody_is_given_up_for_dead_soon_after_the_own_lock_was_lost(idle_harne
         assert idle_harness.row(job)["worker"] == "gone"
     one.round()
     assert idle_harness.row(job)["worker"] is None
-    lock.close()
 
 
-def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harness, job):
+def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harness, takeover, job):
     gone = Claim(job, 1, "gone")
-    lock, one = takeover(idle_harness, "one")
+    _, one = takeover("one")
     one.round()
     before = dict(idle_harness.row(job))
     assert not jobs.begin(idle_harness.database, Claim(job, 2, "gone"))
@@ -88,7 +91,6 @@ def test_a_worker_that_was_given_up_for_dead_changes_nothing_any_more(idle_harne
     assert not jobs.begin(idle_harness.database, gone)  # it had taken the job, and wakes up only now
     assert not idle_harness.database.transact(lambda connection: jobs.release(connection, gone))
     assert idle_harness.row(job)["worker"] == "two"
-    lock.close()
 
 
 def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_path):
@@ -111,21 +113,20 @@ def test_a_change_that_waits_for_the_takeover_changes_nothing(on_postgres, tmp_p
 
 
 @pytest.mark.long
-def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, job):
+def test_a_worker_is_lost_once_whoever_finds_it_and_however_often(idle_harness, takeover, job):
     gone = Claim(job, 1, "gone")
     for _ in range(2):  # one who died between the two halves of taking over leaves them to the next
         idle_harness.database.transact(lambda connection: jobs.record_lost_worker(connection, gone, MAX_LOST))
     assert idle_harness.row(job)["lost"] == 1
-    lock, one = takeover(idle_harness, "one")
+    _, one = takeover("one")
     one.round()
     assert idle_harness.row(job)["lost"] == 1
     assert idle_harness.in_queue(job)[0] == "ENQUEUED"
-    lock.close()
 
 
-def test_a_second_reaper_finds_nothing_to_do(idle_harness, job, monkeypatch):
-    first_lock, first = takeover(idle_harness, "one")
-    second_lock, second = takeover(idle_harness, "two")
+def test_a_second_reaper_finds_nothing_to_do(idle_harness, takeover, job, monkeypatch):
+    _, first = takeover("one")
+    _, second = takeover("two")
     before = idle_harness.queue.taken_by()
     first.round()
     idle_harness.take(job, "one")
@@ -137,12 +138,10 @@ def test_a_second_reaper_finds_nothing_to_do(idle_harness, job, monkeypatch):
     row = idle_harness.row(job)
     assert (row["worker"], row["state"], row["lost"]) == ("one", jobs.RUNNING, 1)
     assert idle_harness.in_queue(job)[0] == "PENDING"
-    first_lock.close()
-    second_lock.close()
 
 
-def test_a_job_that_loses_too_many_workers_fails(idle_harness, job):
-    lock, one = takeover(idle_harness, "one")
+def test_a_job_that_loses_too_many_workers_fails(idle_harness, takeover, job):
+    _, one = takeover("one")
     jobs.advance(idle_harness.database, Claim(job, 1, "gone"), StageProgress("open", 0, 1, None))
     for lost in range(1, MAX_LOST + 2):
         one.round()
@@ -153,12 +152,11 @@ def test_a_job_that_loses_too_many_workers_fails(idle_harness, job):
     row = idle_harness.row(job)
     assert row["state"] == jobs.FAILED and row["error"].startswith("lost 4 workers without progress (open): ")
     assert idle_harness.in_queue(job)[0] == "CANCELLED"
-    lock.close()
 
 
-def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, job):
+def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, takeover, job):
     database, gone = idle_harness.database, Claim(job, 1, "gone")
-    lock, one = takeover(idle_harness, "one")
+    _, one = takeover("one")
 
     def lose():
         one.round()
@@ -175,14 +173,13 @@ def test_more_frames_than_ever_before_count_as_a_finished_step(idle_harness, job
     assert idle_harness.row(job)["lost"] == 1
     jobs.finish_step(database, gone, ["frames 1-5"])
     assert idle_harness.row(job)["lost"] == 0
-    lock.close()
 
 
 @pytest.mark.long
-def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_job(idle_harness, job):
+def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_job(idle_harness, takeover, job):
     """The job came through that stage once, so that something else kills the workers; but not without end."""
     database, gone = idle_harness.database, Claim(job, 1, "gone")
-    lock, one = takeover(idle_harness, "one")
+    _, one = takeover("one")
 
     def come_to(*stages):
         row = idle_harness.row(job)
@@ -217,20 +214,10 @@ def test_a_worker_that_dies_before_the_furthest_stage_is_not_held_against_the_jo
     lose()
     row = idle_harness.row(job)
     assert (row["state"], row["error"].partition(":")[0]) == (jobs.FAILED, "lost 32 workers without progress (open)")
-    lock.close()
 
 
-def test_a_cancelled_job_of_a_dead_worker_is_called_off(idle_harness, job):
-    idle_harness.database.transact(lambda connection: jobs.cancel(connection, job))
-    lock, one = takeover(idle_harness, "one")
-    one.round()
-    assert idle_harness.row(job)["state"] == jobs.CANCELLED
-    assert idle_harness.in_queue(job)[0] == "CANCELLED"
-    lock.close()
-
-
-def test_what_a_worker_took_and_knows_nothing_of_goes_back(idle_harness, job):
-    lock, gone = takeover(idle_harness, "gone")
+def test_what_a_worker_took_and_knows_nothing_of_goes_back(idle_harness, takeover, job):
+    _, gone = takeover("gone")
     for _ in range(FORGOTTEN_ROUNDS - 1):
         gone.round()
     assert idle_harness.in_queue(job)[0] == "PENDING"
@@ -238,21 +225,21 @@ def test_what_a_worker_took_and_knows_nothing_of_goes_back(idle_harness, job):
     assert idle_harness.in_queue(job)[0] == "ENQUEUED"
     row = idle_harness.row(job)
     assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
-    lock.close()
 
 
-def test_what_a_worker_goes_on_with_stays(idle_harness, job):
-    lock, gone = takeover(idle_harness, "gone", running={workflow_id(job, 1)})
+def test_what_a_worker_goes_on_with_stays(idle_harness, takeover, job):
+    _, gone = takeover("gone", running={workflow_id(job, 1)})
     for _ in range(2 * FORGOTTEN_ROUNDS):
         gone.round()
     assert idle_harness.row(job)["worker"] == "gone"
-    lock.close()
 
 
-def test_a_worker_whose_lock_is_another_s_for_good_ends(idle_harness, job):
+def test_a_worker_whose_lock_is_another_s_for_good_ends(idle_harness, takeover, job):
     ends = []
-    lock, one = takeover(idle_harness, "one", lock_lost=lambda: ends.append("one"))
-    other = let_go(idle_harness, lock, "one")
+    lock, one = takeover("one", lock_lost=lambda: ends.append("one"))
+    lock.close()
+    other = open_worker_lock(idle_harness.database, idle_harness.settings.locks, "one")
+    idle_harness.until(lambda: other.hold() is not LockState.REFUSED, "let go")  # until the server, too, has ended the session
     for _ in range(GRACE_ROUNDS):
         one.round()
     assert ends == []

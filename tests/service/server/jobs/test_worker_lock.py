@@ -21,15 +21,9 @@ def test_a_worker_is_dead_when_it_lets_go(idle_harness):
     assert (one.hold(), two.hold()) == (LockState.TAKEN, LockState.TAKEN)
     assert (one.hold(), two.hold()) == (LockState.KEPT, LockState.KEPT)
     assert not is_dead(one, "two")
+    assert is_dead(one, "another")  # which never was
     two.close()
     idle_harness.until(lambda: is_dead(one, "two"), "seen to have let go")  # a server takes a moment to end a session
-    one.close()
-
-
-def test_a_worker_that_never_was_is_dead(idle_harness):
-    one, _ = pair(idle_harness)
-    one.hold()
-    assert is_dead(one, "another")
     one.close()
 
 
@@ -46,7 +40,7 @@ def test_one_alone_takes_over_and_the_dead_does_not_come_back_meanwhile(idle_har
         each.close()
 
 
-def test_the_locks_of_the_dead_leave_no_files(tmp_path):
+def test_the_locks_of_the_dead_leave_no_files_and_one_that_was_removed_is_taken_anew(tmp_path):
     one, two = FileWorkerLock(tmp_path, "one"), FileWorkerLock(tmp_path, "two")
     one.hold()
     two.hold()
@@ -54,9 +48,6 @@ def test_the_locks_of_the_dead_leave_no_files(tmp_path):
     assert is_dead(one, "two")
     one.close()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_whose_file_was_removed_is_taken_anew(tmp_path):
     one, two = FileWorkerLock(tmp_path, "one"), FileWorkerLock(tmp_path, "two")
     one.hold()
     two.hold()

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.clients import installed
+from tests.service.server.api.job_calls import admitted, finish, submit
 from tests.service.server_process import Server, serving
 
 SAMPLES = Path(__file__).resolve().parents[4] / "samples"
@@ -33,8 +34,7 @@ PICTURES = os.environ.get("RELIT_TEST_SCREENSHOTS")
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("pages"), "--anonymous", "--device", "cpu", sabotage="long", roots=str(SAMPLES),
-                 requests_per_second="10000", request_burst="10000", min_free_bytes="0") as running:
+    with serving(tmp_path_factory.mktemp("pages"), "--anonymous", "--device", "cpu", sabotage="long", roots=str(SAMPLES)) as running:
         yield running
 
 
@@ -114,17 +114,13 @@ class Solved:
 
 def done(server: Server, client, request: dict) -> str:
     """Submit a job, and return its identifier when it has succeeded."""
-    job = client.post("/v1/jobs", json=request).raise_for_status().json()["id"]
-    found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"), timeout_s=300)
-    assert found["state"] == "succeeded", found["error"]
-    return job
+    return finish(server, client, submit(client, **request))["id"]
 
 
 def prepared(server: Server, name: str, options: dict | None) -> Solved:
     """A sample, registered, solved unless `options` is None, and prepared for the pages."""
     with server.client() as client:
-        capture = client.post("/v1/captures", json={"name": name, "folder": str(SAMPLES / name)}).raise_for_status().json()["id"]
-        server.wait(client, f"/v1/captures/{capture}", ("ready",))
+        capture = admitted(server, client, SAMPLES / name)["id"]
         done(server, client, {"kind": "view", "capture": capture})
         return Solved(server, capture, None if options is None else solved_maps(server, client, capture, options))
 
@@ -160,6 +156,4 @@ def material(server: Server, solved: Solved, owl: Solved) -> Solved:
 def sky(server: Server) -> str:
     """An environment, registered and ready."""
     with server.client() as client:
-        file = str(SAMPLES / "owl" / "environment.exr")
-        made = client.post("/v1/environments", json={"name": "sky", "file": file}).raise_for_status().json()
-        return server.wait(client, f"/v1/environments/{made['id']}", ("ready", "refused"))["id"]
+        return admitted(server, client, SAMPLES / "owl" / "environment.exr", kind="environments")["id"]

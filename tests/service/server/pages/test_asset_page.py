@@ -8,7 +8,7 @@ import OpenImageIO as oiio
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, new_context
+from tests.service.server.pages.conftest import PAGE_BYTES, count_bytes, done, new_context
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -29,12 +29,7 @@ def page(small_page):
 def exported(server, solved) -> dict[str, str]:
     """The jobs that exported the solved capture, by format."""
     with server.client() as client:
-        jobs = {form: client.post("/v1/jobs", json={"kind": "export", "maps": solved.solve, "format": form}).raise_for_status().json()["id"]
-                for form in ("usdz", "glb", "usda")}
-        for job in jobs.values():
-            found = server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))
-            assert found["state"] == "succeeded", found["error"]
-    return jobs
+        return {form: done(server, client, {"kind": "export", "maps": solved.solve, "format": form}) for form in ("usdz", "glb", "usda")}
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +117,11 @@ def assert_shown(page, state: dict) -> None:
     assert picture[..., :3][covered].mean() > 60
 
 
-def test_an_environment_lights_from_where_it_is_bright(asset, tmp_path):
+def test_an_environment_lights_from_where_it_is_bright_and_turns_as_in_relit_relight(asset, tmp_path):
     for name, side in (("above_right.exr", 1), ("below_left.hdr", -1)):
         light_by(asset, patch(tmp_path / name, (side * np.sqrt(0.5), side * np.sqrt(0.5), 0)))
         assert (side * shift_of_light(asset) > SHIFT).all(), name
-
-
-def test_an_environment_turns_as_in_relit_relight(asset, tmp_path):
-    """Turned by 90 degrees, what shone from the camera (+z) shines from the right (+x)."""
-    light_by(asset, patch(tmp_path / "front.exr", (0, 0, 1)))
+    light_by(asset, patch(tmp_path / "front.exr", (0, 0, 1)))  # what shone from the camera (+z) shines from the right (+x)
     assert abs(shift_of_light(asset)[0]) < SHIFT
     asset.get_by_label("Turn (degrees)").fill("90")
     assert shift_of_light(asset)[0] > SHIFT
@@ -154,7 +145,7 @@ def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
             assert np.sign(frames[index]["direction"][axis]) * shift_of_light(asset)[axis] > SHIFT
 
 
-def test_the_keyboard_turns_it(asset):
+def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor_comes_back(asset):
     first = shown(asset)
     asset.locator("canvas.scene").focus()
     for _ in range(4):
@@ -162,10 +153,6 @@ def test_the_keyboard_turns_it(asset):
     assert not np.array_equal(first, shown(asset))
     asset.keyboard.press("0")
     assert np.array_equal(first, shown(asset))
-
-
-def test_it_is_shown_again_when_the_graphics_processor_comes_back(asset):
-    first = shown(asset)
     asset.evaluate("""() => {
       globalThis.lost = document.querySelector('canvas.scene').getContext('webgl2').getExtension('WEBGL_lose_context');
       lost.loseContext();
@@ -176,9 +163,13 @@ def test_it_is_shown_again_when_the_graphics_processor_comes_back(asset):
     assert np.array_equal(first, shown(asset))
 
 
-def test_a_job_without_an_asset_that_can_be_shown_is_said(page, exported):
+def test_a_job_without_an_asset_that_can_be_shown_is_said_and_without_webgl_the_file_is_offered(page, exported):
     page.goto(f"/asset/{exported['usda']}")
     page.get_by_text("this job has no asset.usdz or asset.glb").wait_for()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto(f"/asset/{exported['glb']}")
+    page.get_by_text("This browser has no WebGL2").wait_for()
+    assert page.get_by_role("link", name="Its job").get_attribute("href") == f"/jobs/{exported['glb']}"
 
 
 @pytest.mark.parametrize("form", ["usdz", "glb"])
@@ -210,13 +201,6 @@ def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp
     assert state["problems"] and all("is not in the file" in problem for problem in state["problems"])
     page.locator(".fault", has_text="is not in the file").first.wait_for()
     assert asked == []
-
-
-def test_without_webgl_the_file_is_still_offered(page, exported):
-    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
-    page.goto(f"/asset/{exported['glb']}")
-    page.get_by_text("This browser has no WebGL2").wait_for()
-    assert page.get_by_role("link", name="Its job").get_attribute("href") == f"/jobs/{exported['glb']}"
 
 
 def test_no_serious_violation(asset):

@@ -10,8 +10,11 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.tcp_proxy import tcp_proxy
+
+pytestmark = pytest.mark.long
 
 JOB_MS = 120_000
 """Time for a small job on a loaded machine."""
@@ -21,9 +24,7 @@ JOB_MS = 120_000
 def capture(server) -> str:
     """A small capture, registered and ready."""
     with server.client() as client:
-        made = client.post("/v1/captures", json={"name": "lambert", "folder": str(SAMPLES / "lambert")}).raise_for_status().json()
-        assert server.wait(client, f"/v1/captures/{made['id']}", ("ready", "refused"))["state"] == "ready"
-    return made["id"]
+        return admitted(server, client, SAMPLES / "lambert")["id"]
 
 
 def opened_form(page, title: str, options: bool = True):
@@ -48,7 +49,6 @@ def slow_job(client, capture: str, sky: str) -> str:
         "frames": "1-300", "spin_degrees": 360}}).raise_for_status().json()["id"]
 
 
-@pytest.mark.long
 def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
@@ -70,7 +70,6 @@ def test_a_form_submits_a_job_that_is_followed_to_its_results(server, page, capt
     assert json.loads(download.value.path().read_text()) == report
 
 
-@pytest.mark.long
 def test_patterns_are_drawn_from_the_page_of_jobs(page):
     """A job that reads nothing; its periods are typed as in a command."""
     page.goto("/jobs")
@@ -85,7 +84,6 @@ def test_patterns_are_drawn_from_the_page_of_jobs(page):
     page.locator("#results").get_by_text("patterns.json").wait_for()
 
 
-@pytest.mark.long
 def test_forms_of_several_captures_and_images(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
@@ -103,7 +101,6 @@ def test_forms_of_several_captures_and_images(page, capture):
     form.locator(".fault", has_text="Images: ").wait_for()
 
 
-@pytest.mark.long
 def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, capture, sky):
     """Both are run as they are shown, and make the same request as the form."""
     page.goto(f"/captures/{capture}")
@@ -125,7 +122,6 @@ def test_what_a_form_sends_is_shown_as_a_command_and_as_curl(server, page, captu
     assert requests[0]["options"]["exposure"] == -1.5 and requests[0]["name"] == "it's a test"
 
 
-@pytest.mark.long
 def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, capture):
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Solve normals")
@@ -142,7 +138,6 @@ def test_a_value_that_cannot_be_is_named_and_a_failed_job_is_tried_again(page, c
     page.locator("#state").get_by_text("attempt 2").wait_for(timeout=JOB_MS)
 
 
-@pytest.mark.long
 def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
     with server.client() as client:
         job = slow_job(client, capture, sky)
@@ -161,7 +156,6 @@ def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
         assert client.get(f"/v1/jobs/{job}").status_code == 404
 
 
-@pytest.mark.long
 def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
     """The connections of the page are cut, and new ones refused for a while; the job ends meanwhile."""
     with server.client() as client, tcp_proxy(urlsplit(server.url).port) as way:
@@ -178,8 +172,7 @@ def test_a_lost_connection_is_said_and_regained(server, browser, capture, sky):
         page.close()
 
 
-@pytest.mark.long
-def test_the_list_follows_all_jobs(server, page, capture):
+def test_the_list_follows_all_jobs_and_what_is_not_there_is_said(server, page, capture):
     page.goto("/jobs")
     with server.client() as client:
         request = {"kind": "solve", "capture": capture, "name": "seen", "options": {"method": "lambert"}}
@@ -188,8 +181,5 @@ def test_the_list_follows_all_jobs(server, page, capture):
         row.locator(".state.succeeded").wait_for(timeout=JOB_MS)
         client.delete(f"/v1/jobs/{job}").raise_for_status()
         row.wait_for(state="detached")
-
-
-def test_what_is_not_there_is_said(page):
     page.goto("/jobs/job_0123456789abcdefghjk")
     page.get_by_role("alert").get_by_text("there is no job_0123456789abcdefghjk in this project").wait_for()

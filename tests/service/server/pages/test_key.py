@@ -12,7 +12,7 @@ from tests.service.server_process import Server, serving
 
 @pytest.fixture(scope="module")
 def locked(tmp_path_factory: pytest.TempPathFactory):
-    with serving(tmp_path_factory.mktemp("locked"), "--device", "none", roots=str(SAMPLES), min_free_bytes="0") as running:
+    with serving(tmp_path_factory.mktemp("locked"), "--device", "none", roots=str(SAMPLES)) as running:
         yield running
 
 

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from service.client import Client
 from stage.colour.colour import rgb_matrix
 from stage.formats import exr
-from tests.scenes.captures import edit_manifest
+from tests.scenes.captures import edit_manifest, write_exr
 from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
 from tests.service.server.pages.frames import assert_same, encoded, picture, rendered
 
@@ -32,7 +31,7 @@ def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
 
 
 @pytest.mark.long
-def test_dragging_on_the_picture_moves_the_light(opened):
+def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(opened):
     box = opened.locator("canvas.picture").bounding_box()
     opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     opened.mouse.down()
@@ -41,6 +40,12 @@ def test_dragging_on_the_picture_moves_the_light(opened):
     opened.mouse.move(box["x"] + box["width"] / 2 - 0.3 * side, box["y"] + box["height"] / 2 - 0.2 * side)
     opened.mouse.up()
     assert np.allclose(opened.evaluate("() => relit.state().light.direction"), [-0.6, 0.4, np.sqrt(1 - 0.52)], atol=0.03)
+    opened.evaluate("() => relit.set([0, 0, -1])")
+    opened.get_by_text("100 % of the light comes from beyond the captured lights").wait_for()
+    assert opened.locator("canvas.picture.hatched").is_visible()
+    assert "beyond the captured lights" in opened.locator("output", has_text="from the camera").inner_text()
+    opened.evaluate("() => relit.set([0, 0, 1])")
+    opened.locator("canvas.picture:not(.hatched)").wait_for()
 
 
 @pytest.mark.long
@@ -80,22 +85,15 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
 
 
 @pytest.mark.long
-def test_the_first_page_opens_on_what_can_be_lit(page, solved):
+def test_arrow_keys_move_the_light_of_what_the_first_page_opens(page, solved):
     page.goto("/")
     page.wait_for_url("**/light/cap_*")
-
-
-@pytest.mark.long
-def test_the_view_transform_is_named(opened):
-    opened.get_by_text("Shown through sRGB (linear Rec.709, clipped, no tone mapping)").wait_for()
-
-
-@pytest.mark.long
-def test_arrow_keys_move_the_light(opened):
-    before = opened.evaluate("() => relit.state().light.direction")
-    opened.locator("canvas.dome").focus()
-    opened.keyboard.press("ArrowRight")
-    after = opened.evaluate("() => relit.state().light.direction")
+    solved.wait_for_content(page, "light")
+    page.get_by_text("Shown through sRGB (linear Rec.709, clipped, no tone mapping)").wait_for()
+    before = page.evaluate("() => relit.state().light.direction")
+    page.locator("canvas.dome").focus()
+    page.keyboard.press("ArrowRight")
+    after = page.evaluate("() => relit.state().light.direction")
     assert np.degrees(np.arccos(np.dot(before, after))) == pytest.approx(5, abs=1.5) and after[0] > before[0]
 
 
@@ -112,24 +110,12 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
         frames = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["frames"]
         image = [frame["image"] for frame in frames if frame["direction"] is not None][CAPTURED]
         keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
-        job = client.post("/v1/jobs", json={"kind": "relight", "capture": solved.capture, "keys": keys,
-                                            "options": {"exposure": exposure}}).raise_for_status().json()["id"]
-        assert solved.server.wait(client, f"/v1/jobs/{job}", ("succeeded", "failed"))["state"] == "succeeded"
+        job = done(solved.server, client, {"kind": "relight", "capture": solved.capture, "keys": keys, "options": {"exposure": exposure}})
     channels, _ = exr.read(solved.result(job, "frame.0001.exr", tmp_path))
     assert_same(shown, encoded(np.stack([channels[c] for c in "RGB"], axis=-1)), channels["A"])
 
 
 @pytest.mark.long
-def test_light_from_beyond_the_captured_is_said(opened):
-    """The lights of the sample are in front; light from behind is none of theirs."""
-    opened.evaluate("() => relit.set([0, 0, -1])")
-    opened.get_by_text("100 % of the light comes from beyond the captured lights").wait_for()
-    assert opened.locator("canvas.picture.hatched").is_visible()
-    assert "beyond the captured lights" in opened.locator("output", has_text="from the camera").inner_text()
-    opened.evaluate("() => relit.set([0, 0, 1])")
-    opened.locator("canvas.picture:not(.hatched)").wait_for()
-
-
 def test_without_webgl_it_is_said(browser, solved):
     context = new_context(browser, base_url=solved.server.url)
     context.add_init_script("HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, "
@@ -172,20 +158,12 @@ def aces(server, tmp_path_factory) -> Solved:
 @pytest.fixture(scope="module")
 def wide_sky(server, tmp_path_factory) -> str:
     """The sample's environment, its colours made saturated, in ACEScg, which the file declares by chromaticities alone."""
-    path = tmp_path_factory.mktemp("wide") / "wide.exr"
     channels, _ = exr.read(SAMPLES / "owl" / "environment.exr")
     rgb = np.stack([channels[c] for c in "RGB"], axis=-1) * np.linspace((0.1, 1, 3), (3, 1, 0.1), channels["R"].shape[1])
-    planes = dict(zip("RGB", np.moveaxis((rgb @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T).astype(np.float32), -1, 0), strict=True))
-    write_with_chromaticities(path, planes)
+    path = write_exr(tmp_path_factory.mktemp("wide") / "wide.exr", rgb @ rgb_matrix("lin_rec709_scene", "lin_ap1_scene").T,
+                     chromaticities=exr.chromaticities("lin_ap1_scene"))
     with Client(server.url) as client:
         return client.environments.upload(path).id
-
-
-def write_with_chromaticities(path: Path, planes: dict[str, np.ndarray]) -> None:
-    import OpenEXR
-
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": exr.chromaticities("lin_ap1_scene")}
-    OpenEXR.File(header, {name: np.ascontiguousarray(plane) for name, plane in planes.items()}).write(str(path))
 
 
 @pytest.mark.long
@@ -205,36 +183,17 @@ def test_colours_are_converted_as_the_batch_converts_them(page, capture, wide_sk
 
 
 @pytest.mark.long
-def test_an_unknown_colour_space_is_named(opened, tmp_path):
-    import OpenEXR
-
-    path = tmp_path / "odd.exr"
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
-              "chromaticities": (0.5, 0.3, 0.3, 0.5, 0.2, 0.1, 0.33, 0.33)}
-    OpenEXR.File(header, {name: np.ones((8, 16), dtype=np.float32) for name in "RGB"}).write(str(path))
-    opened.set_input_files("input[accept='.exr,.hdr']", path)
-    opened.get_by_role("alert").get_by_text("odd.exr: has chromaticities of no known colour space").wait_for(timeout=60_000)
-
-
-@pytest.mark.long
-def test_a_local_environment_is_shown_and_not_sent(opened):
-    opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
-    opened.locator("canvas.preview").wait_for(timeout=60_000)
-    opened.get_by_role("button", name="Render").click()
-    opened.get_by_text("environment.exr is a file of this machine: upload it").first.wait_for()
-    assert "/light/" in opened.url
-
-
-@pytest.mark.long
-def test_a_file_that_is_no_environment_is_named(opened, tmp_path):
-    broken = tmp_path / "broken.exr"
+def test_a_file_that_is_no_environment_or_of_an_unknown_colour_space_is_named(opened, tmp_path):
+    broken, odd = tmp_path / "broken.exr", tmp_path / "odd.exr"
     broken.write_bytes(b"nothing")
-    opened.set_input_files("input[accept='.exr,.hdr']", broken)
-    opened.get_by_role("alert").get_by_text("broken.exr: cannot be read as an environment map").wait_for(timeout=60_000)
+    write_exr(odd, np.ones((8, 16, 3)), chromaticities=(0.5, 0.3, 0.3, 0.5, 0.2, 0.1, 0.33, 0.33))
+    for path, words in ((broken, "cannot be read as an environment map"), (odd, "has chromaticities of no known colour space")):
+        opened.set_input_files("input[accept='.exr,.hdr']", path)
+        opened.get_by_role("alert").get_by_text(f"{path.name}: {words}").wait_for(timeout=60_000)
 
 
 @pytest.mark.long
-def test_an_environment_spins(opened):
+def test_a_local_environment_is_shown_spins_and_is_not_sent(opened):
     opened.set_input_files("input[accept='.exr,.hdr']", SAMPLES / "owl" / "environment.exr")
     opened.locator("canvas.preview").wait_for(timeout=60_000)
     before = picture(opened)
@@ -242,3 +201,6 @@ def test_an_environment_spins(opened):
     opened.wait_for_function("() => relit.state().environment.turn_degrees > 20")
     opened.get_by_role("button", name="Spin").click()
     assert np.abs(picture(opened) - before).mean() > 1 / 255
+    opened.get_by_role("button", name="Render").click()
+    opened.get_by_text("environment.exr is a file of this machine: upload it").first.wait_for()
+    assert "/light/" in opened.url

@@ -10,6 +10,8 @@ from stage.results.maps import SurfaceMaps
 from stage.stack.correction import Correction
 from tests.service.server.pages.conftest import SAMPLES
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def maps(solved, tmp_path_factory) -> SurfaceMaps:
@@ -39,7 +41,6 @@ def numbers(said: str, title: str) -> list[float]:
     return [float(each) for each in re.search(rf"{title} ([^;a-z]+)", said)[1].replace("−", "-").split(",")]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("layer", "title"), [("normal", "Normals"), ("diffuse_albedo", "Diffuse albedo"), ("height", "Height")])
 def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, title):
     """Four significant digits are shown."""
@@ -52,7 +53,6 @@ def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, tit
         assert "status: " in said
 
 
-@pytest.mark.long
 def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     unsure = (maps.status == 15) & (maps.mask == 0)
     assert unsure.any(), "the capture was solved so that some pixels are unsure"
@@ -71,7 +71,6 @@ def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     assert picture() == with_hatching
 
 
-@pytest.mark.long
 def test_the_map_is_moved_by_keys(opened, maps):
     canvas = opened.locator("canvas.map")
     canvas.focus()
@@ -89,8 +88,7 @@ def test_the_map_is_moved_by_keys(opened, maps):
     assert "row" in point_at(opened, 64, 64, len(maps.mask))
 
 
-@pytest.mark.long
-def test_two_layers_are_wiped(opened):
+def test_two_layers_are_wiped_and_the_range_of_the_histogram_changes_the_picture(opened):
     opened.get_by_label("Compare with", exact=True).first.select_option("height")
     wipe = opened.get_by_label("Where the two layers meet")
     pictures = set()
@@ -101,10 +99,6 @@ def test_two_layers_are_wiped(opened):
     assert len(pictures) == 3
     said = point_at(opened, 64, 64, 128)
     assert "Normals" in said and "Height" in said
-
-
-@pytest.mark.long
-def test_the_range_of_the_histogram_changes_the_picture(opened):
     opened.get_by_label("Layer", exact=True).first.select_option("height")
     opened.wait_for_timeout(500)
     before = opened.locator("canvas.map").screenshot()
@@ -132,7 +126,6 @@ def test_the_readings_of_a_pixel_are_plotted(opened, solved, maps):
     assert np.allclose(readings, expected, rtol=2e-3, atol=1e-5)  # half floats, four digits
 
 
-@pytest.mark.long
 def test_every_map_of_the_capture_is_shown(opened):
     """Each layer has tiles, a histogram or a legend, and a value under the cursor."""
     layers = opened.get_by_label("Layer", exact=True).first

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from stage.formats import exr
+from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.axe import violations
-from tests.service.server.pages.conftest import SAMPLES, new_context
+from tests.service.server.pages.conftest import SAMPLES, done, new_context
 from tests.service.server.pages.frames import pixels
 
 pytestmark = pytest.mark.long
@@ -27,15 +28,9 @@ def page(small_page):
 def depth(server) -> tuple[str, str]:
     """The job of a depth, and that of its view."""
     with server.client() as client:
-        made = client.post("/v1/captures", json={"name": "rig", "folder": str(SAMPLES / "rig")}).raise_for_status().json()
-        server.wait(client, f"/v1/captures/{made['id']}", ("ready",))
-        jobs = []
-        for request in ({"kind": "depth"}, {"kind": "view"}):
-            maps = {"maps": jobs[0]} if jobs else {}
-            jobs.append(client.post("/v1/jobs", json={"capture": made["id"]} | request | maps).raise_for_status().json()["id"])
-            found = server.wait(client, f"/v1/jobs/{jobs[-1]}", ("succeeded", "failed"))
-            assert found["state"] == "succeeded", found["error"]
-    return jobs[0], jobs[1]
+        capture = admitted(server, client, SAMPLES / "rig")["id"]
+        made = done(server, client, {"kind": "depth", "capture": capture})
+        return made, done(server, client, {"kind": "view", "capture": capture, "maps": made})
 
 
 @pytest.fixture
@@ -49,7 +44,7 @@ def picture(page) -> np.ndarray:
     return pixels(page, "cloud.picture().pixels")
 
 
-def test_each_colouring_is_another_picture_of_the_same_points(cloud):
+def test_each_colouring_is_another_picture_of_the_same_points_of_which_the_unsure_can_be_hidden(cloud, server, depth):
     pictures = []
     for name in ("depth", "confidence", "photograph"):
         cloud.get_by_label("Colour by").select_option(name)
@@ -59,9 +54,6 @@ def test_each_colouring_is_another_picture_of_the_same_points(cloud):
     for other in pictures[1:]:
         assert np.array_equal(pictures[0][:, 3] > 0, other[:, 3] > 0)
         assert not np.array_equal(pictures[0], other)
-
-
-def test_unsure_points_can_be_hidden(cloud, server, depth):
     with server.client() as client:
         points = client.get(f"/v1/jobs/{depth[1]}/results/view.json").json()["points"]
     assert points["unsure"] > 0

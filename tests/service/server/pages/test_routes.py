@@ -40,7 +40,7 @@ class Document(HTMLParser):
 
 
 @pytest.mark.parametrize("path", PAGES)
-def test_a_page_is_complete(server, path):
+def test_a_page_is_complete_and_its_policy_allows_this_origin_alone(server, path):
     with server.client() as client:
         answer = client.get(path)
         assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/html")
@@ -51,12 +51,7 @@ def test_a_page_is_complete(server, path):
         for address in found.loads:
             assert address.startswith("/static/")
             assert client.get(address).status_code == 200, address
-
-
-@pytest.mark.parametrize("path", PAGES)
-def test_the_content_security_policy_allows_this_origin_alone(server, path):
-    with server.client() as client:
-        headers = client.get(path).headers
+    headers = answer.headers
     policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
     assert policy["default-src"] == "'none'" and policy["frame-ancestors"] == "'none'" and policy["base-uri"] == "'none'"
     assert re.fullmatch(r"'self' 'sha256-[A-Za-z0-9+/=]{44}'", policy["script-src"])
@@ -66,13 +61,10 @@ def test_the_content_security_policy_allows_this_origin_alone(server, path):
     assert headers["x-content-type-options"] == "nosniff"
 
 
-def test_an_identifier_that_cannot_be_is_no_page(server):
+def test_what_is_no_page_and_what_the_document_of_the_api_lists(server):
     with server.client() as client:
         assert client.get("/captures/<script>").status_code == 422
         assert client.get("/nothing").status_code == 404
-
-
-def test_the_document_of_the_api_lists_no_pages(server):
     with server.client() as client:
         paths = set(client.get("/v1/openapi.json").json()["paths"])
     assert paths - {"/healthz", "/readyz", "/metrics"} == {path for path in paths if path.startswith("/v1/")}

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.scenes.sequence import write_sequence
-from tests.service.server.api.test_measuring import upload
+from tests.service.server.api.test_measuring import files_of, upload
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import CONTENT_MS, done, new_context
 
@@ -17,13 +17,12 @@ def walk(server, tmp_path_factory) -> tuple[str, str]:
     """The capture of a sequence, and the job that solved it."""
     folder = tmp_path_factory.mktemp("walk")
     write_sequence(folder, [None] * STEPS, noise=0.01, size=16)
-    files = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with server.client() as client:
-        capture = upload(server, client, files)["id"]
+        capture = upload(server, client, files_of(folder))["id"]
         return capture, done(server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
 
 
-def test_the_maps_of_each_step_are_looked_at(page, walk):
+def test_the_maps_and_the_frames_of_each_step_are_looked_at(page, walk):
     page.goto(f"/jobs/{walk[1]}")
     page.get_by_role("link", name="Look at the maps").click()
     page.get_by_role("heading", name="Maps of step00", level=1).wait_for(timeout=CONTENT_MS)
@@ -37,6 +36,14 @@ def test_the_maps_of_each_step_are_looked_at(page, walk):
     page.get_by_role("heading", name="Maps of step02", level=1).wait_for(timeout=CONTENT_MS)
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
     assert page.get_by_role("button", name="Step after").is_disabled()
+    page.goto(f"/captures/{walk[0]}?step=2")
+    page.locator("#frames canvas").first.wait_for(timeout=CONTENT_MS)
+    assert page.get_by_label("Time step").input_value() == "2"
+    assert page.get_by_role("link", name="Light it").is_hidden()
+    page.goto(f"/jobs/{walk[1]}")
+    page.locator("#results a").first.wait_for(timeout=CONTENT_MS)
+    assert page.get_by_role("link", name="Light the capture").is_hidden()
+    page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)
 
 
 def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
@@ -46,15 +53,3 @@ def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
     page.locator("canvas.map").first.wait_for(timeout=CONTENT_MS)
     assert violations(page) == []
     page.close()
-
-
-def test_the_frames_of_each_step_are_on_the_page_of_the_capture(page, walk):
-    """The view of the capture is prepared first, as for every capture that is opened for the first time."""
-    page.goto(f"/captures/{walk[0]}?step=2")
-    page.locator("#frames canvas").first.wait_for(timeout=CONTENT_MS)
-    assert page.get_by_label("Time step").input_value() == "2"
-    assert page.get_by_role("link", name="Light it").is_hidden()
-    page.goto(f"/jobs/{walk[1]}")
-    page.locator("#results a").first.wait_for(timeout=CONTENT_MS)
-    assert page.get_by_role("link", name="Light the capture").is_hidden()
-    page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)

@@ -6,12 +6,11 @@ there); without it moto's is started where moto is installed.
 
 import importlib.util
 import os
-import socket
 import subprocess
 import sys
-import time
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import httpx2
@@ -21,9 +20,9 @@ from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import ObjectStorage, Storage
 from service.server.storage.scratch import Scratch
+from tests.service.waiting import free_port, until
 
 LIMIT = 1 << 30
-START_S = 60.0
 BUCKET = "relit-test"
 
 
@@ -35,9 +34,7 @@ def s3_server() -> Iterator[str]:
         return
     if importlib.util.find_spec("moto") is None:
         pytest.skip("no S3 server: name one in RELIT_TEST_S3, or install moto[server]")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     process = subprocess.Popen([sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)], stdout=subprocess.DEVNULL,
                                stderr=subprocess.DEVNULL)
     try:
@@ -54,28 +51,35 @@ def s3(s3_server: str, monkeypatch: pytest.MonkeyPatch) -> str:
         monkeypatch.setenv(name, value)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, os.environ.get(name, "test"))
-    deadline = time.monotonic() + START_S
-    while True:
-        try:
-            httpx2.put(f"{s3_server}/{BUCKET}", timeout=5)  # there already, or not ours to make: the tests tell
-            break
-        except httpx2.TransportError:
-            assert time.monotonic() < deadline, f"no S3 server answers at {s3_server}"
-            time.sleep(0.1)
+
+    def answers() -> bool:
+        with suppress(httpx2.TransportError):
+            return httpx2.put(f"{s3_server}/{BUCKET}", timeout=5).status_code > 0  # there already, or not ours to make: the tests tell
+        return False
+
+    until(answers, f"no S3 server answers at {s3_server}", every_s=0.1)
     return f"s3://{BUCKET}/{uuid.uuid4()}"
+
+
+FILE_OR_S3 = ["file", pytest.param("s3", marks=pytest.mark.long)]
+
+
+@pytest.fixture(params=FILE_OR_S3)
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """The URL of an empty object store."""
+    return (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
 
 
 Machine = Callable[[str], Storage]
 
 
-@pytest.fixture(params=["file", pytest.param("s3", marks=pytest.mark.long)])
-def machine(request: pytest.FixtureRequest, tmp_path: Path) -> Machine:
+@pytest.fixture
+def machine(url: str, tmp_path: Path) -> Machine:
     """The same object store as machines of these names see it, each with a disk of its own."""
-    url = (tmp_path / "store").as_uri() if request.param == "file" else request.getfixturevalue("s3")
     return lambda name: ObjectStorage(Bucket(url), Scratch(tmp_path / name, LIMIT))
 
 
-@pytest.fixture(params=["folder", "file", pytest.param("s3", marks=pytest.mark.long)])
+@pytest.fixture(params=["folder", *FILE_OR_S3])
 def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
     """A storage of each kind."""
     if request.param == "folder":

@@ -5,9 +5,6 @@ from pathlib import Path
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
 from service.server.base.settings import Settings
-from service.server.database.jobs import FRAMES
-from service.server.jobs import progress as progresses
-from service.server.jobs.progress import JobProgress
 from service.server.jobs.steps import KEYS_FILE
 from service.server.storage import layout, objects, scratch
 from service.server.storage.objects import SCRATCH
@@ -27,17 +24,3 @@ def test_every_name_is_in_the_docs(tmp_path):
         assert name in TEXT, name
     assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
     assert scratch.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT
-
-
-def test_frames_are_not_counted_backwards_while_they_are_sent(monkeypatch):
-    """A later chunk of a relight: what the store is told while its frames are made, and then sent."""
-    told = []
-    monkeypatch.setattr(progresses, "EVERY_S", 0.0)
-    monkeypatch.setattr(progresses.jobs, "advance", lambda database, claim, progress, **_: told.append(progress[:3]) or True)
-    progress = JobProgress(None, None, alive=lambda: None, frame_offset=4, frame_count=10)
-    progress.stage("open", 1)
-    for stage, total in ((FRAMES, 2), ("upload", 2)):
-        progress.stage(stage, total)
-        for done in (1, 2):
-            progress.advance(done)
-    assert told == [(FRAMES, done, 10) for done in (4, 4, 5, 6, 6, 6, 6)]

@@ -6,7 +6,6 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,16 +13,16 @@ import httpx2
 import numpy as np
 import pytest
 
-from service.requests.base.identifiers import new_id
-from service.requests.jobs import SolveJob
 from service.server.base.settings import Settings
-from service.server.database import jobs, uploads
+from service.server.database import uploads
 from service.server.database.engine import connect
 from service.server.storage import upload_parts
 from service.server.storage.objects import open_storage
 from service.server.storage.upload_parts import open_upload_parts
+from tests.service.server.api.test_watch import queue
 from tests.service.server.api.tus import Tus, encoded
 from tests.service.server_process import Server, serving
+from tests.service.waiting import at_once, until
 
 pytestmark = pytest.mark.long
 
@@ -41,8 +40,7 @@ class Site(NamedTuple):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory, server_postgres) -> Iterator[Site]:
     folder = tmp_path_factory.mktemp("apis")
-    settings = {"database_url": server_postgres.new_database(), "storage_url": (folder / "store").as_uri(), "min_free_bytes": "0",
-                "requests_per_second": "10000", "request_burst": "10000"}
+    settings = {"database_url": server_postgres.new_database(), "storage_url": (folder / "store").as_uri()}
     options = ("--anonymous", "--device", "none")
     with serving(folder / "one", *options, **settings) as first, serving(folder / "two", *options, **settings) as second:
         yield Site(first, second, folder / "store", settings)
@@ -81,15 +79,7 @@ def test_of_two_requests_for_one_upload_one_is_refused(site):
     """Both got 204, and the file had the bytes of either."""
     capture, upload = begun(site, CONTENT)
     for at in range(0, len(CONTENT), MIB):
-        bodies = [bytes([number]) * MIB for number in (1, 2)]
-        start = threading.Barrier(2)
-
-        def send(server: Server, body: bytes, at=at, start=start) -> int:
-            start.wait()
-            return Tus(server.url).patch(upload, at, body).status
-
-        with ThreadPoolExecutor(2) as pool:
-            found = sorted(pool.map(send, (site.first, site.second), bodies))
+        found = sorted(at_once(2, lambda number, at=at: Tus(site[number].url).patch(upload, at, bytes([number]) * MIB).status))
         assert found[0] == 204 and found[1] in (409, 423)
     content = stored(site, capture).read_bytes()
     assert len(content) == len(CONTENT) and all(len(set(content[at : at + MIB])) == 1 for at in range(0, len(content), MIB))
@@ -116,10 +106,8 @@ def test_what_came_before_a_connection_broke_goes_on_at_the_other_api(site):
     with pytest.raises(ConnectionError):
         httpx2.patch(f"{site.first.url}{upload}", content=cut(), headers={
             "Tus-Resumable": "1.0.0", "Upload-Offset": "0", "Content-Type": "application/offset+octet-stream"})
-    two, deadline = Tus(site.second.url), time.monotonic() + 30
-    while (offset := two.head(upload).offset) == 0:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    two = Tus(site.second.url)
+    offset = until(lambda: two.head(upload).offset)
     assert offset <= 2 * MIB
     assert two.patch(upload, offset, CONTENT[offset:]).offset == len(CONTENT)
     assert stored(site, capture).read_bytes() == CONTENT
@@ -128,10 +116,8 @@ def test_what_came_before_a_connection_broke_goes_on_at_the_other_api(site):
 def test_results_have_the_same_etag_at_every_api(site):
     """They were of the copy, so that an interrupted download could not be continued at the other."""
     with site.first.client() as one, site.second.client() as two:
-        database = connect(Settings(data=site.first.data, **site.settings).sqlalchemy_url)
-        job = database.transact(lambda connection: jobs.insert(
-            connection, project="default", key=None, request=SolveJob(kind="solve", capture=new_id("cap")), chunk_frames=1, inputs=[]))
-        database.close()
+        with site.first.database() as database:
+            job = queue(database, "default")
         folder = site.store / "projects/default/jobs" / job
         folder.mkdir(parents=True)
         (folder / "maps.exr").write_bytes(CONTENT)
@@ -215,9 +201,7 @@ def test_the_upload_of_an_api_that_was_killed_goes_on_at_another(site, tmp_path)
         one = Tus(site.first.url)
         assert one.patch(upload, MIB, CONTENT[MIB:]).status == 423
         os.killpg(third.process.pid, signal.SIGKILL)
-        deadline = time.monotonic() + 3 * upload_parts.LEASE_S
-        while (answer := one.patch(upload, MIB, CONTENT[MIB:])).status == 423:
-            assert time.monotonic() < deadline
-            time.sleep(1)
+        answer = until(lambda: (found := one.patch(upload, MIB, CONTENT[MIB:])).status != 423 and found, "still locked",
+                       within_s=3 * upload_parts.LEASE_S, every_s=1)
         assert answer.offset == len(CONTENT)
         assert stored(site, capture).read_bytes() == CONTENT
