@@ -20,8 +20,10 @@ test: $(VENV)/installed-dev
 	$(PYTEST) -m "not long"
 
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
+# and the kernels as on a GPU, on an emulated one
 test-all: $(VENV)/installed-dev
 	$(PYTEST)
+	$(PYTEST) --device-emulated -m "not long" tests/kernels
 
 # keeps what Python compiles of modules and tests
 compiled: $(VENV)/installed-dev

@@ -21,6 +21,8 @@ import warp as wp
 from kernels.errors import ArrayError, DeviceError
 
 wp.config.log_level = wp.LOG_ERROR  # the caller reports the device; compiling shows as progress, not as lines
+wp.config.cuda_output = "cubin"  # else the driver compiles, and its version decides the last bits
+wp.config.enable_backward = False  # nothing is differentiated, and a backward pass takes longer to compile than the kernel
 
 PACK_CPU = 32
 """Pixels per thread on the CPU: wide enough for the compiler to fill SIMD registers (docs/figures.md)."""
@@ -37,6 +39,9 @@ CUDA_BLOCK = 256
 """Threads of a CUDA block."""
 MAX_THREADS = 2**31 - 1
 """Largest number of threads of one launch: kernels count threads in 32 bits."""
+
+MOST_BATCH_BYTES = 4 * 2**31
+"""Largest batch: kernels count its float32 values in 32 bits."""
 
 EVERY = "all"
 """Stands for every CUDA device of the machine."""
@@ -77,8 +82,31 @@ def resolve(name: str | None = None) -> str:
         return next((n for n in available if n.startswith("cuda")), "cpu")
     wanted = "cuda:0" if name == "cuda" else name
     if wanted not in available:
-        raise DeviceError(f"device {name} is not on this machine: choose one of {', '.join(available)}")
+        hint = outdated_driver() if wanted.startswith("cuda") else None
+        raise DeviceError(f"device {name} is not on this machine: choose one of {', '.join(available)}{f'; {hint}' if hint else ''}")
     return wanted
+
+
+def outdated_driver() -> str | None:
+    """Return a sentence if the driver of the machine's GPU is too old for Warp, which then finds no GPU, else None."""
+    _start()
+    driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    if driver is None or toolkit is None or driver[0] >= toolkit[0]:
+        return None
+    return (f"the NVIDIA driver of this machine supports CUDA {driver[0]}.{driver[1]}, and Warp needs CUDA {toolkit[0]}.0 or newer, so "
+            "that its GPU cannot be used: install a newer driver")
+
+
+def batch_bytes(device: str, on_cpu: int) -> int:
+    """Return the memory for what a device works on at one time: `on_cpu` bytes on the CPU, 1/16 of the memory of a GPU if that is more.
+
+    On a GPU a batch has to give work to all multiprocessors: 1/16 of an H200 is a million pixels of 96 lights. The whole memory and not
+    the free is divided, so that workers that share a solve cut it alike.
+    """
+    if device == "cpu":
+        return on_cpu
+    share = 1 << ((wp.get_device(device).total_memory // 16).bit_length() - 1)
+    return max(on_cpu, min(share, MOST_BATCH_BYTES))
 
 
 def resolve_all(name: str | None = None) -> tuple[str, ...]:
@@ -116,8 +144,11 @@ def describe(device: str) -> str:
 
 
 def kind(device: str) -> str:
-    """Return what devices have in common that find the same to the last bit: the model, and on the CPU the count of threads."""
-    return f"cpu, {_cpu_model()}, {worker_count()} threads" if device == "cpu" else wp.get_device(device).name
+    """Return what devices have in common that find the same to the last bit: the model, and the count of threads or the compiler."""
+    if device == "cpu":
+        return f"cpu, {_cpu_model()}, {worker_count()} threads"
+    found = wp.get_device(device)
+    return f"{found.name}, driver {wp.get_cuda_driver_version()}, {found.get_cuda_output_format()}"
 
 
 @cache
@@ -223,6 +254,9 @@ def _start() -> None:
             for line in said.read().decode(errors="replace").splitlines():
                 if "NVIDIA CUDA driver" not in line:
                     print(line, file=sys.stderr)
+    for found in wp.get_cuda_devices():
+        if found.is_mempool_enabled:
+            wp.set_mempool_release_threshold(found, 1.0)  # else every wait for the device gives its memory back
 
 
 @once

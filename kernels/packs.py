@@ -200,14 +200,12 @@ def place(array: np.ndarray, device: str) -> tuple[wp.array, Any]:
     """
     pack, dtype = devices.pack_width(device), wp.dtype_from_numpy(array.dtype)
     short = -array.shape[1] % pack
+    row_stride, stride = array.strides
+    if short or stride != array.itemsize or not 0 <= row_stride < STRIDE_LIMIT:
+        array = np.ascontiguousarray(np.pad(array, [(0, 0), (0, short)]))
     if device == "cpu":
-        row_stride, stride = array.strides
-        if short or stride != array.itemsize or not 0 <= row_stride < STRIDE_LIMIT:
-            array = np.ascontiguousarray(np.pad(array, [(0, 0), (0, short)]))
         view = wp.array(ptr=array.ctypes.data, shape=(array.shape[0], array.shape[1] // pack),
                         strides=(array.strides[0], pack * array.itemsize), dtype=pack_type(pack, dtype), device="cpu", copy=False)
         return view, array
-    if short:
-        array = np.pad(array, [(0, 0), (0, short)])
     owner = wp.array(array, dtype=dtype, device=device)
     return as_packs(owner, device), owner

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from kernels import device as devices
+from tests import emulated_device
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # as after `make test &`, whose shell ignores Ctrl-C for it: so does the run itself, but a program inherits only what is ignored and not
@@ -16,10 +17,29 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 
 
-@pytest.fixture(params=devices.names())
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let the tests of all devices run as on a machine with a GPU."""
+    parser.addoption("--device-emulated", action="store_true", help="run tests of devices, and no others, on an emulated cuda:0")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Add the emulated device before modules of tests ask for the devices."""
+    devices.names()
+    if config.getoption("--device-emulated"):
+        emulated_device.install()
+
+
+@pytest.fixture
 def device(request: pytest.FixtureRequest) -> str:
-    """Each device of this machine: the CPU always, CUDA where present."""
+    """Each device of this machine: the CPU always, CUDA where present; or the emulated device alone."""
     return request.param
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that takes a device once for each."""
+    if "device" in metafunc.fixturenames:
+        names = [emulated_device.NAME] if metafunc.config.getoption("--device-emulated") else devices.names()
+        metafunc.parametrize("device", names, indirect=True)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
@@ -57,12 +77,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
     return Together(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the folders of which one process has all, and spread the files that start other programs evenly over the run.
 
     Side by side these would wait for each other's processor time. Files with more long tests come first, so that at the end no process of
     the run is left with one of them.
     """
+    if config.getoption("--device-emulated"):
+        items[:] = [item for item in items if "device" in getattr(item, "fixturenames", ())]
     groups: dict[str, list[pytest.Item]] = {}
     for item in items:
         groups.setdefault(together(item.nodeid.partition("::")[0]), []).append(item)

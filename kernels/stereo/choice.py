@@ -126,7 +126,7 @@ def _choice_kernel(pack: int) -> Any:
         best = int(held[0])
         lowest = int(least[0])
         for k in range(1, pack):
-            if int(least[k]) < lowest:
+            if int(least[k]) < lowest or (int(least[k]) == lowest and int(held[k]) < best):  # the smaller label, whatever the pack width
                 lowest = int(least[k])
                 best = int(held[k])
         label[r, c] = best

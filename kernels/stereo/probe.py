@@ -74,10 +74,13 @@ def _probe_kernel(pack: int) -> Any:
         col = i - row * across
         r = wp.min(row * step + step // 2, rows - 1)
         c = wp.min(col * step + step // 2, cols - 1)
-        best = cost_pack()
-        where = sum_pack()
+        # the three best labels of each lane: two of one lane can lie within APART of the chosen one
+        best, better, good = cost_pack(), cost_pack(), cost_pack()
+        where, where_better, where_good = sum_pack(), sum_pack(), sum_pack()
         for k in range(pack):
             best[k] = float(FAR)
+            better[k] = float(FAR)
+            good[k] = float(FAR)
         for j in range(packs):
             at = c + start + j * pack
             sums = sum_pack()
@@ -93,18 +96,24 @@ def _probe_kernel(pack: int) -> Any:
             held = seen[r, at]
             for k in range(pack):
                 cost = wp.where(held[k] > wp.uint8(0), scale * float(sums[k]), float(9 * CHANCE))
-                where[k] = wp.where(cost < best[k], j * pack + k, where[k])
+                here_label = j * pack + k
+                where_good[k] = wp.where(cost < better[k], where_better[k], wp.where(cost < good[k], here_label, where_good[k]))
+                good[k] = wp.min(good[k], wp.max(better[k], cost))
+                where_better[k] = wp.where(cost < best[k], where[k], wp.where(cost < better[k], here_label, where_better[k]))
+                better[k] = wp.min(better[k], wp.max(best[k], cost))
+                where[k] = wp.where(cost < best[k], here_label, where[k])
                 best[k] = wp.min(cost, best[k])
         least = best[0]
         chosen = where[0]
         for k in range(1, pack):
-            if best[k] < least:
+            if best[k] < least or (best[k] == least and where[k] < chosen):  # the smaller label, whatever the pack width
                 least = best[k]
                 chosen = where[k]
         second = float(FAR)
         for k in range(pack):
-            if wp.abs(where[k] - chosen) > APART:
-                second = wp.min(second, best[k])
+            second = wp.min(second, wp.where(wp.abs(where[k] - chosen) > APART, best[k], float(FAR)))
+            second = wp.min(second, wp.where(wp.abs(where_better[k] - chosen) > APART, better[k], float(FAR)))
+            second = wp.min(second, wp.where(wp.abs(where_good[k] - chosen) > APART, good[k], float(FAR)))
         label[row, col] = chosen
         lead[row, col] = (second - least) / float(9 * CHANCE)
 

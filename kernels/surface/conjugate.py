@@ -86,9 +86,9 @@ def _dot(first: int,
 
 
 @wp.func
-def _ratio(over: wp.array(dtype=wp.float64), i: int, under: wp.array(dtype=wp.float64), j: int):
-    """Compute over[i] / under[j], and 0 once the iteration has converged fully."""
-    return wp.where(under[j] > wp.float64(0.0), wp.float32(over[i] / under[j]), 0.0)
+def _ratio(over: wp.float64, under: wp.float64, goal: wp.float64):
+    """Compute over / under, and 0 once `over` has reached the goal: iterations until the host knows it divide rounding errors."""
+    return wp.where(over > goal and under > wp.float64(0.0), wp.float32(over / under), 0.0)
 
 
 @wp.kernel
@@ -97,13 +97,14 @@ def _advance(first: int,
              rz: wp.array(dtype=wp.float64),
              pq: wp.array(dtype=wp.float64),
              step: int,
+             goal: wp.float64,
              p: wp.array(dtype=wp.float32),
              q: wp.array(dtype=wp.float32),
              # outputs
              h: wp.array(dtype=wp.float32),
              residual: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
-    alpha = _ratio(rz, step, pq, step)
+    alpha = _ratio(rz[step], pq[step], goal)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
         h[i] = h[i] + alpha * p[i]
         residual[i] = residual[i] - alpha * q[i]
@@ -114,12 +115,13 @@ def _turn(first: int,
           walk: Walk,
           rz: wp.array(dtype=wp.float64),
           step: int,
+          goal: wp.float64,
           z: wp.array(dtype=wp.float32),
           # outputs
           p: wp.array(dtype=wp.float32)):
     """Compute the next direction of search."""
     t = first + wp.tid()
-    beta = _ratio(rz, step + 1, rz, step)
+    beta = _ratio(rz[step + 1], rz[step], goal)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
         p[i] = z[i] + beta * p[i]
 
@@ -166,20 +168,20 @@ class Solver:
         run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)
         wp.copy(self.p, self.z)
-        norm = self._norm(0)
-        goal, start, step = tolerance * norm, norm, 0
-        while norm > goal and step < self.max_iterations:
+        start = square = self._square(0)
+        goal, step = (tolerance * math.sqrt(start)) ** 2, 0
+        while square > goal and step < self.max_iterations:
             run(_multiply, grid.sums, [self.slopes.weights, self.p], [self.q, self.summer.partial])
             self.summer.finish(self.pq, step)
-            run(_advance, grid.cells, [self.rz, self.pq, step, self.p, self.q], [h, self.residual])
+            run(_advance, grid.cells, [self.rz, self.pq, step, goal, self.p, self.q], [h, self.residual])
             self._precondition(step + 1)
-            run(_turn, grid.cells, [self.rz, step, self.z], [self.p])
+            run(_turn, grid.cells, [self.rz, step, goal, self.z], [self.p])
             step += 1
             if step % every == 0 or step == self.max_iterations:
-                norm = self._norm(step)
-                if progress is not None and norm > 0.0:
-                    progress(min(1.0, math.log(start / norm) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
-        return Convergence(step, norm / start if start > 0.0 else 0.0, norm <= goal)
+                square = self._square(step)
+                if progress is not None and square > 0.0:
+                    progress(min(1.0, math.log(start / square) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
+        return Convergence(step, math.sqrt(square) / math.sqrt(start) if start > 0.0 else 0.0, square <= goal)
 
     def _precondition(self, slot: int) -> None:
         """z = B·residual, rz[slot] = residual·z."""
@@ -187,5 +189,6 @@ class Solver:
         run(_dot, self.grid.sums, [self.residual, self.z], [self.summer.partial])
         self.summer.finish(self.rz, slot)
 
-    def _norm(self, slot: int) -> float:
-        return math.sqrt(max(0.0, float(self.rz[slot : slot + 1].numpy()[0])))
+    def _square(self, slot: int) -> float:
+        """Return the square of the residual's norm."""
+        return max(0.0, float(self.rz[slot : slot + 1].numpy()[0]))

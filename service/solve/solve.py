@@ -131,6 +131,8 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged) -> SolveResul
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
     solution.warnings += height_warnings(judged.guessed, method)
+    outdated = devices.outdated_driver() if request.device is None else None
+    solution.warnings += [outdated] if outdated else []
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents) | {HASHING: str(LAYOUT)}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)

@@ -2,14 +2,19 @@
 
 Kernels are discovered: every Warp kernel of a module of kernels/, and every kernel that a cached factory of a module returns. A factory's
 `pack` or `lanes` is what CUDA takes; its other arguments are told by their annotations, each value in turn beside the first of the others.
+
+Where the PyPI package nvidia-cuda-nvcc is installed (13.4 or newer), its assembler tells the registers of the kernels in
+cuda_resources.txt, and no number there may grow.
 """
 
-import importlib
+import importlib.util
 import inspect
 import pkgutil
 import re
+import subprocess
 from collections.abc import Iterator
 from functools import _lru_cache_wrapper, partial
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import pytest
@@ -94,6 +99,13 @@ def discovered() -> dict[str, Any]:
 
 
 KERNELS = discovered()
+TABLE = Path(__file__).with_name("cuda_resources.txt")
+HOT = {name: tuple(map(int, numbers)) for name, *numbers in (line.rsplit(maxsplit=4) for line in TABLE.read_text().splitlines()
+                                                             if not line.startswith("#"))}
+nvidia = importlib.util.find_spec("nvidia")
+PACKAGES = nvidia.submodule_search_locations if nvidia else ()
+PTXAS = next((found for folder in PACKAGES for found in Path(folder).glob("*/bin/ptxas")), None)
+"""Assembler of the PyPI package nvidia-cuda-nvcc, where it is installed."""
 
 
 def test_kernels_are_discovered():
@@ -111,6 +123,21 @@ def test_kernels_are_discovered():
 @pytest.mark.parametrize("name", KERNELS)
 def test_kernel_compiles_for_cuda_and_keeps_its_packs_in_registers(name, tmp_path):
     wp.compile_aot_module(KERNELS[name]().module, arch=OLDEST, module_dir=tmp_path, use_ptx=True)
-    ptx, = (path.read_text(encoding="latin-1") for path in tmp_path.glob("*.ptx"))
+    path, = tmp_path.glob("*.ptx")
+    ptx = path.read_text(encoding="latin-1").rstrip("\0")
     # an array indexed at run time would lie in local memory: slow
     assert ".entry" in ptx and set(re.findall(r"__local_depot\d+\[(\d+)\]", ptx)) <= SINE_DEPOT
+    assert "_backward" not in ptx  # nothing is differentiated
+    if name in HOT and PTXAS is not None:
+        path.write_text(ptx, encoding="latin-1")  # ptxas refuses the NUL at the end
+        found, known = resources(path), HOT[name]
+        assert all(now <= then for now, then in zip(found, known, strict=True)), f"{found}, and before {known}: see {TABLE.name}"
+
+
+def resources(ptx: Path) -> tuple[int, ...]:
+    """Return what the kernels of a file take on an H100, as the table has it: registers, bytes of stack and of spills, and 16-bit loads."""
+    command = [PTXAS, "-v", "-arch=sm_90", "-O3", ptx, "-o", ptx.with_suffix(".cubin")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    most = [max((int(number) for number in re.findall(pattern, done.stderr)), default=0)
+            for pattern in (r"Used (\d+) registers", r"(\d+) bytes stack frame", r"(\d+) bytes spill stores")]
+    return (*most, len(re.findall(r"ld\.global[^;]*[bu]16", ptx.read_text(encoding="latin-1"))))

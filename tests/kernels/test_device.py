@@ -3,6 +3,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -80,6 +81,37 @@ def test_resolve():
 def test_a_device_describes_itself(device):
     assert devices.describe(device).startswith(f"{device}, ")
     assert devices.pack_width(device) == (devices.PACK_CPU if device == "cpu" else devices.PACK_CUDA)
+
+
+def test_a_kind_of_device_has_what_its_last_bits_depend_on(device, monkeypatch):
+    kind = devices.kind(device)
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (99, 9))
+    assert wp.config.cuda_output == "cubin" and (devices.kind(device) == kind) == (device == "cpu")
+
+
+def test_memory_of_a_gpu_is_kept_and_sizes_its_batches(monkeypatch):
+    pools = [SimpleNamespace(is_mempool_enabled=enabled, total_memory=(140 << 30) + 5) for enabled in (True, False)]
+    kept = []
+    monkeypatch.setattr(wp, "get_cuda_devices", lambda: pools)
+    monkeypatch.setattr(wp, "get_device", lambda name: pools[0])
+    monkeypatch.setattr(wp, "set_mempool_release_threshold", lambda *given: kept.append(given))
+    devices._start.__wrapped__()
+    assert kept == [(pools[0], 1.0)]
+    assert devices.batch_bytes("cuda:0", 256 << 20) == 8 << 30 and devices.batch_bytes("cpu", 256 << 20) == 256 << 20
+    pools[0].total_memory = 288 << 30
+    assert devices.batch_bytes("cuda:0", 256 << 20) == devices.MOST_BATCH_BYTES
+    pools[0].total_memory = 3 << 30
+    assert devices.batch_bytes("cuda:0", 256 << 20) == 256 << 20
+
+
+@pytest.mark.parametrize("driver, outdated", [(None, False), ((12, 9), True), ((13, 0), False), ((14, 1), False)])
+def test_a_driver_that_is_too_old_is_said(driver, outdated, monkeypatch):
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: driver)
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: (13, 4))
+    assert (devices.outdated_driver() is not None) == outdated
+    with pytest.raises(DeviceError) as refused:
+        devices.resolve("cuda:99")
+    assert ("supports CUDA 12.9, and Warp needs CUDA 13.0" in str(refused.value)) == outdated
 
 
 @pytest.mark.long

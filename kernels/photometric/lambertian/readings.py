@@ -135,7 +135,7 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
     if packs * lights > devices.MAX_THREADS:
         raise ArrayError(f"the band has {packs} packs of {lights} lights: cut it so that their product stays below 2**31")
     values = new_array(packs * lights, pack_type(pack, wp.float32), band.device, cleared=False)
-    readings = Readings(values, *((lights, 1) if band.device == "cpu" else (1, packs)))
+    readings = Readings(values, *((lights, 1) if band.device == "cpu" or packs == 1 else (1, packs)))
     chunk = CHUNK if band.device == "cpu" else 1
     devices.launch(_grey_kernel(pack), -(-packs // chunk),
                    [band.values, band.saturated, wp.array(factors, dtype=wp.float32, device=band.device),

@@ -1,5 +1,6 @@
 """Readings of chosen pixels, gathered for solvers that take long for each pixel: pixels outside the mask cost nothing."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,12 +128,11 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     order = np.minimum(np.arange(packs * lanes), last)
     pack_stride, light_stride = (light_count, 1) if device == "cpu" else (1, packs)
     lane_type = pack_type(lanes, wp.float32)
-    planes = np.ascontiguousarray(view[order].astype(np.float32).T).reshape(3, packs, lanes)
     samples = Samples(wp.empty(packs * light_count, dtype=lane_type, device=device),
                       wp.empty((3, packs * light_count), dtype=lane_type, device=device),
                       wp.empty(packs, dtype=lane_type, device=device), wp.empty((3, packs * light_count), dtype=lane_type, device=device),
-                      wp.array(planes, dtype=lane_type, device=device), len(pixels), packs, light_count, lanes, pack_stride, light_stride,
-                      device)
+                      _upload(view[order].astype(np.float32).T, (3, packs), lanes, device), len(pixels), packs, light_count, lanes,
+                      pack_stride, light_stride, device)
     per_channel = np.divide(lights.scale[:, None], lights.irradiance, out=np.zeros_like(lights.irradiance),
                             where=lights.irradiance > 0)
     where = wp.array(pixels[order], dtype=wp.int32, device=device)
@@ -151,8 +151,12 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
 def per_pixel(samples: Samples, values: np.ndarray) -> wp.array:
     """Return [n, k] host values of the sampled pixels as [k, packs] packs on the device."""
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
-    planes = np.ascontiguousarray(values[order].astype(np.float32).T).reshape(values.shape[1], samples.packs, samples.lanes)
-    return wp.array(planes, dtype=pack_type(samples.lanes, wp.float32), device=samples.device)
+    return _upload(values[order].astype(np.float32).T, (values.shape[1], samples.packs), samples.lanes, samples.device)
+
+
+def _upload(values: np.ndarray, shape: tuple[int, ...], lanes: int, device: str) -> wp.array:
+    """Return host values as packs of this shape on the device; without a shape, Warp drops axes of length one before packs of one."""
+    return wp.array(np.ascontiguousarray(values), shape=shape, dtype=pack_type(lanes, wp.float32), device=device)
 
 
 def scratch_memory(samples: Samples, held: int) -> Any:
@@ -193,7 +197,7 @@ def device_values(samples: Samples, values: np.ndarray) -> wp.array:
     order = np.minimum(np.arange(samples.packs * samples.lanes), samples.pixel_count - 1)
     planes = values[order].astype(np.float32).reshape(samples.packs, samples.lanes, samples.light_count)
     planes = planes.transpose(0, 2, 1) if samples.light_stride == 1 else planes.transpose(2, 0, 1)
-    return wp.array(np.ascontiguousarray(planes).reshape(-1, samples.lanes), dtype=samples.grey.dtype, device=samples.device)
+    return _upload(planes, samples.grey.shape, samples.lanes, samples.device)
 
 
 def readings_of(samples: Samples) -> np.ndarray:
@@ -211,37 +215,58 @@ def choose(samples: Samples, chosen: np.ndarray) -> Samples:
         chosen: [n] bool, or positions among them; one or more.
 
     Returns:
-        The samples on the same device. Waits for the device.
+        The samples on the same device.
     """
     positions = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
     lanes, packs = samples.lanes, -(-len(positions) // samples.lanes)
     order = positions[np.minimum(np.arange(packs * lanes), len(positions) - 1)]
-    by_pixel = samples.light_stride == 1  # [packs, lights, lanes]; else [lights, packs, lanes]
-    lane_type = pack_type(lanes, wp.float32)
+    strides = (samples.light_count, 1) if samples.device == "cpu" else (1, packs)
+    where = wp.array(order, dtype=wp.int32, device=samples.device)
 
-    def lit(values: np.ndarray) -> np.ndarray:
-        planes = values.reshape(_planes(samples))
-        if by_pixel:
-            picked = planes[order // lanes, :, order % lanes].reshape(packs, lanes, -1).transpose(0, 2, 1)
-        else:
-            picked = planes[:, order // lanes, order % lanes].reshape(-1, packs, lanes)
-        return picked.reshape(-1, lanes)
+    def pick(values: wp.array, lights: int, old: tuple[int, int], new: tuple[int, int]) -> wp.array:
+        rows = values.shape[:-1]
+        picked = wp.empty((*rows, packs * lights), dtype=values.dtype, device=samples.device)
+        single, chosen = (each.reshape((math.prod(rows), -1)) for each in (values, picked))
+        devices.launch(_choose_kernel(lanes), packs, [single, where, lights, *old, *new], [chosen], device=samples.device)
+        return picked
 
-    def upload(values: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=lane_type, device=samples.device)
-
-    colour, toward = (upload(np.stack([lit(plane) for plane in planes.numpy()])) for planes in (samples.colour, samples.toward))
-    level = samples.level.numpy()[order // lanes, order % lanes].reshape(packs, lanes)
-    view = samples.view.numpy()[:, order // lanes, order % lanes].reshape(3, packs, lanes)
-    strides = (samples.light_count, 1) if by_pixel else (1, packs)
-    return Samples(upload(lit(samples.grey.numpy())), colour, upload(level), toward, upload(view), len(positions), packs,
-                   samples.light_count, lanes, *strides, samples.device)
+    grey, colour, toward = (pick(values, samples.light_count, (samples.pack_stride, samples.light_stride), strides)
+                            for values in (samples.grey, samples.colour, samples.toward))
+    level, view = (pick(values, 1, (1, 0), (1, 0)) for values in (samples.level, samples.view))
+    return Samples(grey, colour, level, toward, view, len(positions), packs, samples.light_count, lanes, *strides, samples.device)
 
 
 def _planes(samples: Samples) -> tuple[int, int, int]:
     """Return the shape of readings on the host: packs, lights and lanes where the lights of a pack follow each other."""
     lights, packs = samples.light_count, samples.packs
     return (packs, lights, samples.lanes) if samples.light_stride == 1 else (lights, packs, samples.lanes)
+
+
+@once
+def _choose_kernel(lanes: int) -> Any:
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def choose_kernel(first: int,
+                      values: wp.array2d(dtype=lane_type),
+                      pixels: wp.array(dtype=wp.int32),  # [P · lanes]
+                      light_count: int,
+                      pack_stride: int,  # of values
+                      light_stride: int,
+                      chosen_pack_stride: int,
+                      chosen_light_stride: int,
+                      # outputs
+                      chosen: wp.array2d(dtype=lane_type)):
+        p = first + wp.tid()
+        for row in range(values.shape[0]):
+            for light in range(light_count):
+                picked = lane_type()
+                for k in range(lanes):
+                    n = pixels[p * lanes + k]
+                    picked[k] = values[row, n // lanes * pack_stride + light * light_stride][n % lanes]
+                chosen[row, p * chosen_pack_stride + light * chosen_light_stride] = picked
+
+    return choose_kernel
 
 
 @once

@@ -16,11 +16,11 @@ from kernels.errors import ArrayError
 from kernels.packs import pack_type, vector_at
 from kernels.photometric.lambertian.near import Places
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type
-from kernels.surface.shadows import NO_REACH, Projection, Relief, in_shadow_within, relief_of, surface_point
+from kernels.surface.shadows import NO_REACH, Extent, Projection, Relief, in_shadow_within, relief_of, surface_point
 
 
 def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask: wp.array, projection: Projection,
-                    places: Places | None = None) -> None:
+                    places: Places | None = None, extent: Extent | None = None) -> None:
     """Mark readings whose light is hidden by the surface as no readings, in place.
 
     Args:
@@ -29,6 +29,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
         mask: [rows, cols] uint8, where there is surface.
         projection: of the camera; the unit is that of height.
         places: of the lights, where some light is near.
+        extent: of the surface; None: it is found, for which height and mask are read back.
     """
     rows, cols = mask.shape
     if len(pixels) != samples.pixel_count or pixels.min() < 0 or pixels.max() >= rows * cols:
@@ -38,7 +39,7 @@ def exclude_shadows(samples: Samples, pixels: np.ndarray, height: wp.array, mask
     place = np.zeros((samples.light_count, 4), dtype=np.float32) if places is None else places.place
     devices.launch(_exclude_kernel(samples.lanes), samples.packs,
                    [wp.array(place, dtype=wp.vec4, device=samples.device), where,
-                    relief_of(height, mask, projection)], [samples.arrays], device=samples.device)
+                    relief_of(height, mask, projection, extent)], [samples.arrays], device=samples.device)
 
 
 @once

@@ -56,6 +56,8 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
                 faults += _wrong_products(name)
             if not sound:
                 faults.append(f"{name} gives wrong sums")
+        outdated = None if only else device.outdated_driver()
+        faults += [outdated] if outdated else []
         with tempfile.TemporaryDirectory() as folder:
             print(f"{'temporary':<12} {folder} can be written")
     faults += _service(data, config)

@@ -23,12 +23,25 @@ def of_workers(settings: "Settings") -> list[str]:
         return []
     if settings.devices:
         return [resolve(device) for device in settings.devices]
-    return [name for name in _elsewhere(_names) if name.startswith("cuda")] or [CPU]
+    names, outdated = _elsewhere(_names)
+    _warn(outdated)
+    return [name for name in names if name.startswith("cuda")] or [CPU]
 
 
 def resolve(device: str | None) -> str:
     """Return the name of a device of this machine; None: of the best. Raise DeviceError if it is not on this machine."""
-    return device if device == CPU else _elsewhere(_resolve, device)
+    if device == CPU:
+        return device
+    name, outdated = _elsewhere(_resolve, device)
+    _warn(outdated)
+    return name
+
+
+def _warn(outdated: str | None) -> None:
+    if outdated is not None:
+        from service.server.base.log import logger
+
+        logger.warning(outdated)
 
 
 def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
@@ -36,13 +49,13 @@ def _elsewhere(ask: Callable[..., T], *arguments: object) -> T:
         return pool.apply(ask, arguments)
 
 
-def _names() -> list[str]:
-    from kernels.device import names
+def _names() -> tuple[list[str], str | None]:
+    from kernels.device import names, outdated_driver
 
-    return names()
+    return names(), outdated_driver()
 
 
-def _resolve(device: str | None) -> str:
-    from kernels.device import resolve
+def _resolve(device: str | None) -> tuple[str, str | None]:
+    from kernels.device import outdated_driver, resolve
 
-    return resolve(device)
+    return resolve(device), outdated_driver()

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from kernels import device as devices
 from kernels import packs
 from kernels.photometric.lambertian.near import NearField, NearLights, see_near
 from kernels.photometric.lambertian.readings import Lights, Readings, grey_factors, grey_readings
@@ -23,7 +24,7 @@ NEAR_BYTES = READING_BYTES + 16
 SAMPLE_FLOATS = 7
 """Numbers per light and pixel of the samples: grey and colour readings, direction."""
 BATCH_BYTES = 256 << 20
-"""Memory for the samples and lobes that are worked on at one time."""
+"""Memory for the samples and lobes that are worked on at one time, on a GPU the least."""
 LEAST_READINGS = 3
 """Frames with a reading, dark or not, that a normal needs."""
 
@@ -112,7 +113,7 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
         done: pixels of the stage that are done before.
     """
     stack, factors = given.stack, grey_factors(lights, GREY_WEIGHTS)
-    size = max(1, BATCH_BYTES // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
+    size = max(1, devices.batch_bytes(given.device, BATCH_BYTES) // (4 * (SAMPLE_FLOATS + lobes) * stack.light_count))
 
     def read(piece: slice, device: str) -> None:
         chosen = pixels[piece]

@@ -14,6 +14,7 @@ from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import Samples
 from kernels.photometric.shadows.bounce import subtract_bounce
 from kernels.photometric.shadows.shadowing import exclude_shadows
+from kernels.surface.shadows import Extent, extent_of
 from service.solve.base.solution import SolveInput
 from service.solve.height.height import integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
@@ -33,6 +34,8 @@ class DirectLight(NamedTuple):
     """The positions of the lights; None where all lights are distant."""
     solved: wp.array  # [rows, cols] uint8 on the device: the number of the part of each solved pixel, 0 elsewhere
     height: wp.array  # [rows, cols] float32, on the device
+    extent: Extent
+    """Of the height and the mask."""
     shadows: bool
     """True if cast shadows of the height are taken out."""
     arriving: ArrivingLight | None
@@ -58,7 +61,7 @@ class DirectLight(NamedTuple):
         others."""
         if self.shadows:
             exclude_shadows(samples, pixels, self.height, self.solved, projection_of(self.given.camera),
-                            None if self.field is None else self.field.places)
+                            None if self.field is None else self.field.places, self.extent)
         if self.arriving is not None:
             corners, shares = self.arriving.at(*np.divmod(pixels, self.given.camera.width))
             albedo = np.minimum(self.albedo_scale * self.albedo[:, pixels].T.astype(np.float32), LARGEST_ALBEDO)
@@ -92,4 +95,4 @@ def direct_light(given: SolveInput, lights: Lights, field: NearField | None, nor
     arriving = arriving_light(given, lights, normal, height, solved) if interreflection else None
     mask = solved.astype(np.uint8) if surface.part is None else numbered(surface.part)
     on_device = wp.array(mask, dtype=wp.uint8, device=given.device)
-    return DirectLight(given, lights, field, on_device, height, shadows, arriving, bouncing)
+    return DirectLight(given, lights, field, on_device, height, extent_of(height.numpy(), mask), shadows, arriving, bouncing)

@@ -140,3 +140,25 @@ def test_probe_finds_disparities_of_either_sign(device, shift):
     unique = found.lead.numpy() > 0.2
     # one place whose match lies outside the right image may find another
     assert unique.mean() > 0.6 and (labels.highest - found.label.numpy()[unique] == shift).sum() >= unique.sum() - 1
+
+
+@pytest.mark.parametrize("period", [30, 32])
+def test_probe_finds_a_rival_in_any_lane_and_of_equals_the_smaller_label(device, period):
+    """A period of 32 has its rivals in the same lane of a pack, one of 30 in a lower one."""
+    image = np.tile(texture(64, period, 11)[0], 5)[None]
+    labels = Labels.covering(-80, 80, device)
+    found = probe(image, image, np.ones(image.shape[1:], bool), labels, step=8, device=device)
+    across = 8 * np.arange(image.shape[2] // 8) + 4
+    largest = (across // period * period)  # disparity of the leftmost equal place
+    sure = (across - largest >= 8) & (across - largest < period - 8) & (np.abs(largest) <= 80)
+    assert sure.sum() >= 4
+    assert (labels.highest - found.label.numpy()[2:-2, sure] == largest[sure]).all() and (found.lead.numpy()[2:-2, sure] == 0).all()
+
+
+def test_choice_takes_the_smaller_of_equal_labels(device):
+    image = np.tile(texture(30, 30, 12)[0], 5)[None]
+    labels = Labels.covering(0, 63, device)
+    volume, costs = volume_of(image, image, np.ones(image.shape[1:], bool), labels, device)
+    sums = gather(volume)
+    choice = choose(volume, sums, labels, right_columns=image.shape[2])
+    assert np.array_equal(choice.label.numpy(), sums.numpy().reshape(costs.shape).argmin(axis=-1))

@@ -7,12 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from typer import Context
 from typer.main import get_command
 
 import service
 from service.captures import info
 from service.cli.main import BLAS_THREADS, COMMANDS, main, program
+from service.server.base.log import logger
+from service.server.base.settings import Settings
+from service.server.process import devices as process_devices
 from service.solve import opening
 from stage.capture.capture import Capture
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image
@@ -61,6 +65,23 @@ def test_doctor_finds_this_installation_sound(relit):
     out = relit("doctor").well()
     assert out.splitlines()[-1] == "sound"
     assert "cpu" in out and "works" in out
+
+
+def test_a_driver_that_is_too_old_for_the_gpu_is_said(relit, tmp_path, monkeypatch):
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (12, 9))
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: (13, 4))
+    sentence = "the NVIDIA driver of this machine supports CUDA 12.9, and Warp needs CUDA 13.0 or newer"
+    outcome = relit("doctor")
+    assert outcome.code == 1 and sentence in outcome.out
+    capture = write_capture(tmp_path / "capture")
+    assert sentence in relit("solve", capture, "--method", "lambert", "--out", tmp_path / "out").out
+    assert sentence not in relit("solve", capture, "--method", "lambert", "--device", "cpu", "--out", tmp_path / "out").out
+    said = []
+    monkeypatch.setattr(process_devices, "_elsewhere", lambda ask, *given: ask(*given))
+    monkeypatch.setattr(logger, "warning", said.append)
+    process_devices.of_workers(Settings(data=tmp_path / "data"))
+    process_devices.resolve(None)
+    assert len(said) == 2 and all(sentence in each for each in said)
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

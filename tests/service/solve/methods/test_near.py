@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from kernels import device as devices
 from stage.formats import exr
 from stage.results.maps import SurfaceMaps
 from tests.scenes import bowl, near_lights
@@ -120,7 +119,6 @@ def test_lamps_at_a_thousand_radii_are_distant_lights(relit, tmp_path, method):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("device", devices.names())
 def test_every_device_and_a_rim_that_few_lamps_reach(relit, tmp_path, device):
     """Pixels without three lamps stay unsolved, and do not pull the others away."""
     lights = lamps(ORTHOGRAPHIC, 9, RADII, widest=45)
