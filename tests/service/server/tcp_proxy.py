@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Iterator
 
+from tests.service.waiting import until
+
 
 class TcpProxy:
     """Passes bytes on to an address, until it is told to cut."""
@@ -39,6 +41,15 @@ class TcpProxy:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
+
+    def cut_when_open(self, *, away_s: float = 0.0) -> None:
+        """Wait for a connection, and cut as `cut` does."""
+        def cut() -> int:
+            if self._open:
+                self.cut(away_s=away_s)
+            return self.cuts
+
+        until(cut, "nobody connected")
 
     def mend(self) -> None:
         """Take new connections again."""

@@ -53,9 +53,9 @@ def test_cut_connections_lose_nothing_between_machines_that_share_no_folder(tmp_
                 for view in client.jobs.follow(job.id):
                     done = 0 if view.progress is None or view.progress.stage != "frames" else view.progress.done
                     if done >= 4 and to_store.cuts == 0:
-                        to_store.cut(away_s=2.0)
+                        to_store.cut_when_open(away_s=2.0)
                     if done >= 12 and to_database.cuts == 0:  # after the store: without the database no progress is told
-                        to_database.cut(away_s=2.0)
+                        to_database.cut_when_open(away_s=2.0)
                 ended = client.jobs.get(job.id)
                 assert (ended.state, ended.error) == ("succeeded", None), (tmp_path / "worker.log").read_text()[-4000:]
                 assert to_database.cuts == 1 and to_store.cuts == 1
