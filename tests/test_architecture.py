@@ -16,7 +16,7 @@ HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
 PRODUCTS = tuple(f"service.{name}" for name in (
     "solve", "depth", "boards", "relight", "calibrate", "light_estimation", "basis", "captures", "demo", "export", "viewing", "joining",
-    "scans", "sequences"))
+    "scans", "sequences", "play", "twin", "drive", "rigs"))
 """Where stage and kernels meet: captures go in, results come out."""
 WRITERS = ("service.asset",)
 """Meshes and textures of solved maps, and the formats that they are written in."""
@@ -97,7 +97,9 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 
 @pytest.mark.parametrize(("library", "homes"), [
     ("pxr", ["service.asset.usd"]), ("pygltflib", ["service.asset.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
-    ("fastapi", ["service.server.api", "service.server.pages"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
+    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.page"]), ("sacn", ["service.play.sacn_output"]),
+    ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),
+    ("stupidArtnet", ["service.play.artnet_output"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
     ("laspy", ["stage.formats.las"]), ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
     ("fast_simplification", ["service.asset.content.levels", "service.asset.content.uv_unwrap"]),
     ("xatlas", ["service.asset.content.uv_unwrap"]),

@@ -8,7 +8,7 @@ from tests.test_architecture import HOME, imports_of, module_name
 
 TEXT = (HOME / "CONTRIBUTING.md").read_text(encoding="utf-8")
 WAYS = {title: re.findall(r"^\d\. `([^`]+)`( \(another process\))?", body, re.MULTILINE)
-        for title, body in re.findall(r"^\*\*([^*]+)\*\*: .*\n\n((?:\d\. .*\n)+)", TEXT, re.MULTILINE)}
+        for title, body in re.findall(r"^\*\*([^*]+)\*\*: .*\n\n((?:\d\. .*\n(?: {3}.*\n)*)+)", TEXT, re.MULTILINE)}
 MOST_FILES = 8
 """The most files of one way: a reader cannot keep more in view."""
 
@@ -22,6 +22,8 @@ def test_the_ways_are_read():
 def test_a_way_is_short_and_each_file_is_reached_from_one_before_it(way):
     files = WAYS[way]
     assert 2 < len(files) <= MOST_FILES
+    numbers = re.findall(r"^(\d)\. ", TEXT.split(f"**{way}**: ")[1].split("\n**")[0].split("\n## ")[0], re.MULTILINE)
+    assert numbers == [str(number + 1) for number in range(len(files))]
     reached: set[str] = set()
     for number, (file, another_process) in enumerate(files):
         assert (HOME / file).is_file(), file

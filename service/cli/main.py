@@ -37,6 +37,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),
     "relight": ("light", "Frames under HDR environments and animated lights."),
     "shade": ("light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
+    "drive": ("rig", "Levels at which the lamps of a rig light a subject as environments and animated lights would."),
+    "play": ("stage", "Send cues to the lamps of a rig over sACN or Art-Net, and turn the lamps dark at the end."),
+    "twin": ("stage", "A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."),
     "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "
                "and the service here."),
     "serve": ("server", "Run the service: the API, and a worker on each device."),
@@ -46,6 +49,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
                 "when it starts."),
     "audit": ("keys", "Show who did what to which object, the newest first."),
     "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
+    "rig": ("rig", "Rigs of driven lamps: check them, make them from captures, tables and scenes, plan them; docs/drive.md."),
     "keys": ("keys", "Make, list and revoke the keys of the service."),
     "import": ("imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
     "calibrate": ("calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "

@@ -100,21 +100,9 @@ class CaptureLighting:
 
     def _weights(self, run: Sequence[FarLight]) -> np.ndarray:
         """Return [frames, 3, lights padded] float32 weights that stand for environment and discs."""
-        energy = np.zeros((len(run), len(self._lights.direction), 3))
-        environment = run[0].environment
-        discs = [(index, disc) for index, light in enumerate(run) for disc in light.discs]
-        if environment is None and not discs:
+        if run[0].environment is None and not any(light.discs for light in run):
             return np.zeros((len(run), 3, len(self._stack.scale)), dtype=np.float32)
-        if environment is not None:
-            given = integrate(environment.radiance, self._lights.direction, np.stack([light.rotation for light in run]),
-                              weighting=self._weighting, device=self._device)
-            energy += given * np.array([light.gain for light in run])[:, None, None]
-        if discs:
-            shares = integrate_discs(np.stack([disc.direction for _, disc in discs]),
-                                     np.array([disc.angle_degrees for _, disc in discs]), self._lights.direction,
-                                     weighting=self._weighting)
-            for (index, disc), share in zip(discs, shares, strict=True):
-                energy[index] += share[:, None] * disc.irradiance
+        energy = shared_energy(run, self._lights.direction, weighting=self._weighting, device=self._device)
         return light_weights(energy, self._lights.irradiance, self._stack.scale)
 
     def _captured_energy(self, weights: np.ndarray, captured: Mapping[int, float]) -> CapturedEnergy:
@@ -130,3 +118,29 @@ class CaptureLighting:
             shares[index] -= weight
             added[index] += weight * irradiance[index]
         return CapturedEnergy(shares * irradiance, added if captured else None)
+
+
+def shared_energy(run: Sequence[FarLight], directions: np.ndarray, *, weighting: LightWeights, device: str) -> np.ndarray:
+    """Share the environment and the discs of frames out over lights.
+
+    Args:
+        run: the light of each frame, all under one environment map or under none.
+        directions: [lights, 3] unit vectors to the lights.
+        weighting: how.
+        device: where the map is shared out.
+
+    Returns:
+        [frames, lights, 3] float64 energy of each light.
+    """
+    energy = np.zeros((len(run), len(directions), 3))
+    environment = run[0].environment
+    if environment is not None:
+        given = integrate(environment.radiance, directions, np.stack([light.rotation for light in run]), weighting=weighting, device=device)
+        energy += given * np.array([light.gain for light in run])[:, None, None]
+    discs = [(index, disc) for index, light in enumerate(run) for disc in light.discs]
+    if discs:
+        shares = integrate_discs(np.stack([disc.direction for _, disc in discs]), np.array([disc.angle_degrees for _, disc in discs]),
+                                 directions, weighting=weighting)
+        for (index, disc), share in zip(discs, shares, strict=True):
+            energy[index] += share[:, None] * disc.irradiance
+    return energy

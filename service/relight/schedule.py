@@ -8,6 +8,7 @@ import numpy as np
 
 from service.errors import RequestError
 from service.relight.environments import Environments
+from service.requests.drive import DriveRequest
 from service.requests.light.light_keys import CapturedTrack, EnvironmentKey, Key, LightKeys, LightTrack
 from service.requests.relight import RelightRequest
 from stage.model import Vector
@@ -60,7 +61,7 @@ class ScheduledFrame(NamedTuple):
         return found
 
 
-def schedule(request: RelightRequest, numbers: Sequence[int], keys: LightKeys | None,
+def schedule(request: RelightRequest | DriveRequest, numbers: Sequence[int], keys: LightKeys | None,
              environments: Environments | None) -> list[ScheduledFrame]:
     """Return what lights each of the numbered frames of a range, by the content of `request.keys` and the maps of `request.environment`.
 

@@ -11,6 +11,7 @@ from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
+from service.requests.drive import RIG, DriveOptions, RigDocument
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light.light_keys import LightKeys
@@ -238,6 +239,25 @@ class GaugeBoardJob(JobRequest):
         return self
 
 
+class DriveJob(JobRequest):
+    """Levels at which the lamps of a rig light a subject as an environment would: cues.csv, cues.json, report.json, preview.png."""
+
+    kind: Literal["drive"]
+    rig: Annotated[RigDocument, Role.INPUT, RIG]
+    """The rig (JSON, schema relit.rig/1; docs/drive.md)."""
+    environment: Annotated[EnvironmentId | None, Role.INPUT] = None
+    """Lat-long environment."""
+    keys: Annotated[LightKeys | None, Role.INPUT, KEYS] = None
+    """Light keys (JSON, schema relit.keys/1; docs/relight.md)."""
+    options: DriveOptions = DriveOptions()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.keys is not None and self.keys.captured:
+            raise ValueError("keys: has captured images, which lamps cannot show: take them out")
+        return self
+
+
 class PatternsJob(JobRequest):
     """Images to project and their manifest entries: PNG files and patterns.json."""
 
@@ -246,7 +266,7 @@ class PatternsJob(JobRequest):
 
 
 OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | SeparateJob | ScanJob | PatternsJob
-          | InspectBoardJob | GaugeBoardJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
+          | InspectBoardJob | GaugeBoardJob | DriveJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
 """Every kind of job that the API accepts."""
 JOBS: dict[str, type[JobRequest]] = {get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(OneJob)}

@@ -8,6 +8,7 @@ from service.requests import jobs as asked
 from service.requests import states
 from service.requests.base.base import JobRequest, SequenceOptions
 from service.requests.calibration_jobs import TofCalibrationJob
+from service.requests.drive import RigDocument
 from service.requests.export import AssetFormat
 from service.requests.light.frame_range import frame_numbers
 from service.requests.relight import RelightOptions
@@ -23,6 +24,7 @@ SOLVES = ("solve", "pipeline")
 """Kinds of jobs that solve maps."""
 OF_SEQUENCES = (asked.SolveJob, asked.DepthJob, asked.PipelineJob, asked.RelightJob, asked.ViewJob, TofCalibrationJob)
 """Jobs whose capture may be a sequence of captures."""
+KINDS_OF_SEQUENCES = [kind for kind, job in asked.JOBS.items() if issubclass(job, OF_SEQUENCES)]
 TIME_SAMPLED: tuple[AssetFormat, ...] = ("usdz", "usdc")
 """Formats of the asset of a sequence."""
 
@@ -51,11 +53,13 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     read = []
     for field in ("capture", "captures", "environment", "reference_ball", "beside", "rig", "apply_to"):
         value = getattr(request, field, None)
+        if isinstance(value, RigDocument):
+            continue
         for identifier in value if isinstance(value, tuple) else () if value is None else (value,):
             steps = intakes.time_steps(_require_ready(service, project, field, identifier))
             if steps and not (field == "capture" and isinstance(request, OF_SEQUENCES)):
                 raise ApiError("invalid", f"{field}: {identifier} is a sequence of {steps} captures: give one capture here; "
-                                          "solve, depth, relight and pipeline take sequences")
+                                          f"{', '.join(KINDS_OF_SEQUENCES)} take sequences")
             if field == "capture" and isinstance(request, asked.SolveJob | asked.DepthJob | asked.PipelineJob):
                 _require_sequence(request, steps)
             if isinstance(request, asked.ViewJob):
@@ -114,6 +118,10 @@ def spelled_out(service: Service, project: str, request: JobRequest) -> JobReque
         if request.environment is None and request.keys is None:
             raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights or captured images")
         return request.model_copy(update={"options": _with_frames(service, project, request.capture, request.options)})
+    if isinstance(request, asked.DriveJob):
+        if request.environment is None and (request.keys is None or not request.keys.lights):
+            raise ApiError("invalid", "nothing lights the frames: give an environment, or keys with lights")
+        _require_frames(service, request.options.frames, frame_numbers(request.options.frames, 1))
     if isinstance(request, asked.PipelineJob):
         return request.model_copy(update={"relight": _with_frames(service, project, request.capture, request.relight)})
     return request
@@ -123,9 +131,14 @@ def _with_frames(service: Service, project: str, capture: str, options: RelightO
     row = intakes.find(service.database, capture, project)
     steps = int((row["facts"] or {}).get("captures", 1)) if row is not None else 1
     numbers = frame_numbers(options.frames, steps)
-    if len(numbers) > service.settings.max_frames:
-        raise ApiError("invalid", f"frames {options.frames}: {len(numbers)} frames, {service.settings.max_frames} are allowed in a job")
+    _require_frames(service, options.frames, numbers)
     return options.model_copy(update={"frames": f"{numbers[0]}-{numbers[-1]}"})
+
+
+def _require_frames(service: Service, given: str | None, numbers: Sequence[int]) -> None:
+    """Refuse more frames than a job may have."""
+    if len(numbers) > service.settings.max_frames:
+        raise ApiError("invalid", f"frames {given}: {len(numbers)} frames, {service.settings.max_frames} are allowed in a job")
 
 
 def _require_ready(service: Service, project: str, field: str, identifier: str) -> sa.RowMapping:

@@ -12,6 +12,7 @@ from service.reporting.provenance import name_place
 from service.requests import calibrate, calibration_jobs, jobs
 from service.requests.base.base import JobRequest, Options
 from service.requests.basis import BasisKind
+from service.requests.light.light_keys import LightKeys
 from service.server.jobs.places import StepFiles, file_within
 from service.server.storage import layout
 from stage.capture.manifest import FILE_NAME
@@ -20,6 +21,8 @@ from stage.files import write_text
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""
+RIG_FILE, KEYS_FILE = "rig.json", "keys.json"
+"""Names of the files with the rig and the light keys of a job, which lie beside what was made of them."""
 REGIONS_FILE = "regions.json"
 """Name of the file with the regions of a job, which lies beside what they were judged in."""
 STUDY_FILE = "study.json"
@@ -105,6 +108,23 @@ def _inspect_board(request: jobs.InspectBoardJob, files: StepFiles) -> None:
                   files.progress)
 
 
+def _drive(request: jobs.DriveJob, files: StepFiles) -> None:
+    from service.drive.drive import drive
+    from service.requests.drive import DriveRequest
+
+    rig = files.out / RIG_FILE
+    write_text(rig, request.rig.model_dump_json(by_alias=True) + "\n")
+    drive(files.request(DriveRequest, request, rig=rig, keys=write_keys(request.keys, files), out=files.out), files.progress)
+
+
+def write_keys(keys: LightKeys | None, files: StepFiles) -> Path | None:
+    """Write the light keys of a job among its results and return their file, or None if it has none."""
+    if keys is None:
+        return None
+    write_text(files.out / KEYS_FILE, keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
+    return files.out / KEYS_FILE
+
+
 def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
     from service.boards.gauge_board import gauge_board
     from service.requests.inspect_board import GaugeBoardRequest
@@ -168,6 +188,7 @@ ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] =
     **dict.fromkeys(get_args(calibration_jobs.AnyCalibration), (MEASURE, _calibrate)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
     jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _join), jobs.ShadeJob: ("shade", _shade), jobs.ViewJob: ("view", _view),
-    jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.BasisJob: (MEASURE, _basis),
-    jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan), jobs.PatternsJob: (MEASURE, _patterns)}
+    jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _drive),
+    jobs.BasisJob: (MEASURE, _basis), jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan),
+    jobs.PatternsJob: (MEASURE, _patterns)}
 """The name of the step of each of these kinds of jobs, and the function that does it."""

@@ -12,12 +12,9 @@ from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
 from service.server.jobs import scan_sets, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
-from service.server.jobs.one_step import ONE_STEP, export
+from service.server.jobs.one_step import ONE_STEP, export, write_keys
 from service.server.jobs.places import StepFiles
 from service.server.storage import layout
-
-KEYS_FILE = "keys.json"
-"""Name of the file with the light keys of a job, which lies beside its frames."""
 
 
 def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
@@ -96,12 +93,9 @@ def _check(request: jobs.CheckJob, files: StepFiles) -> None:
 def _relight(request: jobs.RelightJob, chunk: list[int], files: StepFiles) -> None:
     from service.relight.relight import relight
     from service.requests.relight import RelightRequest
-    from stage.files import write_text
 
     out = files.out
-    if request.keys is not None:
-        write_text(out / KEYS_FILE, request.keys.model_dump_json(by_alias=True, indent=2, exclude_defaults=True))
-    wanted = files.request(RelightRequest, request, keys=None if request.keys is None else out / KEYS_FILE, out=str(out / layout.FRAMES))
+    wanted = files.request(RelightRequest, request, keys=write_keys(request.keys, files), out=str(out / layout.FRAMES))
     for part in _parts(chunk, out) if files.job.is_resumed else [chunk]:
         relight(wanted.model_copy(update={"only": f"{part[0]}-{part[-1]}"}), files.progress)
 

@@ -19,6 +19,7 @@ from service.requests.jobs import JOBS
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
           "inspect-board": "Inspect a board", "gauge-board": "Find how well inspections of boards repeat",
+          "drive": "Drive the lamps of a rig",
           "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
           "separate": "Separate direct and global light",
           "export": "Export an asset", "shade": "Shade one picture",
@@ -36,7 +37,7 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
 CAPTURE_JOBS = {name: JOBS[name] for name in TITLES if any(
     field.is_required() for part, field in JOBS[name].model_fields.items() if part in ("capture", "captures"))}
 """Jobs that begin with a capture, by kind."""
-FREE_JOBS = {name: JOBS[name] for name in ("patterns", "gauge-board")}
+FREE_JOBS = {name: JOBS[name] for name in ("patterns", "gauge-board", "drive")}
 """Jobs that begin with neither a capture nor maps, by kind."""
 MAPS_JOBS = {name: JOBS[name] for name in TITLES if name not in CAPTURE_JOBS and name not in FREE_JOBS}
 """Jobs that begin with the maps of another job, by kind."""

@@ -103,6 +103,12 @@ async def asset(job: JobId) -> Response:
     return _page("asset.html", identifier=job)
 
 
+@router.get("/drive/{job}")
+async def drive(job: JobId) -> Response:
+    """Show the levels of the lamps that a job has driven."""
+    return _page("drive.html", identifier=job)
+
+
 @router.get("/favicon.ico")
 async def icon(request: Request) -> Response:
     """Return the icon, which browsers ask for at this place."""

@@ -1,6 +1,6 @@
 /** Requests to the API of this server, with the key of the person who looks. */
 
-import { byId, tell } from "./element.js";
+import { byId, element, tell } from "./element.js";
 
 const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
@@ -97,6 +97,13 @@ export function resultsOf(job) {
       return (await send(at(name), { headers })).arrayBuffer();
     },
   };
+}
+
+/** Save a file of this server with the key of this tab, which a plain link would not send. */
+export async function save(path) {
+  const address = URL.createObjectURL(await (await send(path)).blob());
+  element("a", { href: address, download: path.split("/").at(-1) }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
 
 /**

@@ -1,4 +1,4 @@
-/** The captured lights as a diagram: the hemisphere seen from the camera, with a thumbnail of each light's image. */
+/** Lights as a diagram seen from the camera: those of a capture, and the lamps of a rig. */
 
 import { element } from "./element.js";
 
@@ -44,6 +44,31 @@ export function mountDome(parent, frames, choose) {
   return (chosen) => {
     for (const [index, dot] of dots) dot.classList.toggle("chosen", index === chosen);
   };
+}
+
+/**
+ * Show the lamps of a rig.
+ * @param {HTMLElement} parent Takes the diagram.
+ * @param {{name: string, direction: number[]}[]} lamps With the direction to each.
+ * @returns {function({colours: number[][], levels: number[][]}): void} Colours the lamps by linear red, green and blue, 0 to 1; the levels of
+ *   the primaries of each lamp, 0 to 1, are said of it.
+ */
+export function mountLamps(parent, lamps) {
+  const places = lamps.map((lamp) => placeOf(lamp.direction));
+  const size = 2 * Math.max(1, ...places.map(([x, y]) => Math.hypot(x, y))) + 0.3;
+  const svg = shape("svg", { viewBox: `${-size / 2} ${-size / 2} ${size} ${size}`, role: "img", "aria-label": "Lamps, seen from the camera" });
+  for (const degrees of [30, 60, 90]) svg.append(shape("circle", { r: degrees / 90, class: "ring" }));
+  const radius = Math.min(0.06, 0.8 / Math.sqrt(lamps.length));
+  const dots = places.map(([x, y]) => shape("circle", { cx: x, cy: y, r: radius, stroke: "var(--soft)", "stroke-width": 0.006 }));
+  const titles = dots.map(() => shape("title", {}));
+  dots.forEach((dot, index) => dot.append(titles[index]));
+  svg.append(...dots);
+  parent.replaceChildren(svg);
+  return ({ colours, levels }) => colours.forEach((colour, index) => {
+    const code = colour.map((value) => Math.round(255 * Math.min(1, Math.max(0, value)) ** (1 / 2.2)));
+    dots[index].setAttribute("fill", `rgb(${code})`);
+    titles[index].textContent = `${lamps[index].name}: ${levels[index].map((level) => `${(100 * level).toFixed(1)} %`).join(", ")}`;
+  });
 }
 
 function label(degrees) {

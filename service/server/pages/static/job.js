@@ -1,6 +1,6 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, post, read, remove, resultsOf, send } from "./api.js";
+import { attempt, listing, post, read, remove, resultsOf, save } from "./api.js";
 import { byId, bytes, duration, element, factText, show, time, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
@@ -44,7 +44,8 @@ function presentRequest(job) {
   const rows = [];
   const add = (name, value) => {
     if (value === null || value === "" || (Array.isArray(value) && value.length === 0)) return;
-    if (typeof value === "object" && !Array.isArray(value)) Object.entries(value).forEach(([inner, each]) => add(inner, each));
+    if (typeof value.schema === "string") rows.push(element("dt", {}, words(name)), element("dd", {}, value.name ?? value.schema));
+    else if (typeof value === "object" && !Array.isArray(value)) Object.entries(value).forEach(([inner, each]) => add(inner, each));
     else rows.push(element("dt", {}, words(name)), element("dd", {}, link(name, value)));
   };
   Object.entries(job.request).forEach(([name, value]) => add(name, value));
@@ -73,6 +74,7 @@ async function presentResults(job) {
   byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
   const solved = job.state === "succeeded" && [...MAPS, SEQUENCE].some((name) => names.includes(name));
   offer("look", solved, `/maps/${identifier}`);
+  offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);
   const forms = [...byId("work").querySelectorAll("form[data-kind]")];
@@ -97,15 +99,9 @@ function offer(id, possible, href) {
   show(byId(id), possible);
 }
 
-/** Save a result with the key of this tab, which a plain link would not send. */
 function download(event, result) {
   event.preventDefault();
-  attempt(async () => {
-    const answer = await send(result.url);
-    const address = URL.createObjectURL(await answer.blob());
-    element("a", { href: address, download: result.name.split("/").at(-1) }).click();
-    setTimeout(() => URL.revokeObjectURL(address), 60_000);
-  });
+  attempt(() => save(result.url));
 }
 
 async function follow() {

@@ -24,6 +24,8 @@ REQUIRED = {
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
     "gauge-board": {"study": {"schema": "relit.gauge-study/1", "name": "pads", "runs": [
         {"result": JOB, "board": "A"}, {"result": OTHER, "board": "A"}]}},
+    "drive": {"rig": {"schema": "relit.rig/1", "name": "one lamp", "lights": [
+        {"name": "A", "type": "distant", "direction": [0, 0, 1], "primaries": [{"name": "white", "irradiance": [1, 1, 1]}]}]}},
 }
 """What a job must have beside a capture, where it must."""
 TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x6", "square_m": 0.025},

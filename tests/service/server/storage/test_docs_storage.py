@@ -5,7 +5,7 @@ from pathlib import Path
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, new_id
 from service.server.base.settings import Settings
-from service.server.jobs.steps import KEYS_FILE
+from service.server.jobs.one_step import KEYS_FILE
 from service.server.storage import layout, objects, scratch
 from service.server.storage.objects import SCRATCH
 from service.server.storage.part_files import part_files_folder

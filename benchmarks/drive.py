@@ -1,0 +1,67 @@
+"""Driven rigs: errors of the irradiance, against sampling an 8-bit panorama at the lamps, and seconds for a turning sky; python -m
+benchmarks.drive prints the tables of docs/drive.md."""
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import nnls
+
+from service.drive.drive import drive
+from service.requests.drive import DriveRequest
+from stage.transforms import fibonacci_sphere
+from tests.scenes.rigs import NORMALS, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
+
+SKIES = ("sun", "overcast", "patches")
+ROWS = 128
+FULL = 4.0
+"""Irradiance of every primary at full level."""
+
+
+def sampled(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the energies of lamps [lights, 3] that are set to the pixels of an 8-bit panorama in their directions."""
+    x, y, z = directions.T
+    rows, columns = radiance.shape[:2]
+    row, column = (np.arccos(y) / np.pi * rows).astype(int), (np.arctan2(x, -z) / (2 * np.pi) % 1 * columns).astype(int)
+    return np.round(np.clip(radiance, 0, 1)[row, column] * 255) / 255 * 4 * np.pi / len(directions)
+
+
+def accuracy(folder: Path) -> None:
+    print("| lamps | sky | irradiance, RMS | least possible | largest Δu'v' | with 8 bits | 8-bit panorama sampled |")
+    print("|---|---|---|---|---|---|---|")
+    for count in (331, 128, 32):
+        directions = fibonacci_sphere(count)
+        seen = np.maximum(NORMALS @ directions.T, 0)
+        for kind in SKIES:
+            radiance = write_sky(folder / "sky.exr", kind, rows=ROWS)
+            truth = irradiance(radiance)
+            errors = []
+            for bits in (16, 8):
+                rig = write_rig(folder / "rig.json", directions, irradiance=FULL, bits=bits)
+                result = drive(DriveRequest(rig=folder / "rig.json", out=folder / "cues", environment=folder / "sky.exr", device="cpu",
+                                            auto_exposure=True))
+                errors.append(rms(lamps_irradiance(rig, read_levels(folder / "cues")[0]) / result.exposure, truth))
+                if bits == 16:
+                    chromaticity = result.judgement.chromaticity.max()
+            best = np.stack([nnls(seen, truth[:, c], maxiter=50000)[0] for c in range(3)], axis=1)
+            print(f"| {count} | {kind} | {errors[0]:.2%} | {rms(seen @ best, truth):.2%} | {chromaticity:.4f} | {errors[1]:.2%} | "
+                  f"{rms(seen @ sampled(radiance, directions), truth):.1%} |")
+
+
+def speed(folder: Path, frames: int) -> None:
+    write_rig(folder / "rig.json", fibonacci_sphere(331), irradiance=FULL)
+    write_sky(folder / "sky.exr", "sun", rows=ROWS)
+    request = DriveRequest(rig=folder / "rig.json", out=folder / "cues", environment=folder / "sky.exr", device="cpu",
+                           frames=f"1-{frames}", spin_degrees=360)
+    drive(request.model_copy(update={"frames": "1"}))
+    began = time.perf_counter()
+    drive(request)
+    print(f"\n{frames} frames, 331 lamps of three primaries, a map of {2 * ROWS} x {ROWS}: {time.perf_counter() - began:.1f} s")
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as name:
+        accuracy(Path(name))
+        speed(Path(name), int(sys.argv[1]) if len(sys.argv) > 1 else 240)

@@ -1,0 +1,99 @@
+"""The light of the frames of a drive: environments and discs, shared out over the lamps as `relit relight` weighs captured images."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.relight.model.beyond import share_beyond
+from service.drive.judgement import Judgement, environment_samples, judge
+from service.relight.environments import EnvironmentMap, Environments
+from service.relight.far_light import FarLight, far_light
+from service.relight.lighting import RUN, shared_energy
+from service.relight.schedule import ScheduledFrame
+from service.reporting.progress import Timings
+from service.requests.drive import Beyond, DriveRequest
+from stage.rig.rig import Rig
+from stage.transforms import fibonacci_sphere
+
+BEYOND_ROWS = 64
+"""The rows of the map by which light is measured that comes from where no lamp stands."""
+PROBES = 4096
+"""The number of directions in which lamps are looked for, to tell whether there is such a place."""
+
+
+class Light(NamedTuple):
+    """The light of all frames, before its exposure."""
+
+    far: list[FarLight]
+    energy: np.ndarray  # [frames, lights, 3] that each lamp is to give
+    beyond: np.ndarray  # [frames] part of the energy from where no lamp stands
+    stops: np.ndarray  # [frames] exposure of each frame by the light keys
+
+
+def collect_light(scheduled: Sequence[ScheduledFrame], environments: Environments | None, rig: Rig, request: DriveRequest, device: str,
+           timings: Timings) -> Light:
+    """Return the light of all frames, shared out over the lamps."""
+    far: list[FarLight] = []
+    energy, beyond = [], []
+    for _, group in groupby(scheduled, key=lambda frame: None if frame.environment is None else frame.environment.path):
+        members = list(group)
+        for begin in range(0, len(members), RUN):
+            run = [far_light(frame, environments, rig.color_space) for frame in members[begin : begin + RUN]]
+            beyond.append(_beyond(run, rig))
+            if request.beyond is Beyond.DROP:
+                given = np.concatenate([shared_energy([_within(light, rig)], rig.directions, weighting=request.weights,
+                                                      device=device) for light in run])
+            else:
+                given = shared_energy(run, rig.directions, weighting=request.weights, device=device)
+            energy.append(given)
+            far += run
+            timings.advance(len(far))
+    stops = np.array([frame.exposure_stops for frame in scheduled]) - request.exposure
+    return Light(far, np.concatenate(energy), np.concatenate(beyond), stops)
+
+
+def _beyond(run: Sequence[FarLight], rig: Rig) -> np.ndarray:
+    """Return the part of the energy of each frame that comes from where no lamp stands."""
+    environment = run[0].environment
+    found = np.zeros(len(run))
+    if not share_beyond(rig.directions, fibonacci_sphere(PROBES)).any():
+        return found
+    direction, energy = (np.zeros((0, 3)), np.zeros(0)) if environment is None else _lumped(environment)
+    for index, light in enumerate(run):
+        towards = np.concatenate([direction @ light.rotation.T, *(disc.direction[None] for disc in light.discs)])
+        amount = np.concatenate([energy * light.gain, [disc.irradiance.sum() for disc in light.discs]])
+        found[index] = share_beyond(rig.directions, towards) @ amount / max(amount.sum(), np.finfo(float).tiny)
+    return found
+
+
+def _lumped(environment: EnvironmentMap) -> tuple[np.ndarray, np.ndarray]:
+    direction, energy = environment_samples(environment, BEYOND_ROWS)
+    return direction, energy.sum(axis=1)
+
+
+def _within(light: FarLight, rig: Rig) -> FarLight:
+    """Return the light of a frame without what comes from where no lamp stands."""
+    discs = tuple(disc._replace(irradiance=disc.irradiance * (1 - share_beyond(rig.directions, disc.direction[None])[0]))
+                  for disc in light.discs)
+    if light.environment is None:
+        return light._replace(discs=discs)
+    radiance = light.environment.radiance
+    rows, columns = radiance.shape[:2]
+    across, down = 2 * np.pi * (np.arange(columns) + 0.5) / columns, np.pi * (np.arange(rows) + 0.5) / rows
+    kept = np.empty_like(radiance)
+    for row, angle in enumerate(down):
+        direction = np.stack([np.sin(across) * np.sin(angle), np.full(columns, np.cos(angle)), -np.cos(across) * np.sin(angle)], axis=1)
+        kept[row] = radiance[row] * (1 - share_beyond(rig.directions, direction @ light.rotation.T))[:, None]
+    return light._replace(environment=EnvironmentMap(kept), discs=discs)
+
+
+def judge_all(light: Light, level: np.ndarray, rig: Rig, exposure: np.ndarray) -> Judgement:
+    """Return the error of all frames, run by run of one environment."""
+    found, begin = [], 0
+    for _, group in groupby(light.far, key=lambda far: id(far.environment)):
+        run = list(group)
+        part = slice(begin, begin := begin + len(run))
+        found.append(judge(run, level[part], rig, exposure[part]))
+    return Judgement(*(np.concatenate(values) for values in zip(*found, strict=True)))

@@ -1,0 +1,102 @@
+"""The picture of a drive: the environment, what a mirror ball and a matte ball show under it and under the lamps, and their difference."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kernels.relight.model.sources import disc_samples
+from service.drive.judgement import environment_samples, irradiance_of, lamp_irradiance
+from service.relight.far_light import FarLight, disc_light
+from service.relight.sheet import BACKGROUND, display, write_sheet
+from stage.rig.rig import Rig
+
+PICTURE_FILE = "preview.png"
+MOST_ROWS = 3
+"""The most frames that are shown; of more, evenly spaced ones are."""
+ERROR_SCALE = 10.0
+"""The factor on the difference of the matte balls."""
+SAMPLE_ROWS = 32
+"""The rows of the map that lights the matte ball."""
+MAP_ROWS = 128
+"""The most rows of the map before it is scaled."""
+BALL = 112
+"""The side of a ball before it is scaled to the height of the sheet, pixels."""
+GREY = 0.5
+"""The mean of the matte ball under the environment before the display transform."""
+LAMP_COSINE = float(np.cos(np.radians(4.0)))
+"""Half the width at which lamps are drawn."""
+
+
+def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, numbers: Sequence[int]) -> Path:
+    """Write the picture into a folder and return its path.
+
+    Args:
+        folder: it is there.
+        rig: its lamps.
+        far: the light of each frame.
+        level: [frames, emitters] of `rig.emitters`, 0…1.
+        exposure: [frames] factor on the light.
+        numbers: of the frames.
+    """
+    shown = np.linspace(0, len(far), min(MOST_ROWS, len(far)), endpoint=False).astype(int)
+    rows = [_row(rig, far[index], level[index], exposure[index], numbers[index]) for index in shown]
+    path = folder / PICTURE_FILE
+    write_sheet(path, rows)
+    return path
+
+
+def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: int) -> list[tuple[str, np.ndarray]]:
+    energy = lamp_irradiance(level[None], rig)[0]
+    normal, on_ball = _ball()
+    parts = [] if light.environment is None else [environment_samples(light.environment, SAMPLE_ROWS)]
+    directions = [parts[0][0] @ light.rotation.T] if parts else []
+    energies = [parts[0][1] * light.gain] if parts else []
+    for disc in light.discs:
+        samples = disc_light(disc, disc_samples(disc.direction, disc.angle_degrees))
+        directions.append(samples.direction)
+        energies.append(samples.energy)
+    wanted = irradiance_of(np.concatenate(directions), np.concatenate(energies), normal) * exposure
+    given = irradiance_of(rig.directions, energy, normal)
+    scale = GREY / max(float(wanted.mean()), np.finfo(float).tiny)
+    reflected = 2 * normal[:, 2:] * normal - np.array([0.0, 0.0, 1.0])
+    mirrored = np.zeros((len(normal), 3)) if light.environment is None else _looked_up(light, reflected) * exposure
+    lamps = np.zeros((len(normal), 3))
+    cosine = reflected @ rig.directions.T
+    nearest = cosine.argmax(axis=1)
+    seen = cosine.max(axis=1) >= LAMP_COSINE
+    lamps[seen] = energy[nearest[seen]] / (2 * np.pi * (1 - LAMP_COSINE))
+
+    def ball(values: np.ndarray) -> np.ndarray:
+        picture = np.tile(BACKGROUND, (BALL, BALL, 1))
+        picture[on_ball] = display((values * scale * np.pi)[None].astype(np.float32), rig.color_space)[0]
+        return picture
+
+    def matte(values: np.ndarray) -> np.ndarray:
+        return ball(values / np.pi)
+
+    tiles = [("mirror ball: environment", ball(mirrored)), ("mirror ball: lamps", ball(lamps)), ("matte ball: environment", matte(wanted)),
+             ("matte ball: lamps", matte(given)), (f"{ERROR_SCALE:.0f} x difference", matte(np.abs(given - wanted) * ERROR_SCALE))]
+    if light.environment is not None:
+        step = -(-len(light.environment.radiance) // MAP_ROWS)
+        shown = light.environment.radiance[::step, ::step] * (light.gain * exposure * scale * np.pi)
+        tiles.insert(0, (f"frame {number}: map", display(shown.astype(np.float32), rig.color_space)))
+    return tiles
+
+
+def _ball() -> tuple[np.ndarray, np.ndarray]:
+    """Return the normals [pixels, 3] of a ball seen from +z, and the pixels [BALL, BALL] bool that show it."""
+    across = (2 * np.arange(BALL) + 1) / BALL - 1
+    x, y = np.meshgrid(across, -across)
+    on_ball = x * x + y * y < 1
+    return np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)[on_ball], on_ball
+
+
+def _looked_up(light: FarLight, towards: np.ndarray) -> np.ndarray:
+    """Return the radiance [n, 3] of the turned environment in directions [n, 3]."""
+    assert light.environment is not None
+    x, y, z = (towards @ light.rotation).T
+    rows, columns = light.environment.radiance.shape[:2]
+    column = (np.arctan2(x, -z) / (2 * np.pi) % 1 * columns).astype(int) % columns
+    row = np.minimum((np.arccos(np.clip(y, -1, 1)) / np.pi * rows).astype(int), rows - 1)
+    return light.environment.radiance[row, column].astype(np.float64) * light.gain

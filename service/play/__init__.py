@@ -1,0 +1,1 @@
+"""Cues sent to the lamps of a rig, frame by frame, over sACN or Art-Net."""

@@ -1,0 +1,92 @@
+"""The options of `relit rig`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from service.requests.base.base import CAPTURE, Choice, Commas, Options, Role, Spelling
+from service.requests.drive import RIG
+from service.requests.play import Protocol
+from stage.model import Count, Finite, FirstFault, Line, NotNegativeCount, Positive
+
+
+class Primaries(Choice):
+    """The primaries of the lamps of a rig that is made from a capture."""
+
+    RGB = "rgb", "red, green and blue, each with its channel of the irradiance of the captured light"
+    WHITE = "white", "one, with the whole irradiance of the captured light"
+
+
+class PatchOptions(Options):
+    """The addresses of new lamps, which are patched one after another."""
+
+    protocol: Protocol = Protocol.SACN
+    """The protocol of all lamps."""
+    universe: NotNegativeCount = 1
+    """The first universe; a lamp whose channels would not fit begins the next."""
+    bits: Literal[8, 16] = 16
+    """The bits of a level: 8, or 16 on two channels."""
+
+
+class RigCheckRequest(Options):
+    """Say what a rig holds, and what is wrong with it."""
+
+    rig: Annotated[Path, Role.INPUT, RIG]
+    """The rig (JSON, schema relit.rig/1); docs/drive.md."""
+    picture: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE.png")] = None
+    """Write a picture of the dome."""
+
+
+class RigFromCaptureRequest(PatchOptions):
+    """Write the rig of the lamps that lit a capture: their directions or places, and their irradiances."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder with a capture.json, a frame for each lamp."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The rig file."""
+    primaries: Primaries = Primaries.RGB
+    """The primaries of every lamp."""
+
+
+class RigFromCsvRequest(PatchOptions):
+    """Write the rig of a table of lamps: CSV with the columns name, x, y, z, and optionally universe, channel and irradiance."""
+
+    table: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="TABLE.csv")]
+    """The table; x, y and z in the camera frame: x to the right, y up, z towards the viewer."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The rig file."""
+    places: bool = False
+    """x, y and z are places in metres, and not directions."""
+    primaries: Annotated[tuple[Line, ...], FirstFault, Commas, Spelling(metavar="NAMES")] = ("red", "green", "blue")
+    """The names of the primaries of every lamp, in the order of their channels; red, green and blue, white (all three), or amber."""
+    irradiance: Positive = 1.0
+    """The irradiance of every primary at the subject at full level, where the table has none."""
+
+
+class RigFromMvrRequest(Options):
+    """Write the rig of the fixtures of a scene in MVR, by the GDTF files in it: places, colours of emitters and addresses."""
+
+    scene: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCENE.mvr")]
+    """The scene, with the GDTF files of its fixtures; needs pymvr and pygdtf: pip install 'relit[set]'."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The rig file."""
+    subject: Annotated[tuple[Finite, Finite, Finite], Commas, Spelling(metavar="X,Y,Z")] = (0.0, 0.0, 0.0)
+    """The place of the subject in the scene, in metres: z up, as in the scene."""
+    protocol: Protocol = Protocol.SACN
+    """The protocol of all lamps."""
+    universe: NotNegativeCount = 1
+    """The number that the protocol gives to universe 1 of the scene; the others follow it."""
+    irradiance: Positive = 1.0
+    """The luminance of the irradiance of every lamp at the subject with all its primaries at full level; a scene has none."""
+
+
+class RigPlanRequest(Options):
+    """Say what domes of so many lamps achieve under environments, before one is built."""
+
+    environment: Annotated[tuple[Path, ...], Role.INPUT, Spelling(metavar="MAP")] = Field(min_length=1)
+    """Lat-long environment maps, .exr or .hdr; may be given several times."""
+    lights: Annotated[tuple[Count, ...], FirstFault, Commas, Spelling(metavar="COUNTS")] = (32, 64, 128, 331)
+    """Numbers of lamps, with commas between; they are spread evenly over the sphere."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder of the results: plan.csv and plan.png."""

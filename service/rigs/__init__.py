@@ -1,0 +1,1 @@
+"""Rig files: made from captures and tables, checked, and planned."""

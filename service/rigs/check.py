@@ -1,0 +1,78 @@
+"""Say what a rig holds and what is wrong with it, with a picture of its dome."""
+
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.relight.model.beyond import reach
+from service.relight.sheet import BACKGROUND, display, write_sheet
+from service.requests.rig import RigCheckRequest
+from stage.rig.patch import Universe, patch_faults, slot
+from stage.rig.rig import Rig, read_rig
+from stage.transforms import fibonacci_sphere
+
+PROBES = 4096
+"""The number of directions in which lamps are looked for."""
+ONE_SIDED = 0.25
+"""A rig without lamps near this part of the sphere is said to leave it dark."""
+SIDE, LAMP = 720, 7
+"""The side of the picture of a half of the dome, and the radius of a lamp in it, pixels."""
+
+
+class RigCheck(NamedTuple):
+    """What a rig holds, and what is wrong with it."""
+
+    rig: Rig
+    universes: dict[Universe, int]
+    """The number of channels in each."""
+    primaries: dict[str, int]
+    """The number of lamps that have each primary."""
+    uncovered: float
+    """The part of the sphere in which no lamp stands within their reach, 0…1."""
+    faults: tuple[str, ...]
+    """What keeps lamps from being driven, as `field: what is wrong`."""
+    warnings: tuple[str, ...]
+
+
+def check_rig(request: RigCheckRequest) -> RigCheck:
+    """Check a rig and draw its dome where that is asked for.
+
+    Raises:
+        ManifestError: the file is wrong; names the field.
+        StorageError: the rig cannot be read or the picture not be written.
+    """
+    rig = read_rig(request.rig)
+    channels: Counter[Universe] = Counter()
+    for index, primary in rig.emitters:
+        if (place := slot(rig.lights[index], primary)) is not None:
+            channels[place.universe] += place.bits // 8
+    nearest = np.arccos(np.clip((fibonacci_sphere(PROBES) @ rig.directions.T).max(axis=1), -1, 1))
+    uncovered = float((nearest > 2 * reach(rig.directions)).mean())
+    warnings = []
+    if uncovered > ONE_SIDED:
+        warnings.append(f"no lamp stands near {uncovered:.0%} of the sphere: light from there is moved to other lamps or left out "
+                        "(relit drive --beyond)")
+    if request.picture is not None:
+        _draw(rig, request.picture)
+    return RigCheck(rig, dict(channels), dict(Counter(primary.name for _, primary in rig.emitters)), uncovered, tuple(patch_faults(rig)),
+                    tuple(warnings))
+
+
+def _draw(rig: Rig, path: Path) -> None:
+    """Write the dome as two discs, its front and its back, each lamp in the colour of its primaries together."""
+    colour = np.array([np.sum([primary.irradiance for primary in lamp.primaries], axis=0) for lamp in rig.lights])
+    colour = display((0.8 * colour / colour.max(axis=1, keepdims=True))[None].astype(np.float32), rig.color_space)[0]
+    down, across = np.mgrid[:SIDE, :SIDE]
+    tiles = []
+    for name, sign in (("front", 1.0), ("back, seen from the front", -1.0)):
+        picture = np.tile(BACKGROUND, (SIDE, SIDE, 1))
+        for direction, shown in zip(rig.directions, colour, strict=True):
+            if sign * direction[2] < 0:
+                continue
+            polar = np.arccos(np.clip(sign * direction[2], -1, 1)) / (np.pi / 2)  # equal angles are equal distances
+            side = polar * direction[:2] / max(np.hypot(*direction[:2]), 1e-12) * (SIDE / 2 - 2 * LAMP)
+            picture[np.hypot(across - SIDE / 2 - side[0], down - SIDE / 2 + side[1]) <= LAMP] = shown
+        tiles.append((f"{rig.name}: {name}", picture))
+    write_sheet(path, [tiles], height=SIDE)

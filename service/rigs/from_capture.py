@@ -1,0 +1,114 @@
+"""Make a rig of the lamps that lit a capture, or of a table of lamps."""
+
+import csv
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+
+from service.errors import RequestError
+from service.requests.rig import Primaries, RigFromCaptureRequest, RigFromCsvRequest
+from service.rigs.lamps import addresses, checked
+from stage import inputs
+from stage.capture.capture import Capture
+from stage.capture.light import PointLight
+from stage.capture.lighting import lights_from_centre
+from stage.capture.point_lights import place_lights
+from stage.colour.colour_spaces import linear_space
+from stage.errors import ManifestError
+from stage.rig.rig import RIG_SCHEMA, Lamp, Primary, Rig, write_rig
+
+RGB = ("red", "green", "blue")
+COLOURS = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0), "white": (1.0, 1.0, 1.0), "amber": (1.0, 0.5, 0.0)}
+"""The nominal colours of primaries by name; `relit calibrate rig` measures those of a stage."""
+
+
+def rig_from_capture(request: RigFromCaptureRequest) -> Rig:
+    """Write the rig of the lamps that lit a capture and return it.
+
+    Raises:
+        RequestError: addresses beyond the protocol's.
+        StageError: bad input; names file and field.
+        StorageError: the file cannot be written.
+    """
+    capture = Capture.open(request.capture)
+    lights = lights_from_centre(capture)
+    placed = place_lights(capture) if capture.lit_by(PointLight) else None
+    white = request.primaries is Primaries.WHITE
+    names = ("white",) if white else RGB
+    patch = addresses(request, names)
+    lamps, used = [], set[str]()
+    for index, frame in enumerate(capture.sources()):
+        name = Path(frame.image).stem
+        name = f"{name}-{index + 1}" if name in used else name
+        used.add(name)
+        strength = lights.irradiance[index]
+        if white:
+            primaries = [Primary(name="white", irradiance=tuple(strength))]
+        else:
+            dark = [colour for colour, value in zip(RGB, strength, strict=True) if value <= 0]
+            if dark:
+                raise RequestError(f"{request.capture}: the light of {frame.image} has no {dark[0]}: give --primaries white")
+            primaries = [Primary(name=colour, irradiance=tuple(row)) for colour, row in zip(RGB, np.diag(strength), strict=True)]
+        place = {"type": "point", "position_m": frame.light.position_m} if isinstance(frame.light, PointLight) else {
+            "type": "distant", "direction": tuple(lights.direction[index])}
+        lamps.append(checked(Lamp, {"name": name, **place, "primaries": tuple(primaries), "bits": request.bits, "address": next(patch)},
+                             f"{request.capture}: {frame.image}"))
+    manifest = capture.manifest
+    rig = checked(Rig, {"schema": RIG_SCHEMA, "name": manifest.name, "color_space": linear_space(manifest.color_space),
+                        "subject_m": (0.0, 0.0, 0.0) if placed is None else tuple(placed.centre), "camera": manifest.camera,
+                        "lights": tuple(lamps)}, str(request.out))
+    write_rig(rig, request.out)
+    return rig
+
+
+def rig_from_csv(request: RigFromCsvRequest) -> Rig:
+    """Write the rig of a table of lamps and return it.
+
+    Raises:
+        RequestError: addresses beyond the protocol's, or a primary of no known colour.
+        ManifestError: the table is wrong; names the line and the column.
+        StorageError: the table cannot be read, or the rig not be written.
+    """
+    unknown = [name for name in request.primaries if name not in COLOURS]
+    if unknown or len(set(request.primaries)) < len(request.primaries):
+        raise RequestError(f"--primaries {','.join(request.primaries)}: give different ones of {', '.join(COLOURS)}")
+    try:
+        text = inputs.read_bytes(request.table).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ManifestError(f"{request.table}: is not UTF-8 text") from error
+    rows = csv.DictReader(text.splitlines())
+    heads = [head.strip().lower() for head in rows.fieldnames or ()]
+    for column in ("name", "x", "y", "z"):
+        if column not in heads:
+            raise ManifestError(f"{request.table}: has no column {column}: its first line names the columns name, x, y, z")
+    if ("universe" in heads) != ("channel" in heads):
+        raise ManifestError(f"{request.table}: has one of the columns universe and channel: give both or neither")
+    patched = "universe" in heads
+    rows.fieldnames = heads
+    patch = repeat(None) if patched else addresses(request, request.primaries)
+    lamps = []
+    for row, address in zip(rows, patch, strict=False):
+        where = f"{request.table}: line {rows.line_num}"
+
+        def number(column: str, row: dict[str, str] = row, where: str = where) -> float:
+            try:
+                return float(row[column])
+            except (TypeError, ValueError) as error:
+                raise ManifestError(f"{where}: {column}: is {row[column]}: must be a number") from error
+
+        place = number("x"), number("y"), number("z")
+        strength = number("irradiance") if "irradiance" in heads else request.irradiance
+        if patched:
+            channel = int(number("channel"))
+            given = {name: channel + index * request.bits // 8 for index, name in enumerate(request.primaries)}
+            entry: object = {"protocol": request.protocol.value, "universe": int(number("universe")), "channels": given}
+        else:
+            entry = address
+        data = {"name": row["name"], "type": "point" if request.places else "distant", "bits": request.bits, "address": entry,
+                "position_m" if request.places else "direction": place,
+                "primaries": [{"name": name, "irradiance": tuple(strength * part for part in COLOURS[name])} for name in request.primaries]}
+        lamps.append(checked(Lamp, data, where))
+    rig = checked(Rig, {"schema": RIG_SCHEMA, "name": request.table.stem, "lights": tuple(lamps)}, str(request.table))
+    write_rig(rig, request.out)
+    return rig

@@ -1,0 +1,110 @@
+"""What domes of so many lamps achieve under environments: errors of the irradiance and of highlights, against the number of lamps.
+
+Highlights are those of a GGX lobe with the view from the front, as relit's materials have them (Walter et al., EGSR 2007).
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from service.drive.judgement import environment_samples, irradiance_of
+from service.relight.environments import Environments
+from service.relight.sheet import BACKGROUND, write_sheet
+from service.relight.weights.weighting import integrate
+from service.reporting.progress import Progress, Timings
+from service.requests.relight import LightWeights
+from service.requests.rig import RigPlanRequest
+from stage.files import write_text
+from stage.transforms import fibonacci_sphere
+
+SPACE = "lin_rec709_scene"
+NORMALS = 256
+ROUGHNESS = (0.1, 0.3, 0.6)
+"""The roughnesses of the highlights; α is the square of each."""
+WIDTH, HEIGHT = 720, 420
+COLOURS = ((0.95, 0.6, 0.2), (0.35, 0.7, 0.95), (0.5, 0.85, 0.45), (0.9, 0.4, 0.75))
+BATCH = 64
+
+
+class PlanRow(NamedTuple):
+    """What a dome achieves under an environment: root mean square errors over the normals, as parts of what the environment gives."""
+
+    environment: str
+    lights: int
+    irradiance: float
+    highlights: tuple[float, ...]
+    """One for each of ROUGHNESS."""
+
+
+def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[PlanRow]:
+    """Judge domes under environments, and write plan.csv and plan.png.
+
+    Raises:
+        StageError: a map cannot be used.
+        StorageError: a file cannot be read or written.
+    """
+    timings = Timings(progress)
+    timings.stage("plan", len(request.environment) * len(request.lights))
+    normals = fibonacci_sphere(NORMALS)
+    rows = []
+    for path in request.environment:
+        environments = Environments(path)
+        environments.check([1])
+        environment = environments.read(environments.path(1), SPACE)
+        direction, energy = environment_samples(environment)
+        wanted = [irradiance_of(direction, energy, normals), *(_lobe(direction, energy, normals, roughness) for roughness in ROUGHNESS)]
+        for count in request.lights:
+            lamps = fibonacci_sphere(count)
+            given = integrate(environment.radiance, lamps, np.eye(3)[None], weighting=LightWeights.KERNEL, device="cpu")[0]
+            got = [irradiance_of(lamps, given, normals), *(_lobe(lamps, given, normals, roughness) for roughness in ROUGHNESS)]
+            errors = [float(np.sqrt(((a - b) ** 2).mean() / max((b**2).mean(), 1e-300))) for a, b in zip(got, wanted, strict=True)]
+            rows.append(PlanRow(path.name, count, errors[0], tuple(errors[1:])))
+            timings.advance(len(rows))
+    timings.stage("files", 1)
+    request.out.mkdir(parents=True, exist_ok=True)
+    heads = ",".join(f"highlights_{roughness:g}_percent" for roughness in ROUGHNESS)
+    lines = "".join(f"{row.environment},{row.lights},{100 * row.irradiance:.4g},"
+                    f"{','.join(f'{100 * error:.4g}' for error in row.highlights)}\n" for row in rows)
+    write_text(request.out / "plan.csv", f"environment,lights,irradiance_percent,{heads}\n{lines}")
+    _plot(rows, request.out / "plan.png")
+    timings.close()
+    return rows
+
+
+def _lobe(direction: np.ndarray, energy: np.ndarray, normals: np.ndarray, roughness: float) -> np.ndarray:
+    """Return the radiance [normals, 3] that a GGX mirror of F0 1 sends to the front under samples of light; normals face the front."""
+    alpha2 = roughness**4
+    towards = np.array([0.0, 0.0, 1.0])
+    half = direction + towards
+    half /= np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-9)
+    found = np.zeros((len(normals), 3))
+    for begin in range(0, len(normals), BATCH):
+        normal = normals[begin : begin + BATCH]
+        seen, lit, across = np.maximum(normal[:, 2:], 0), np.maximum(normal @ direction.T, 0), np.maximum(normal @ half.T, 0)
+        distribution = alpha2 / (np.pi * (across**2 * (alpha2 - 1) + 1) ** 2)
+        masked = lit * np.sqrt(seen**2 * (1 - alpha2) + alpha2) + seen * np.sqrt(lit**2 * (1 - alpha2) + alpha2)
+        found[begin : begin + BATCH] = (distribution * 0.5 / np.maximum(masked, 1e-9) * lit * (seen > 0)) @ energy
+    return found
+
+
+def _plot(rows: list[PlanRow], path: Path) -> None:
+    """Write a plot of the errors against the number of lamps for each environment, both logarithmic."""
+    tiles = []
+    lights = np.log([row.lights for row in rows])
+    errors = np.log([[max(row.irradiance, 1e-5), *(max(error, 1e-5) for error in row.highlights)] for row in rows])
+    low, high = errors.min(), max(errors.max(), errors.min() + 1)
+    for name in dict.fromkeys(row.environment for row in rows):
+        picture = np.tile(BACKGROUND, (HEIGHT, WIDTH, 1))
+        chosen = [index for index, row in enumerate(rows) if row.environment == name]
+        x = 20 + (lights[chosen] - lights.min()) / max(float(np.ptp(lights)), 1e-9) * (WIDTH - 40)
+        for curve, colour in enumerate(COLOURS):
+            y = 20 + (high - errors[chosen, curve]) / (high - low) * (HEIGHT - 40)
+            order = np.argsort(x)
+            across = np.linspace(x.min(), x.max(), 4 * WIDTH)
+            down = np.interp(across, x[order], y[order])
+            for shift in (0, 1):
+                picture[np.clip(np.rint(down).astype(int) + shift, 0, HEIGHT - 1), np.rint(across).astype(int)] = colour
+        tiles.append([(f"{name}: {np.exp(low):.2%} to {np.exp(high):.2%}, {round(np.exp(lights.min()))} to {round(np.exp(lights.max()))} "
+                       "lamps; orange irradiance, blue, green, pink highlights of roughness .1, .3, .6", picture)])
+    write_sheet(path, tiles, height=HEIGHT)

@@ -1,0 +1,103 @@
+"""The twin of a stage: listen, show, and write down what was received."""
+
+import csv
+import io
+import socket
+import time
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import NamedTuple
+
+from service.errors import RequestError
+from service.play.addresses import driven_universes, with_protocol
+from service.reporting.progress import Progress, Timings
+from service.requests.play import TwinRequest
+from service.twin.fixtures import UniverseId
+from service.twin.listener import Listener
+from service.twin.page import serve_page
+from service.twin.picture import TwinPicture
+from stage.files import write_text
+from stage.rig.patch import levels_of_universes
+from stage.rig.rig import Rig, read_rig
+
+PICTURES = (".exr", ".png")
+
+
+class TwinResult(NamedTuple):
+    """What was received."""
+
+    frames: int
+    """Number of whole frames."""
+    out_of_order: int
+    """Number of packets that were left out because a later one had arrived."""
+
+
+class Twin(NamedTuple):
+    """A twin that is ready to listen."""
+
+    rig: Rig
+    universes: Collection[UniverseId]
+    picture: TwinPicture
+
+
+def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
+    """Read the rig and the images of the capture.
+
+    Raises:
+        RequestError: a suffix is unknown.
+        StageError, KernelError: bad input; names file and field.
+    """
+    if request.snapshot is not None and request.snapshot.suffix.lower() not in PICTURES:
+        raise RequestError(f"--snapshot {request.snapshot}: end the name in {' or '.join(PICTURES)}")
+    rig = with_protocol(read_rig(request.rig), request.protocol)
+    return Twin(rig, driven_universes(request.rig, rig).keys(), TwinPicture(rig, request, Timings(progress)))
+
+
+def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None], None]) -> TwinResult:
+    """Receive what is sent to a rig until the request's end or an interruption, and show or write it.
+
+    Args:
+        listening: called when the twin listens, with the address of its page, if there is one.
+
+    Raises:
+        RequestError: a port is in use, or no frame came.
+        StorageError: a file cannot be written.
+    """
+    rig, universes, picture = twin
+    ends = request.frames is not None or request.after is not None or request.snapshot is not None
+    most = 1 if ends and request.after is None and request.frames is None else request.frames
+    with Listener(universes, request.interface, keep=request.record is not None, most=most) as listener:
+        page = None if ends else _page_socket(request.port)
+        listening(None if page is None else "http://{}:{}".format(*page.getsockname()))
+        try:
+            if page is not None:
+                serve_page(page, rig, listener, picture)
+            else:
+                listener.wait(most, None if request.after is None else time.monotonic() + request.after)
+        except KeyboardInterrupt:
+            pass  # which ends a rehearsal as it should
+    if request.snapshot is not None:
+        if listener.last.number == 0:
+            raise RequestError(f"--snapshot {request.snapshot}: no frame was received on {request.interface}")
+        picture.write(request.snapshot, levels_of_universes(rig, dict(listener.last.values)))
+    if request.record is not None:
+        _record(request.record, rig, listener)
+    return TwinResult(listener.last.number, listener.fixtures.out_of_order)
+
+
+def _record(path: Path, rig: Rig, listener: Listener) -> None:
+    """Write the levels of every frame as a table."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "time_s", *(f"{rig.lights[index].name}.{primary.name}" for index, primary in rig.emitters)])
+    for frame in listener.kept:
+        levels = levels_of_universes(rig, dict(frame.values))
+        table.writerow([frame.number, f"{frame.time_s:.6f}", *(f"{level:.9g}" for level in levels)])
+    write_text(path, text.getvalue())
+
+
+def _page_socket(port: int) -> socket.socket:
+    try:
+        return socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        raise RequestError(f"--port {port}: cannot serve the page: {(error.strerror or str(error)).lower()}") from error

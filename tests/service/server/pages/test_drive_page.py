@@ -1,0 +1,69 @@
+"""The page of a drive shows the levels of cues.json, frame by frame, and gives the files away."""
+
+import json
+
+import pytest
+
+from stage.transforms import fibonacci_sphere
+from tests.scenes.rigs import write_rig
+from tests.service.server.pages.axe import violations_in_both_schemes
+from tests.service.server.pages.conftest import PICTURES, done, new_context
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def driven(server, sky, tmp_path_factory) -> str:
+    """The job that drove a dome of 64 lamps under the turning environment of the sample."""
+    rig = write_rig(tmp_path_factory.mktemp("rig") / "dome.json", fibonacci_sphere(64), irradiance=4.0)
+    with server.client() as client:
+        return done(server, client, {"kind": "drive", "rig": rig, "environment": sky,
+                                     "options": {"frames": "11-14", "spin_degrees": 360.0, "auto_exposure": True}})
+
+
+def shown(page) -> dict[str, list[float]]:
+    """The levels in percent that the diagram says of each lamp."""
+    titles = [text.split(": ") for text in page.locator("#dome title").all_text_contents()]
+    return {name: [float(level.removesuffix(" %")) for level in levels.split(", ")] for name, levels in titles}
+
+
+def test_the_lamps_of_each_frame_and_the_files(page, server, driven, tmp_path):
+    with server.client() as client:
+        cues = client.get(f"/v1/jobs/{driven}/results/cues.json").raise_for_status()
+    page.goto(f"/jobs/{driven}")
+    page.locator("#cues").click()
+    page.get_by_role("heading", name="Drive of dome").wait_for()
+    slider, fills = page.get_by_label("Frame"), []
+    for place, frame in enumerate(cues.json()["frames"]):
+        slider.fill(str(place))
+        page.locator("#frame", has_text=f"{11 + place}: the brightest primary").wait_for()
+        wanted: dict[str, list[float]] = {}
+        for (lamp, _), level in zip(cues.json()["emitters"], frame["levels"], strict=True):
+            wanted.setdefault(lamp, []).append(100 * level)
+        found = shown(page)
+        assert found.keys() == wanted.keys()
+        assert all(found[lamp] == pytest.approx(wanted[lamp], abs=0.0501) for lamp in wanted)  # one decimal is shown
+        fills.append([dot.get_attribute("fill") for dot in page.locator("#dome circle[fill]").all()])
+    assert len({tuple(each) for each in fills}) == 4
+    assert any("255" in fill for each in fills for fill in each)  # the brightest of all frames
+    page.wait_for_function("document.getElementById('picture').naturalWidth > 0")
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Download cues.json").click()
+    assert json.loads(saved.value.path().read_text()) == cues.json()
+    page.screenshot(path=f"{PICTURES or tmp_path}/page_drive.png")
+
+
+def test_a_job_of_another_kind_is_said(page, solved):
+    page.goto(f"/drive/{solved.solve}")
+    page.locator("#state", has_text="This job drives no rig.").wait_for()
+
+
+def test_the_page_fits_and_has_no_serious_violation(browser, server, driven):
+    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
+    page.goto(f"/drive/{driven}")
+    page.locator("#dome circle[fill]").first.wait_for()
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
+    assert violations_in_both_schemes(page) == []
+    page.close()

@@ -1,0 +1,59 @@
+"""The page of relit twin in a browser: the owl under a warm sun and a blue sky, as its lamps are driven."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.play.play import play
+from service.requests.play import PlayRequest
+from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+
+ROOT = SAMPLES.parent
+
+
+@pytest.mark.long
+def test_the_twin_shows_the_sample(browser, tmp_path):
+    frames = json.loads((SAMPLES / "owl" / "capture.json").read_text())["frames"]
+    directions, host = np.array([frame["light"]["direction"] for frame in frames]), loopback()
+    rig = write_rig_file(tmp_path / "rig.json", directions, host=host, universes=2, name="the owl's dome")
+    near = [np.clip((directions @ np.array(way) / np.linalg.norm(way) - 0.6) / 0.4, 0, 1) for way in ((-1.0, 0.5, 1.0), (1.0, 0.7, 0.2))]
+    levels = np.outer(near[0], [1, 0.7, 0.4]) + np.outer(near[1], [0.05, 0.15, 0.5])
+    steps = np.round(255 * np.minimum(levels, 1)).astype(int).reshape(1, -1)
+    cues, stop = write_cues_file(tmp_path / "cues.json", rig, steps), threading.Event()
+    command = [sys.executable, "-m", "service.cli.main", "twin", rig, SAMPLES / "owl", "--cache", tmp_path, "--interface", host,
+               "--port", "0"]
+    program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    player = threading.Thread(target=play, args=[PlayRequest(cues=cues, rig=rig, hold=1), stop])
+    try:
+        assert program.stdout.readline().startswith("twin ")
+        address = program.stdout.readline().split()[1].removesuffix(":")
+        context = new_context(browser, viewport={"width": 1000, "height": 640})
+        page, errors = context.new_page(), []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(address)
+        assert page.locator("#state").inner_text().startswith("Waiting")
+        player.start()
+        page.locator("#state", has_text="frames received").wait_for()
+        brightest = int(np.argmax(steps.reshape(-1, 3)[:, 0]))
+        red, green, blue = (round(value / 2.55, 1) for value in steps.reshape(-1, 3)[brightest])
+        page.locator("#dome title", has_text=f"lamp {brightest}: {red:.1f} %, {green:.1f} %, {blue:.1f} %").wait_for(state="attached")
+        page.screenshot(path=Path(PICTURES or tmp_path) / "page_twin.png")
+        stop.set()
+        player.join()
+        page.locator("#dome title", has_text=f"lamp {brightest}: 0.0 %, 0.0 %, 0.0 %").wait_for(state="attached")
+        program.send_signal(signal.SIGINT)
+        assert program.wait(timeout=20) == 0
+        page.locator("#state", has_text="The twin has ended.").wait_for()
+        context.close()
+        assert errors == []
+    finally:
+        stop.set()
+        program.kill()
