@@ -11,10 +11,11 @@ import pytest
 from kernels import device as devices
 from tests import emulated_device
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # as after `make test &`, whose shell ignores Ctrl-C for it: so does the run itself, but a program inherits only what is ignored and not
-    # what is handled, so that programs that tests start take signals as ever
-    signal.signal(signal.SIGINT, lambda *_: None)
+for ignored in (signal.SIGINT, signal.SIGHUP):
+    if signal.getsignal(ignored) is signal.SIG_IGN:
+        # as after `make test &` and under nohup: the run itself goes on ignoring them, but a program inherits only what is ignored and not
+        # what is handled, so that programs that tests start take signals as ever
+        signal.signal(ignored, lambda *_: None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

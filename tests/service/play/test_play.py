@@ -152,10 +152,13 @@ def test_a_signal_turns_the_lamps_dark(tmp_path, protocol, number):
     with Listener([(protocol, 1), (protocol, 2)], host, keep=True) as listener:
         program = subprocess.Popen([sys.executable, "-m", "service.cli.main", "play", str(cues), str(rig_path), "--loop"], cwd=ROOT,
                                    stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-        listener.wait(10, time.monotonic() + 30)
-        assert levels_of_universes(read_rig(rig_path), listener.last.values).min() == 1
-        program.send_signal(number)
-        out, _ = program.communicate(timeout=20)
+        try:
+            listener.wait(10, time.monotonic() + 30)
+            assert levels_of_universes(read_rig(rig_path), listener.last.values).min() == 1
+            program.send_signal(number)
+            out, _ = program.communicate(timeout=20)
+        finally:
+            program.kill()  # else it would go on to light the lamps of the next test
         assert program.returncode == 0 and "the lamps are dark" in out
     assert not levels_of_universes(read_rig(rig_path), listener.last.values).any()
 
