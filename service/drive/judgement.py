@@ -83,20 +83,25 @@ def environment_samples(environment: EnvironmentMap, most_rows: int = FOLDED_ROW
     """Return samples of a map, unit vectors [n, 3] and their energies [n, 3], as many as a map of `most_rows` rows has or fewer."""
     radiance = environment.radiance
     rows, columns = radiance.shape[:2]
-    across, down = 2 * np.pi * (np.arange(columns) + 0.5) / columns, np.pi * (np.arange(rows) + 0.5) / rows
     side = -(-rows // most_rows)
     directions, energies = [], []
     for first in range(0, rows, side):
-        part = down[first : first + side, None]
-        solid = np.sin(part) * (np.pi / rows) * (2 * np.pi / columns)
+        down = np.pi * (np.arange(first, min(first + side, rows)) + 0.5) / rows
+        solid = np.sin(down)[:, None] * (np.pi / rows) * (2 * np.pi / columns)
         energy = radiance[first : first + side].astype(np.float64) * solid[..., None]
-        direction = np.stack(np.broadcast_arrays(np.sin(across) * np.sin(part), np.cos(part), -np.cos(across) * np.sin(part)), axis=-1)
+        direction = texel_directions(down, columns)
         weight = np.maximum(energy.sum(axis=2), 1e-100)
         starts = np.arange(0, columns, side)
         folded = np.add.reduceat((direction * weight[..., None]).sum(axis=0), starts, axis=0)
         directions.append(folded / np.linalg.norm(folded, axis=1, keepdims=True))
         energies.append(np.add.reduceat(energy.sum(axis=0), starts, axis=0))
     return np.concatenate(directions), np.concatenate(energies)
+
+
+def texel_directions(down: np.ndarray, columns: int) -> np.ndarray:
+    """Return the unit vectors [rows, columns, 3] to the texels of a lat-long map in rows at these angles from +y, radians."""
+    across, sine = 2 * np.pi * (np.arange(columns) + 0.5) / columns, np.sin(down)[:, None]
+    return np.stack(np.broadcast_arrays(np.sin(across) * sine, np.cos(down)[:, None], -np.cos(across) * sine), axis=-1)
 
 
 def _uv(xyz: np.ndarray) -> np.ndarray:

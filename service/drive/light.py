@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.model.beyond import share_beyond
-from service.drive.judgement import Judgement, environment_samples, judge
+from service.drive.judgement import Judgement, environment_samples, judge, texel_directions
 from service.relight.environments import EnvironmentMap, Environments
 from service.relight.far_light import FarLight, far_light
 from service.relight.lighting import RUN, shared_energy
@@ -60,17 +60,12 @@ def _beyond(run: Sequence[FarLight], rig: Rig) -> np.ndarray:
     found = np.zeros(len(run))
     if not share_beyond(rig.directions, fibonacci_sphere(PROBES)).any():
         return found
-    direction, energy = (np.zeros((0, 3)), np.zeros(0)) if environment is None else _lumped(environment)
+    direction, energy = (np.zeros((0, 3)), np.zeros((0, 3))) if environment is None else environment_samples(environment, BEYOND_ROWS)
     for index, light in enumerate(run):
         towards = np.concatenate([direction @ light.rotation.T, *(disc.direction[None] for disc in light.discs)])
-        amount = np.concatenate([energy * light.gain, [disc.irradiance.sum() for disc in light.discs]])
+        amount = np.concatenate([energy.sum(axis=1) * light.gain, [disc.irradiance.sum() for disc in light.discs]])
         found[index] = share_beyond(rig.directions, towards) @ amount / max(amount.sum(), np.finfo(float).tiny)
     return found
-
-
-def _lumped(environment: EnvironmentMap) -> tuple[np.ndarray, np.ndarray]:
-    direction, energy = environment_samples(environment, BEYOND_ROWS)
-    return direction, energy.sum(axis=1)
 
 
 def _within(light: FarLight, rig: Rig) -> FarLight:
@@ -81,10 +76,9 @@ def _within(light: FarLight, rig: Rig) -> FarLight:
         return light._replace(discs=discs)
     radiance = light.environment.radiance
     rows, columns = radiance.shape[:2]
-    across, down = 2 * np.pi * (np.arange(columns) + 0.5) / columns, np.pi * (np.arange(rows) + 0.5) / rows
     kept = np.empty_like(radiance)
-    for row, angle in enumerate(down):
-        direction = np.stack([np.sin(across) * np.sin(angle), np.full(columns, np.cos(angle)), -np.cos(across) * np.sin(angle)], axis=1)
+    for row, angle in enumerate(np.pi * (np.arange(rows) + 0.5) / rows):
+        direction = texel_directions(np.array([angle]), columns)[0]
         kept[row] = radiance[row] * (1 - share_beyond(rig.directions, direction @ light.rotation.T))[:, None]
     return light._replace(environment=EnvironmentMap(kept), discs=discs)
 

@@ -69,14 +69,12 @@ def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: 
 
     def ball(values: np.ndarray) -> np.ndarray:
         picture = np.tile(BACKGROUND, (BALL, BALL, 1))
-        picture[on_ball] = display((values * scale * np.pi)[None].astype(np.float32), rig.color_space)[0]
+        picture[on_ball] = display((values * scale)[None].astype(np.float32), rig.color_space)[0]
         return picture
 
-    def matte(values: np.ndarray) -> np.ndarray:
-        return ball(values / np.pi)
-
-    tiles = [("mirror ball: environment", ball(mirrored)), ("mirror ball: lamps", ball(lamps)), ("matte ball: environment", matte(wanted)),
-             ("matte ball: lamps", matte(given)), (f"{ERROR_SCALE:.0f} x difference", matte(np.abs(given - wanted) * ERROR_SCALE))]
+    tiles = [("mirror ball: environment", ball(mirrored * np.pi)), ("mirror ball: lamps", ball(lamps * np.pi)),
+             ("matte ball: environment", ball(wanted)), ("matte ball: lamps", ball(given)),
+             (f"{ERROR_SCALE:.0f} x difference", ball(np.abs(given - wanted) * ERROR_SCALE))]
     if light.environment is not None:
         step = -(-len(light.environment.radiance) // MAP_ROWS)
         shown = light.environment.radiance[::step, ::step] * (light.gain * exposure * scale * np.pi)

@@ -1,4 +1,4 @@
-"""The one interface of all protocols; each is a module of its own, which is loaded when it is needed."""
+"""The interface that every protocol has; each is a module of its own, which is loaded when it is needed."""
 
 from collections.abc import Mapping
 from importlib import import_module

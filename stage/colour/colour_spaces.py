@@ -4,7 +4,9 @@ The names are those of the Color Interop Forum. Pixels are converted in `stage.c
 that requests and the command line can check a name without loading one.
 """
 
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+from pydantic import AfterValidator
 
 ColorSpaceName = Literal[
     "lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene", "lin_adobergb_scene",
@@ -25,6 +27,16 @@ _LINEAR_OF: dict[str, str] = {
 def is_linear(space: str) -> bool:
     """Return whether the values of a colour space are proportional to radiance."""
     return space not in _LINEAR_OF
+
+
+def _of_light(space: str) -> str:
+    if not is_linear(space):
+        raise ValueError(f"is {space}: a light has a scene-linear colour, such as lin_rec709_scene")
+    return space
+
+
+LightSpaceName = Annotated[ColorSpaceName, AfterValidator(_of_light)]
+"""The values that `color_space` of a light may have: scene-linear spaces alone."""
 
 
 def linear_space(space: str) -> str:

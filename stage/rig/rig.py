@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from stage.capture.camera import Camera
-from stage.colour.colour_spaces import ColorSpaceName, is_linear
+from stage.colour.colour_spaces import LightSpaceName
 from stage.files import write_text
 from stage.model import Direction, FirstFault, Fraction, LitRgb, NotNegative, Positive, Strict, Text, Vector
 from stage.records import faults_of_each, read_record
@@ -143,12 +143,6 @@ class Lamp(Strict):
         return self
 
 
-def _linear(space: str) -> str:
-    if not is_linear(space):
-        raise ValueError(f"is {space}: a light has a scene-linear colour, such as lin_rec709_scene")
-    return space
-
-
 class Rig(Strict):
     """The content of a rig file."""
 
@@ -156,7 +150,7 @@ class Rig(Strict):
     """The kind and version of the file."""
     name: Text
     """The name of the rig."""
-    color_space: Annotated[ColorSpaceName, AfterValidator(_linear)] = "lin_rec709_scene"
+    color_space: LightSpaceName = "lin_rec709_scene"
     """The scene-linear colour space of the irradiances."""
     subject_m: Vector = (0.0, 0.0, 0.0)
     """The place of the subject, in metres."""

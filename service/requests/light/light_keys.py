@@ -8,7 +8,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import AfterValidator, Field
 
 from service.requests.light.picture_options import MAX_STOPS, FrameRate
-from stage.colour.colour_spaces import ColorSpaceName, is_linear
+from stage.colour.colour_spaces import LightSpaceName
 from stage.model import Direction, FirstFault, NotNegative, Rgb, Strict, Text
 from stage.records import read_record
 
@@ -81,12 +81,6 @@ def _no_opposites(keys: tuple[AnyKey, ...], *, field: str) -> tuple[AnyKey, ...]
     return keys
 
 
-def _linear(space: str) -> str:
-    if not is_linear(space):
-        raise ValueError(f"is {space}: a light has a scene-linear colour, such as lin_rec709_scene")
-    return space
-
-
 InOrder = AfterValidator(_in_order)
 Some = Field(min_length=1)
 
@@ -95,7 +89,7 @@ class LightTrack(Strict):
     """One animated light."""
 
     name: Text
-    color_space: Annotated[ColorSpaceName, AfterValidator(_linear)] = "lin_rec709_scene"
+    color_space: LightSpaceName = "lin_rec709_scene"
     """The colour space of the irradiance."""
     keys: Annotated[tuple[LightKey, ...], Some, FirstFault, InOrder, AfterValidator(partial(_no_opposites, field="direction"))]
 

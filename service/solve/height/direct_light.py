@@ -35,7 +35,7 @@ class DirectLight(NamedTuple):
     solved: wp.array  # [rows, cols] uint8 on the device: the number of the part of each solved pixel, 0 elsewhere
     height: wp.array  # [rows, cols] float32, on the device
     extent: Extent
-    """Of the height and the mask."""
+    """The part of the image where there is surface, and its highest z."""
     shadows: bool
     """True if cast shadows of the height are taken out."""
     arriving: ArrivingLight | None

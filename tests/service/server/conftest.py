@@ -13,7 +13,7 @@ from tests.service.server.house import DAYS, House
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest) -> str | None:
-    """Of each kind of database; those on PostgreSQL are a new one each."""
+    """The address of a database of each kind, of a new one each time on PostgreSQL; None for SQLite."""
     return None if request.param == "sqlite" else request.getfixturevalue("server_postgres").new_database()
 
 

@@ -22,7 +22,7 @@ def data(tmp_path, monkeypatch):
 
 @pytest.fixture(autouse=True)
 def database(data):
-    """Of a service with one key."""
+    """The database of a service with one key."""
     settings = Settings(data=data)
     made = connect(settings.sqlalchemy_url)
     prepare(settings, made)

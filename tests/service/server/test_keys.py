@@ -20,7 +20,7 @@ def data(tmp_path):
 
 @pytest.fixture
 def database(data):
-    """Of the keys that a test makes."""
+    """The database for the keys that a test makes."""
     settings = Settings(data=data)
     made = connect(settings.sqlalchemy_url)
     prepare(settings, made)
