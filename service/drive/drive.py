@@ -95,7 +95,7 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     factor = exposure * 2.0**light.stops
     judgement, unrounded = (judge_all(light, level, rig, factor) for level in (quantised.level, dilated.level))
     timings.advance(4)
-    warnings = tuple(drive_warnings(rig, light, wanted, dilated, environments))
+    warnings = tuple(drive_warnings(rig, light, wanted, dilated, factor, environments))
     rate = request.frames_per_second or (None if keys is None else keys.frames_per_second) or FRAMES_PER_SECOND
     sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers)
     timings.stage("files", 1)

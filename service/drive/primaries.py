@@ -27,7 +27,7 @@ class WantedLevels(NamedTuple):
     """Levels without an upper limit."""
 
     level: np.ndarray  # [frames, emitters] float64, 0 or more
-    out_of_gamut: np.ndarray  # [frames, 3] float64: irradiance that the lamps' colours cannot give, summed without sign
+    out_of_gamut: np.ndarray  # [frames, 3] float64: irradiance that the lamps' colours cannot give, without sign; 0 with a chart
 
 
 def levels_for_light(light: np.ndarray, rig: Rig, chart: ChartReadings | None) -> WantedLevels:
@@ -57,7 +57,8 @@ def levels_for_light(light: np.ndarray, rig: Rig, chart: ChartReadings | None) -
             towards = wanted @ np.einsum("jk,ajk->ka", chart.target, readings)
         count = len(matrix)
         found = nonnegative_least_squares(gram + np.eye(count) * (LEAST_POWER * np.trace(gram) / count), towards)
-        missed += np.abs(wanted - found @ matrix).reshape(frames, -1, 3).sum(axis=1)
+        if chart is None:
+            missed += np.abs(wanted - found @ matrix).reshape(frames, -1, 3).sum(axis=1)
         columns = first[members][:, None] + np.arange(count)
         level[:, columns] = found.reshape(frames, len(members), count)
     return WantedLevels(level, missed)

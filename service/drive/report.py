@@ -17,8 +17,9 @@ WORTH_SAYING = 0.01
 """Parts of the light from here on are worth a warning."""
 
 
-def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilated, environments: Environments | None) -> list[str]:
-    """Return what the user should know, a sentence each."""
+def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilated, exposure: np.ndarray,
+                   environments: Environments | None) -> list[str]:
+    """Return what the user should know, a sentence each; the levels are those of the light times the exposure [frames]."""
     found = []
     if (faults := list(patch_faults(rig))):
         found.append(f"{len(faults)} faults of the patch keep lamps dark in relit play, the first: {faults[0]} (relit rig check)")
@@ -27,7 +28,7 @@ def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilate
     if dilated.radius.max() > 0:
         found.append(f"lamps are at their limit in {int((dilated.radius > 0).sum())} frames: what they cannot give is spread over lamps up "
                      f"to {np.degrees(dilated.radius.max()):.0f} degrees around")
-    total = np.maximum(light.energy.sum(axis=(1, 2)), np.finfo(float).tiny)
+    total = np.maximum(light.energy.sum(axis=(1, 2)) * exposure, np.finfo(float).tiny)
     if (gamut := float((wanted.out_of_gamut.sum(axis=1) / total).max())) > WORTH_SAYING:
         found.append(f"the colours of the lamps miss up to {gamut:.0%} of the light: its colours lie outside theirs")
     if environments is not None and environments.clipped:

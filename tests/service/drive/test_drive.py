@@ -137,6 +137,16 @@ def test_light_from_where_no_lamp_stands_is_moved_or_left_out(drive, tmp_path):
     assert lost == pytest.approx(report["limits"]["beyond_share"], abs=0.01)
 
 
+@pytest.mark.parametrize("exposure", ["0", "-2"])
+def test_colours_that_the_lamps_lack_are_said_as_a_part_of_the_light(relit, tmp_path, exposure):
+    """Red lamps alone under white light: two thirds are missing, whatever the exposure."""
+    write_rig(tmp_path / "rig.json", fibonacci_sphere(32), primaries={"red": (1.0, 0.0, 0.0)})
+    write_sky(tmp_path / "sky.exr", "overcast", rows=16)
+    outcome = relit.done("drive", tmp_path / "rig.json", "--environment", tmp_path / "sky.exr", "--exposure", exposure,
+                         "--out", tmp_path / "cues")
+    assert "miss up to 67%" in outcome.out
+
+
 def test_the_levels_light_the_owl_as_relight_does(relit, drive, tmp_path):
     """Sums of the captured images at the levels of a rig made of the capture, of 16 bits: within a thousandth of relit relight."""
     owl_capture = write_small_owl(tmp_path / "owl", 4)
