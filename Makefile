@@ -20,10 +20,10 @@ test: $(VENV)/installed-dev
 	$(PYTEST) -m "not long"
 
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
-# and the kernels as on a GPU, on an emulated one
+# and the kernels and products as on a GPU, on an emulated one
 test-all: $(VENV)/installed-dev
 	$(PYTEST)
-	$(PYTEST) --device-emulated -m "not long" tests/kernels
+	$(PYTEST) --device-emulated -m "not long" tests/kernels tests/test_device_ways.py tests/test_gpu_benchmark.py
 
 # keeps what Python compiles of modules and tests
 compiled: $(VENV)/installed-dev
@@ -39,7 +39,7 @@ lint: $(VENV)/installed-dev
 bench: $(VENV)/installed
 	$(BIN)/relit bench
 
-# the kernels on cuda:0, after their tests; needs nothing but Warp and NumPy: python -m benchmarks.gpu in any environment with them
+# the kernels on cuda:0, compared with NumPy and then timed; needs nothing but Warp and NumPy: python -m benchmarks.gpu in any environment with them
 gpu-bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks.gpu
 

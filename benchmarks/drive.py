@@ -10,7 +10,9 @@ import numpy as np
 from scipy.optimize import nnls
 
 from service.drive.drive import drive
+from service.drive.judgement import XYZ
 from service.requests.drive import DriveRequest
+from stage.colour.colour import rgb_matrix
 from stage.transforms import fibonacci_sphere
 from tests.scenes.rigs import NORMALS, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
 
@@ -28,9 +30,18 @@ def sampled(radiance: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.round(np.clip(radiance, 0, 1)[row, column] * 255) / 255 * 4 * np.pi / len(directions)
 
 
+def chromaticity_rms(given: np.ndarray, wanted: np.ndarray, space: str) -> float:
+    """Return the root mean square Δu'v' (CIE 1976) of irradiances [normals, 3]."""
+    parts = []
+    for light in (given, wanted):
+        x, y, z = (light @ rgb_matrix(space, XYZ).T.astype(np.float64)).T
+        parts.append(np.stack([4 * x, 9 * y], axis=1) / (x + 15 * y + 3 * z)[:, None])
+    return float(np.sqrt(((parts[0] - parts[1]) ** 2).sum(axis=1).mean()))
+
+
 def accuracy(folder: Path) -> None:
-    print("| lamps | sky | irradiance, RMS | least possible | largest Δu'v' | with 8 bits | 8-bit panorama sampled |")
-    print("|---|---|---|---|---|---|---|")
+    print("| lamps | sky | irradiance, RMS | least possible | Δu'v', RMS | largest Δu'v' | with 8 bits | 8-bit panorama sampled |")
+    print("|---|---|---|---|---|---|---|---|")
     for count in (331, 128, 32):
         directions = fibonacci_sphere(count)
         seen = np.maximum(NORMALS @ directions.T, 0)
@@ -42,11 +53,13 @@ def accuracy(folder: Path) -> None:
                 rig = write_rig(folder / "rig.json", directions, irradiance=FULL, bits=bits)
                 result = drive(DriveRequest(rig=folder / "rig.json", out=folder / "cues", environment=folder / "sky.exr", device="cpu",
                                             auto_exposure=True))
-                errors.append(rms(lamps_irradiance(rig, read_levels(folder / "cues")[0]) / result.exposure, truth))
+                given = lamps_irradiance(rig, read_levels(folder / "cues")[0]) / result.exposure
+                errors.append(rms(given, truth))
                 if bits == 16:
-                    chromaticity = result.judgement.chromaticity.max()
+                    chromaticity = chromaticity_rms(given, truth, rig["color_space"]), result.judgement.chromaticity.max()
             best = np.stack([nnls(seen, truth[:, c], maxiter=50000)[0] for c in range(3)], axis=1)
-            print(f"| {count} | {kind} | {errors[0]:.2%} | {rms(seen @ best, truth):.2%} | {chromaticity:.4f} | {errors[1]:.2%} | "
+            print(f"| {count} | {kind} | {errors[0]:.2%} | {rms(seen @ best, truth):.2%} | "
+                  f"{chromaticity[0]:.4f} | {chromaticity[1]:.4f} | {errors[1]:.2%} | "
                   f"{rms(seen @ sampled(radiance, directions), truth):.1%} |")
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
+from benchmarks.device_estimate import estimate_rows
 from benchmarks.fresnel import fresnel_table
 from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
@@ -140,6 +141,11 @@ def gpu(_: argparse.Namespace) -> None:
     """Keep the section that `python -m benchmarks.gpu --write` has written on a machine with a GPU."""
 
 
+def estimate(_: argparse.Namespace) -> list[str]:
+    """Estimate the time on a GPU from what products ask of it."""
+    return estimate_rows()
+
+
 def tof(_: argparse.Namespace) -> list[str]:
     """Measure the range errors of time of flight."""
     return [*accuracy_rows(), "", *bound_rows()]
@@ -193,6 +199,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "rig": ("Depth from projected light", rig),
     "speed": ("Speed", speed),
     "gpu": ("On a GPU", gpu),
+    "estimate": ("Estimate for a GPU", estimate),
     "tof": ("Depth from time of flight", tof),
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),

@@ -6,8 +6,7 @@ import numpy as np
 
 from benchmarks.tof_accuracy import COLS, ROWS, SEED, solved_maps
 from stage.spread import MAD_TO_SIGMA
-from stage.tof.bound import range_bound_m
-from stage.tof.simulate import HistogramCamera, TofScene
+from stage.tof.simulate import HistogramCamera, TofScene, range_bound_m
 from tests.reference import tof as scenes
 
 BACKGROUND = 0.02
@@ -57,7 +56,7 @@ def bound_rows() -> list[str]:
     """Return the table as lines of Markdown."""
     room = scenes.room(ROWS, COLS)
     lines = ["Histograms, compared with what their photons allow. Possible: median of the errors that the Cramér-Rao bound of each pixel "
-             "allows (`stage.tof.bound`). Observed over sigma: 1.4826 · median of |error|/sigma, in fifths of the pixels from the smallest "
+             "allows (`range_bound_m`). Observed over sigma: 1.4826 · median of |error|/sigma, in fifths of the pixels from the smallest "
              "sigma to the largest; RMS of the same, clipped at 4.", "",
              "| scene | light | possible, mm | measured, mm | goal, mm | no depth | observed over sigma | RMS |",
              "|---|---|---|---|---|---|---|---|"]

@@ -22,6 +22,7 @@ from kernels.errors import ArrayError, DeviceError
 
 wp.config.log_level = wp.LOG_ERROR  # the caller reports the device; compiling shows as progress, not as lines
 wp.config.cuda_output = "cubin"  # else the driver compiles, and its version decides the last bits
+wp.config.default_grid_stride = False  # on CUDA a loop over further indices, of which a thread has none, takes up to 75 registers
 wp.config.enable_backward = False  # nothing is differentiated, and a backward pass takes longer to compile than the kernel
 
 PACK_CPU = 32
@@ -35,13 +36,17 @@ millisecond of the interpreter, during which the other cores wait."""
 CPU_BLOCK = 1
 """The block size that Warp launches CPU kernels with; loading ahead with another would compile the module twice."""
 
-CUDA_BLOCK = 256
-"""Threads of a CUDA block."""
+CUDA_BLOCK = 128
+"""Threads of a CUDA block. A multiprocessor has 65536 registers: three blocks of a kernel with 168 fit, 12 warps. Of 256 threads only one
+would, 8 warps."""
 MAX_THREADS = 2**31 - 1
 """Largest number of threads of one launch: kernels count threads in 32 bits."""
 
 MOST_BATCH_BYTES = 4 * 2**31
 """Largest batch: kernels count its float32 values in 32 bits."""
+
+CUDA_PIECES = 2
+"""Pieces of an image that are in work on a CUDA device at one time."""
 
 EVERY = "all"
 """Stands for every CUDA device of the machine."""
@@ -109,6 +114,17 @@ def batch_bytes(device: str, on_cpu: int) -> int:
     return max(on_cpu, min(share, MOST_BATCH_BYTES))
 
 
+def free_bytes(device: str) -> int:
+    """Return the free memory of a CUDA device."""
+    return int(wp.get_device(device).free_memory)
+
+
+def pieces_at_once(device: str) -> int:
+    """Return how many pieces of an image are in work on a device at one time: on CUDA it computes one while the host reads or finishes
+    another."""
+    return 1 if device == "cpu" else CUDA_PIECES
+
+
 def resolve_all(name: str | None = None) -> tuple[str, ...]:
     """Name the devices that one work is divided among.
 
@@ -166,6 +182,11 @@ def pack_width(device: str) -> int:
     """Return the number of pixels that one thread takes on this device."""
     _start()
     return PACK_CPU if device == "cpu" else PACK_CUDA
+
+
+def warp_width(device: str) -> int:
+    """Return the number of neighbouring threads that run together and can exchange values: 32 on CUDA, else 1."""
+    return 32 if wp.get_device(device).is_cuda else 1
 
 
 def worker_count() -> int:
@@ -236,6 +257,35 @@ def record(kernel: Any, count: int, inputs: Sequence[Any], outputs: Sequence[Any
     # recorded here, so that the pool's threads need the interpreter for a moment only
     return Recorded([wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device="cpu", record_cmd=True)
                      for first, last in itertools.pairwise(edges)])
+
+
+def has_graphs(device: str) -> bool:
+    """Return whether launches on this device wait in a queue, so that a graph of them saves their starts."""
+    return bool(wp.get_device(device).is_cuda)
+
+
+class Repeated:
+    """Launches that are done many times with the same arguments: on CUDA one graph, captured when they are first done.
+
+    Args:
+        work: makes the launches, whose arguments must not change from run to run where the device has graphs. It reads nothing back and
+            allocates nothing, and the arrays live as long as this object.
+        device: where.
+    """
+
+    def __init__(self, work: Callable[[], None], device: str) -> None:
+        self._work, self._device, self._graph = work, device, None
+
+    def run(self) -> None:
+        """Do the launches; returns as `launch` does."""
+        if not has_graphs(self._device):
+            self._work()
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(self._device) as capture:
+                self._work()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
 
 
 @cache

@@ -15,8 +15,6 @@ MIN_OFF_CIRCLE = 7.6e-5
 half a degree. Float32 sums leave up to 1e-7 of exactly coplanar lights, and noise leaves nothing of such a normal."""
 MIN_EXPLAINED = 1.0e-6
 """Least part of Σ w y² that b·l explains: a pixel with less is equally bright from every side, and its readings give no direction."""
-CONFIDENCE_HALF = 0.01745329
-"""Standard error of the normal, radians (one degree), at which confidence is one half."""
 
 
 @wp.func

@@ -9,6 +9,7 @@ A kernel loads a pack by an assignment of its own: `x = values[0, p]` copies it 
 refer to memory, and each lane that reads one of them loads its whole pack again, which keeps the compiler from using SIMD.
 """
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,6 +178,9 @@ def as_packs(array: wp.array, device: str) -> wp.array:
     *rows, length = array.shape
     if length % pack:
         raise ArrayError(f"array has {length} pixels: pad to a multiple of {pack}")
+    bytes_of_pack = pack * wp.types.type_size_in_bytes(array.dtype)
+    if array.ptr and device != "cpu" and array.ptr % bytes_of_pack:  # where CUDA loads a pack at once
+        raise ArrayError(f"array begins {array.ptr % bytes_of_pack} bytes after a multiple of {bytes_of_pack}: give a whole array")
     return wp.array(ptr=array.ptr, shape=(*rows, length // pack), dtype=pack_type(pack, array.dtype), device=device, copy=False)
 
 
@@ -209,3 +213,42 @@ def place(array: np.ndarray, device: str) -> tuple[wp.array, Any]:
         return view, array
     owner = wp.array(array, dtype=dtype, device=device)
     return as_packs(owner, device), owner
+
+
+HOST = "cpu"
+
+
+def to_half(values: np.ndarray) -> np.ndarray:
+    """Return values […] float32 as float16, rounded to the nearest, as `values.astype(np.float16)` does to the last bit.
+
+    Values beyond the largest half become infinite.
+    """
+    flat = np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
+    found = np.empty(flat.shape, dtype=np.float16)
+    pack = devices.pack_width(HOST)
+    whole = len(flat) // pack * pack
+    given, out = (wp.array(array[:whole].reshape(-1, pack), dtype=pack_type(pack, kind), device=HOST, copy=False)
+                  for array, kind in ((flat, wp.float32), (found, wp.float16)))
+    devices.launch(_half_kernel(pack), whole // pack, [given], [out], device=HOST)
+    with np.errstate(over="ignore"):
+        found[whole:] = flat[whole:]
+    return found.reshape(values.shape)
+
+
+@cache
+def _half_kernel(pack: int) -> Any:
+    float_pack, half_pack = pack_type(pack, wp.float32), pack_type(pack, wp.float16)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def half_kernel(first: int,
+                    values: wp.array(dtype=float_pack),  # [P]
+                    # outputs
+                    out: wp.array(dtype=half_pack)):  # [P]
+        p = first + wp.tid()
+        value = values[p]
+        rounded = half_pack()
+        for k in range(pack):
+            rounded[k] = wp.float16(value[k])
+        out[p] = rounded
+
+    return half_kernel

@@ -2,25 +2,31 @@
 
 Pack widths, memory layouts and branches are those of CUDA. Its memory is apart from the host's: what is read from it is a copy, what
 is passed to a launch must lie in it, and nobody may write past the end of an array. New memory is full of NaN (-1 where counts are meant).
+A copy from or to pinned memory waits until something waits for it (emulated_streams.py).
 Each launch runs twice, its threads in parts one after another in two orders, and must leave the same bits in all arrays.
+What is asked of the device is counted: launches, reads that wait for it, and bytes copied to and from it.
 
 What only hardware shows stays unseen: races within a part, the rounding of its own arithmetic, and errors of its driver.
 """
 
+import atexit
 import bisect
 import copy
 import ctypes
 import itertools
 import random
+from collections import Counter
 from collections.abc import Iterator
-from threading import Lock
-from types import SimpleNamespace
+from threading import RLock
 from typing import Any
 
 import numpy as np
 import warp as wp
 from warp._src import context
 from warp._src.codegen import StructInstance
+
+from tests import emulated_streams
+from tests.emulated_streams import LAUNCHES, PINNED, Event, Stream
 
 NAME = "cuda:0"
 PARTS = 6
@@ -32,11 +38,21 @@ UNWRITTEN = 0xFF
 MEMORY = 8 << 30
 """Bytes that the device says it has."""
 
-STREAM = SimpleNamespace(is_capturing=False)
-"""Stands for the stream of a copy."""
-
 plain_launch, plain_load, plain_total_memory = context.launch, context.Module.load, context.Device.total_memory
-plain_copy, plain_from_data = wp.copy, wp.array._init_from_data
+plain_copy, plain_empty, plain_from_data, plain_free_memory = wp.copy, wp.empty, wp.array._init_from_data, context.Device.free_memory
+WAITS = "synchronize", "synchronize_device", "synchronize_stream", "synchronize_event"
+
+COUNTED = {"launches": "launches of kernels", "waits": "copies to the host, and calls that do nothing but wait for the device",
+           "up": "bytes copied to the device", "down": "bytes copied to the host",
+           "touched": "bytes of the arrays that launches were given, each array once a launch"}
+counts: Counter[str] = Counter()
+"""What all threads have asked of the device so far, by the names of COUNTED."""
+counts_lock = RLock()
+
+
+def note(**more: int) -> None:
+    with counts_lock:
+        counts.update(more)
 
 
 class Memory:
@@ -48,7 +64,7 @@ class Memory:
     def __init__(self) -> None:
         self._sizes: dict[int, int] = {}
         self._begins: list[int] = []
-        self._lock = Lock()
+        self._lock = RLock()
 
     def allocate(self, size: int) -> int:
         begin = context.runtime.core.wp_alloc_host(size + GUARD, None)
@@ -59,6 +75,8 @@ class Memory:
         return begin
 
     def deallocate(self, begin: int, size: int) -> None:
+        for stream in list(Stream.every):
+            stream.finish(begin, begin + size)
         with self._lock:
             self._begins.remove(begin)
             given = self._sizes.pop(begin)
@@ -66,6 +84,11 @@ class Memory:
         context.runtime.core.wp_free_host(begin)
         if not sound:
             raise AssertionError(f"something was written past the end of an array of {given} bytes")
+
+    @property
+    def free(self) -> int:
+        with self._lock:
+            return MEMORY - sum(self._sizes.values())
 
     def has(self, begin: int, size: int) -> bool:
         with self._lock:
@@ -104,6 +127,7 @@ class Launch:
             if not memory.has(begin, size):
                 raise AssertionError(f"{self._name} is given {size} bytes that are not in the memory of {NAME}")
         self._memory = [bytes_at(begin, size) for begin, size in places.items()]
+        self._touched = sum(places.values())
         if first.label == "first" and isinstance(dim, int):
             edges[1:1] = sorted(random.Random(dim).sample(range(1, dim), min(dim - 1, PARTS - 1)))
             starts = [[inputs[0] + start, *inputs[1:]] for start in edges[:-1]]
@@ -114,6 +138,8 @@ class Launch:
                        for size, given in zip(sizes, starts, strict=True)]
 
     def launch(self) -> None:
+        LAUNCHES.go_on()
+        note(launches=1, touched=self._touched)
         before = [place.copy() for place in self._memory]
         for part in reversed(self._parts):
             part.launch()
@@ -144,16 +170,35 @@ def load(module: Any, device: Any, block_dim: int | None = None, *args: Any, **o
     return plain_load(module, context.runtime.cpu_device if is_emulated else device, 1 if is_emulated else block_dim, *args, **options)
 
 
-def copy_array(dest: Any, src: Any, *args: Any, **options: Any) -> None:
-    if emulated in (dest.device, src.device):
-        options["stream"] = STREAM
-    plain_copy(dest, src, *args, **options)
+def copy_array(dest: Any, src: Any, dest_offset: int = 0, src_offset: int = 0, count: int = 0, stream: Stream | None = None) -> None:
+    if emulated not in (dest.device, src.device):
+        plain_copy(dest, src, dest_offset, src_offset, count, stream)
+        return
+    size = (count or src.size) * wp.types.type_size_in_bytes(src.dtype)
+    if src.device is not emulated:
+        note(up=size)
+    elif dest.device is not emulated:
+        note(down=size, waits=not PINNED.has(dest))
+    emulated_streams.copy(plain_copy, UNWRITTEN, dest, src, dest_offset, src_offset, count, stream)
+
+
+def empty(shape: Any = None, *args: Any, pinned: bool = False, **options: Any) -> Any:
+    return PINNED.empty(plain_empty, UNWRITTEN, shape, options) if pinned else plain_empty(shape, *args, **options)
 
 
 def from_data(array: Any, data: Any, dtype: Any, shape: Any, device: Any, copied: bool, pinned: bool) -> None:
     """Copy host data to the emulated device, whether the caller asks for it or not."""
     is_emulated = context.runtime.get_device(device) is emulated
     plain_from_data(array, data, dtype, shape, device, copied or is_emulated, pinned)
+
+
+def counting_waits(synchronise: Any) -> Any:
+    """Return a call of Warp's that waits for the device, counted."""
+    def wait(*given: Any) -> None:
+        note(waits=1)
+        synchronise(*given)
+
+    return wait
 
 
 def is_same(device: Any, other: Any) -> bool:
@@ -171,7 +216,13 @@ def install() -> None:
     runtime.cuda_devices.append(emulated)
     context.Device.__eq__ = is_same
     context.Device.total_memory = property(lambda device: MEMORY if device is emulated else plain_total_memory.fget(device))
+    context.Device.free_memory = property(lambda device: memory.free if device is emulated else plain_free_memory.fget(device))
     context.Module.load = load
     wp.array._init_from_data = from_data
     wp.launch = context.launch = launch
     wp.copy = context.copy = copy_array
+    wp.empty = context.empty = empty
+    atexit.register(Stream.forget)
+    wp.Stream, wp.Event, wp.get_stream, wp.synchronize_event = Stream, Event, lambda device=None: LAUNCHES, Event.synchronize
+    for name in WAITS:
+        setattr(wp, name, counting_waits(getattr(wp, name)))

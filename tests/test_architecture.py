@@ -16,7 +16,7 @@ HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
 PRODUCTS = tuple(f"service.{name}" for name in (
     "solve", "depth", "boards", "relight", "calibrate", "light_estimation", "basis", "captures", "demo", "export", "viewing", "joining",
-    "scans", "sequences", "play", "twin", "drive", "rigs"))
+    "scans", "sequences", "sharing", "play", "twin", "drive", "rigs", "acquisition"))
 """Where stage and kernels meet: captures go in, results come out."""
 WRITERS = ("service.asset",)
 """Meshes and textures of solved maps, and the formats that they are written in."""
@@ -97,7 +97,9 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 
 @pytest.mark.parametrize(("library", "homes"), [
     ("pxr", ["service.asset.usd"]), ("pygltflib", ["service.asset.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
-    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.page"]), ("sacn", ["service.play.sacn_output"]),
+    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.page", "service.acquisition.projector"]),
+    ("sacn", ["service.play.sacn_output"]),
+    ("serial", ["service.acquisition.lights.serial_line"]), ("gphoto2", ["service.acquisition.cameras"]),
     ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),
     ("stupidArtnet", ["service.play.artnet_output"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
     ("laspy", ["stage.formats.las"]), ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
@@ -111,7 +113,7 @@ def test_a_library_lives_in_its_places(library, homes):
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
     allowed = ("stage.motion", "service.calibrate.solvers", "stage.results.mask_border", "stage.formats.avif", "stage.formats.camera_raw",
-               "stage.importers", "service.scans.registration.found_targets")
+               "stage.importers", "service.scans.registration.found_targets", "service.acquisition.cameras.video_device")
     assert {i.importer for i in imports() if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md leads through the code as it is."""
+"""CONTRIBUTING.md leads through the code as it is, and the pages of docs/ name modules that exist."""
 
 import re
 
@@ -9,6 +9,8 @@ from tests.test_architecture import HOME, imports_of, module_name
 TEXT = (HOME / "CONTRIBUTING.md").read_text(encoding="utf-8")
 WAYS = {title: re.findall(r"^\d\. `([^`]+)`( \(another process\))?", body, re.MULTILINE)
         for title, body in re.findall(r"^\*\*([^*]+)\*\*: .*\n\n((?:\d\. .*\n(?: {3}.*\n)*)+)", TEXT, re.MULTILINE)}
+PATHS = [path.relative_to(HOME).as_posix() for folder in ("stage", "kernels", "service", "tests", "benchmarks", "samples", "docs")
+         for path in (HOME / folder).rglob("*.py")]
 MOST_FILES = 8
 """The most files of one way: a reader cannot keep more in view."""
 
@@ -36,3 +38,10 @@ def test_a_way_is_short_and_each_file_is_reached_from_one_before_it(way):
 def test_every_path_exists(path):
     """A folder of the service is named without service/ in the table of its folders."""
     assert (HOME / path).exists() or (HOME / "service" / path).exists()
+
+
+@pytest.mark.parametrize("page", sorted((HOME / "docs").glob("*.md")), ids=lambda page: page.name)
+def test_every_module_that_a_page_names_exists(page):
+    """A page names a module by the end of its path."""
+    named = set(re.findall(r"`([a-z_0-9/]+\.py)\b", page.read_text(encoding="utf-8")))
+    assert [name for name in sorted(named) if not any(f"/{path}".endswith(f"/{name}") for path in PATHS)] == []

@@ -6,10 +6,26 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import gpu
+from benchmarks.gpu import __main__ as gpu
+from benchmarks.gpu import checks, work
 from kernels import device as devices
 
 HOME = Path(__file__).parents[1]
+ALONE = """
+import sys
+from importlib.machinery import BuiltinImporter, FrozenImporter, PathFinder
+
+class Few(PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        known = {"warp", "numpy", "kernels", "benchmarks", *sys.stdlib_module_names}
+        return super().find_spec(name, path, target) if name.partition(".")[0] in known else None
+
+sys.meta_path[:] = BuiltinImporter, FrozenImporter, Few
+from benchmarks.gpu import __main__ as gpu, work
+work.PATTERN_PIXELS, work.CPU_BYTES, work.REPEATS = 1024, 1 << 20, 1
+sys.exit(gpu.main(["--device", "cpu"]))
+"""
 
 
 def python(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -17,11 +33,11 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.long
-def test_it_needs_only_warp_and_numpy():
-    """Importing it loads none of the packages that the rest of relit needs."""
-    others = ("OpenEXR", "OpenImageIO", "cv2", "fastapi", "pxr", "pydantic", "scipy", "service", "stage", "typer")
-    said = python("-c", f"import sys, benchmarks.gpu; print([name for name in {others!r} if name in sys.modules])")
-    assert (said.stdout.strip(), said.stderr) == ("[]", "")
+def test_it_runs_with_warp_and_numpy_alone():
+    """In a process in which no other package can be imported."""
+    said = python("-c", ALONE)
+    assert (said.returncode, said.stderr) == (0, "")
+    assert "torch is not installed" in said.stdout and "`svbrdf`" in said.stdout
 
 
 @pytest.mark.long
@@ -33,11 +49,26 @@ def test_a_machine_without_a_gpu_is_told_so():
     assert len(said.stderr.strip().splitlines()) == 1
 
 
-def test_the_table_has_a_row_for_each_kind_of_work(monkeypatch, capsys):
-    monkeypatch.setattr(gpu, "SIZES", {"cpu": (64, 16)})
-    monkeypatch.setattr(gpu, "REPEATS", 1)
-    monkeypatch.setattr(sys, "argv", ["gpu", "--device", "cpu", "--no-tests"])
-    assert gpu.main() == 0
+def test_the_table_has_a_row_for_each_kind_of_work(device, monkeypatch, capsys):
+    for name, value in {"PATTERN_PIXELS": 128, "CPU_BYTES": 1 << 20, "MOST_PIXELS": 256, "MOST_SAMPLED": 128, "REPEATS": 1}.items():
+        monkeypatch.setattr(work, name, value)
+    assert gpu.main(["--device", device]) == 0
     shown = capsys.readouterr().out
-    works = "copy", "relight, 1 frame", "relight, 32 frames", "`lambert`", "`robust`", "`svbrdf`", "phase", "time-of-flight", "height"
+    assert len(checks.CHECKS) >= 20 and f"{len(checks.CHECKS)} kernels agree with NumPy" in shown
+    works = "copy", "upload", "relight, 1 frame", "relight, 32 frames", "`lambert`", "`robust`", "`svbrdf`", "phase", "flight", "height"
     assert all(work in shown for work in works)
+
+
+def test_no_speed_is_told_of_a_wrong_kernel(device, monkeypatch, capsys):
+    """A sum that lacks its last light."""
+    plain = checks.combine
+
+    def without_last(band, weights):
+        lacking = weights.copy()
+        lacking[:, checks.LIGHTS - 1] = 0
+        return plain(band, lacking)
+
+    monkeypatch.setattr(checks, "combine", without_last)
+    assert gpu.main(["--device", device]) == 1
+    outcome = capsys.readouterr()
+    assert outcome.out == "" and "one_frame: off by" in outcome.err and f"1 of {len(checks.CHECKS)} kernels" in outcome.err

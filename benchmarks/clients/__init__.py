@@ -8,7 +8,7 @@
 USDLoader or GLTFLoader) or `mitsuba` (its `principled` BSDF, textures as OpenUSD reads them) and writes linear RGBA as float EXR, not
 denoised, with a box filter of one pixel. The light is an environment (`--environment`, see docs/relight.md for its orientation) or one
 distant light (`--sun x,y,z`, irradiance `--irradiance`, default π). `compare` prints the figures of `benchmarks.clients.comparison`.
-`parts` measures captures of samples/make_parts.py: docs/clients.md has its table.
+`parts` measures captures of samples/make_parts.py: docs/asset_viewers.md has its table.
 
 A render needs no GPU; at 128 x 128 pixels it takes 5 to 30 seconds on two cores. `benchmarks.clients.installed` says where the programs are
 looked for; `make clients` installs them. From Python:

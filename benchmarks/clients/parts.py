@@ -1,4 +1,4 @@
-"""The figures of docs/clients.md: assets of path-traced captures, opened in every program and compared with the path tracer.
+"""The figures of docs/asset_viewers.md: assets of path-traced captures, opened in every program and compared with the path tracer.
 
 Each capture is a folder of samples/make_parts.py: metal and paint in parts that stand in front of each other, with the pictures under two
 environments. Four assets are opened: of the solved maps and of the true ones, each exported by relit and written by

@@ -67,19 +67,26 @@ def trials(data: Path | None) -> Iterator[Trial]:
     seen = trace(World(shapes=MIRRORS))
     for name in ("Gray, inverses", "Gray, both axes", "phase 16, 4 steps, Gray"):
         yield _run(f"{name}, before a mirror ball", False, World(shapes=MIRRORS), CODES[name], seen)
-    for words, change in _WRONG.items():
-        yield _run(f"Gray, {words}", False, World(shapes=SHELF), GRAY, light, declared=[change(pattern) for pattern in GRAY])
+    for name, (patterns, change) in wrong().items():
+        yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
 
 
 def _changed(**fields: Callable[[Pattern], object]) -> Callable[[Pattern], Pattern]:
     return lambda pattern: pattern.model_copy(update={name: value(pattern) for name, value in fields.items() if hasattr(pattern, name)})
 
 
-_WRONG: dict[str, Callable[[Pattern], Pattern]] = {
-    "inverses declared for patterns": _changed(inverse=lambda p: not getattr(p, "inverse", False)),
-    "columns declared as rows": _changed(axis=lambda p: "row"),
-    "bits declared backwards": _changed(bit=lambda p: getattr(p, "bits", 1) - 1 - getattr(p, "bit", 0)),
-}
+def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]:
+    """Return what is shown, and how each pattern is declared in its place."""
+    return {
+        "Gray, inverses declared for patterns": (GRAY, _changed(inverse=lambda p: not getattr(p, "inverse", False))),
+        "Gray, columns declared as rows": (GRAY, _changed(axis=lambda p: "row")),
+        "Gray, bits declared backwards": (GRAY, _changed(bit=lambda p: getattr(p, "bits", 1) - 1 - getattr(p, "bit", 0))),
+        "Gray declared as binary": (GRAY, _changed(code=lambda p: "binary" if p.code == "gray" else p.code)),
+        "Gray, bits 5 and 6 exchanged": (GRAY, _changed(bit=lambda p: {5: 6, 6: 5}.get(getattr(p, "bit", 0), getattr(p, "bit", 0)))),
+        "phase 16, 4 steps, Gray, steps backwards": (PHASE_GRAY, _changed(step=lambda p: -getattr(p, "step", 0) % getattr(p, "steps", 1))),
+        "phase 16, 4 steps, Gray, a step late": (PHASE_GRAY, _changed(step=lambda p: (getattr(p, "step", 0) + 1) % getattr(p, "steps", 1))),
+        "phase 16, 4 steps, Gray, declared as 17 px": (PHASE_GRAY, _changed(period_px=lambda p: 17.0)),
+    }
 
 
 def _run(name: str, in_model: bool, world: World, patterns: Sequence[Pattern], light: Light | None = None,

@@ -32,8 +32,9 @@ from kernels.photometric.material.material import (
 from kernels.photometric.material.metal_search import Metals, moved, search_metals
 from kernels.photometric.material.mixtures import NO_PAIRS, Mixture, mix_materials
 from kernels.photometric.model.candidates import rings
-from kernels.photometric.model.samples import Samples, choose, to_host
-from kernels.photometric.search.certainty import assess
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import Samples, to_host
+from kernels.photometric.search.certainty import SingleLobe, standard_deviation
 from kernels.photometric.search.descent import WARM, descend
 from kernels.photometric.search.hypotheses import Diffuse, Prior
 from kernels.photometric.search.normal_search import find_normals
@@ -59,7 +60,6 @@ class SvbrdfFit(NamedTuple):
     specular: np.ndarray  # [n, 3] float32, F0
     roughness: np.ndarray  # [n] float32
     sigma: np.ndarray  # [n] float32, standard deviation of the normal, degrees
-    confidence: np.ndarray  # [n] float32: probability of the mode / (1 + sigma / 1°)
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
     mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
@@ -90,6 +90,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         normals.append(other.normal)
         costs.append(other.cost)
     normal, spread = average_normals(np.stack(normals), np.stack(costs), temperature=SHAPE_TEMPERATURE)
+    lone = None
     if single_lobe and prior is None:
         if roughness is None:
             roughness = fit_tinted(samples, found.best.normal, shape=shape).roughness
@@ -97,6 +98,7 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
         kinds = np.stack([np.min(costs, axis=0), SINGLE_LOBE_CHARGE * single.cost])
         normal, spread = average_normals(np.stack([normal, single.normal]), kinds, temperature=KIND_TEMPERATURE,
                                          spreads=np.stack([spread, np.zeros_like(spread)]))
+        lone = SingleLobe(model_weights(kinds, temperature=KIND_TEMPERATURE)[1], single.cost, single.openness)
     if prior is None:
         material = fit_material(samples, normal, shape=lobe, shared=shared)
         if metals is not None:
@@ -115,9 +117,8 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
     material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
         spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
-    certainty = assess(samples, found, normal, spread)
-    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, certainty.sigma,
-                     certainty.probability / (1 + certainty.sigma), np.sqrt(found.best.cost), mixture)
+    sigma = standard_deviation(samples, found, normal, spread, lone)
+    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma, np.sqrt(found.best.cost), mixture)
 
 
 def nearby_shapes(shape: Diffuse) -> list[Diffuse]:
@@ -126,20 +127,24 @@ def nearby_shapes(shape: Diffuse) -> list[Diffuse]:
             if not rough or shape.rough + rough >= 0]
 
 
+def model_weights(costs: np.ndarray, *, temperature: float) -> np.ndarray:
+    """Return the weights of models in a pixel's average, [models, n], from their costs, [models, n]: exp(-(cost - best) / (temperature ·
+    best)) over their sum."""
+    best = costs.min(axis=0)
+    weights = np.exp(-(costs - best) / np.maximum(temperature * best, 1e-6))
+    return np.asarray(weights / weights.sum(axis=0))
+
+
 def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float,
                     spreads: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of a pixel's normals under several models, and their weighted RMS spread in degrees.
-
-    The weights are exp(-(cost - best) / (temperature · best)).
+    """Return the mean of a pixel's normals under several models, by `model_weights`, and their weighted RMS spread in degrees.
 
     Args:
         normals: [models, n, 3] unit.
         costs: [models, n].
         spreads: [models, n] RMS spread, in degrees, of the normals that each model's normal is the mean of; None: of none.
     """
-    best = costs.min(axis=0)
-    weights = np.exp(-(costs - best) / np.maximum(temperature * best, 1e-6))
-    weights /= weights.sum(axis=0)
+    weights = model_weights(costs, temperature=temperature)
     mean = np.einsum("sn,snc->nc", weights, normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
     apart = _angles(normals, mean) ** 2 + (0 if spreads is None else spreads**2)

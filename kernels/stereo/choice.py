@@ -50,20 +50,45 @@ def choose(volume: wp.array, sums: wp.array, labels: Labels, *, right_columns: i
     pack = devices.pack_width(device)
     margins = Margins.of(cols, right_columns, labels, device)
     width = margins.before + right_columns + margins.after
-    best = new_array((rows, width), wp.int16, device, cleared=False)
+    start = margins.before - labels.highest
     where = new_array((rows, width), wp.int16, device, cleared=False)
-    best.fill_(FAR)
-    devices.launch(_other_kernel(pack), rows, [sums, margins.before - labels.highest], [sliding(best), sliding(where)], device=device)
     each = wp.array(ptr=sums.ptr, shape=(rows, cols, packs * pack), dtype=wp.int16, device=device, copy=False)
+    if device == "cpu":
+        best = new_array((rows, width), wp.int16, device, cleared=False)
+        best.fill_(FAR)
+        devices.launch(_other_kernel(pack), rows, [sums, start], [sliding(best), sliding(where)], device=device)
+    else:
+        devices.launch(_gather_other_kernel, rows * width, [each, start], [where], device=device)
     kinds = wp.int32, wp.float32, wp.int32, wp.float32, wp.float32
     found = Choice(*(new_array((rows, cols), kind, device, cleared=False) for kind in kinds))
-    inputs = [volume, sums, each, where, margins.before - labels.highest]
+    inputs = [volume, sums, each, where, start]
     devices.launch(_choice_kernel(pack), rows * cols, inputs, list(found), device=device)
     return found
 
 
+@wp.kernel(enable_backward=False)
+def _gather_other_kernel(first: int,
+                         each: wp.array(dtype=wp.int16, ndim=3),  # [R, C, labels]
+                         start: int,
+                         # outputs
+                         where: wp.array(dtype=wp.int16, ndim=2)):  # [R, margin + C' + margin], label of the least sum of a right pixel
+    """On CUDA: one thread for a right pixel, so that neighbouring threads read neighbouring sums."""
+    i = first + wp.tid()
+    r = i // where.shape[1]
+    at = i - r * where.shape[1]
+    least = wp.int16(FAR)
+    label = wp.int32(0)
+    for c in range(wp.max(at - start - each.shape[2] + 1, 0), wp.min(at - start + 1, each.shape[1])):
+        here = each[r, c, at - start - c]
+        if here < least:
+            least = here
+            label = at - start - c
+    where[r, at] = wp.int16(label)
+
+
 @once
 def _other_kernel(pack: int) -> Any:
+    """Return the CPU kernel: one thread for a row, all labels of a pixel after another, pack by pack."""
     sum_pack = pack_type(pack, wp.int16)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})

@@ -12,6 +12,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.device import once
+from kernels.pack_access import pack_load, pack_store
 from kernels.packs import new_array, pack_type
 from kernels.stereo.cost import SCALE
 
@@ -47,14 +48,96 @@ def gather(volume: wp.array) -> wp.array:
         lines = rows if down == 0 else cols
         # a path's costs at the pixel before and at this one, with a pack of `FAR` on either side
         before = new_array((lines, 2, packs + 2), pack_type(pack, wp.int16), device, cleared=False)
+        if device != "cpu":
+            width = devices.warp_width(device)
+            devices.launch(_warp_kernel(pack), lines * width, [volume, before, width, down, across], [sums], device=device)
+            continue
         floors = new_array((lines,), wp.int16, device, cleared=True)
-        span = 1 if down == 0 or device != "cpu" else SPAN
+        span = 1 if down == 0 else SPAN
         devices.launch(_kernel(pack), -(-lines // span), [volume, before, floors, span, down, across], [sums], device=device)
     return sums
 
 
+@wp.func
+def least_change(below: wp.int16, here: wp.int16, above: wp.int16, ceiling: wp.int16):
+    """Return the least cost of the pixel before and of a change of disparity, which `ceiling` is for large ones."""
+    return wp.min(wp.min(here, wp.min(below, above) + wp.int16(SMALL_STEP)), ceiling)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int away = warpSize / 2; away > 0; away /= 2)
+        value = wp::min(value, __shfl_xor_sync(0xffffffff, value, away));
+    __syncwarp();
+#endif
+    return value;
+""")
+def least_of_warp(value: int) -> int:
+    """Return the least value among the threads of a CUDA warp, each of which then sees what the others have written."""
+    ...
+
+
+@once
+def _warp_kernel(pack: int) -> Any:
+    """Return the CUDA kernel: a warp for a line, whose threads take neighbouring disparities and read them together."""
+    cost_pack, sum_pack = pack_type(pack, wp.uint8), pack_type(pack, wp.int16)
+    load, load_costs, store = pack_load(pack, wp.int16, 3), pack_load(pack, wp.uint8, 3), pack_store(pack, wp.int16, 3)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
+    def warp_kernel(first: int,
+                    volume: wp.array(dtype=cost_pack, ndim=3),  # [R, C, packs]
+                    before: wp.array(dtype=sum_pack, ndim=3),  # [lines, 2, packs + 2], scratch
+                    width: int,  # threads of a line: a warp
+                    down: int,
+                    across: int,
+                    # outputs
+                    sums: wp.array(dtype=sum_pack, ndim=3)):  # [R, C, packs], added to
+        thread = first + wp.tid()
+        line = thread / width
+        lane = thread % width
+        rows = volume.shape[0]
+        cols = volume.shape[1]
+        packs = volume.shape[2]
+        far = sum_pack()
+        for k in range(pack):
+            far[k] = wp.int16(FAR)
+        for j in range(lane, packs + 2, width):  # as if all disparities of the pixel before the first cost nothing
+            edge = j == 0 or j == packs + 1
+            begin = sum_pack()
+            if edge:
+                begin = far
+            store(before, line, 0, j, begin)
+            store(before, line, 1, j, far)
+        least = least_of_warp(0)
+        for step in range(wp.where(down == 0, cols, rows)):
+            old = step % 2
+            r = wp.where(down == 0, line, wp.where(down > 0, step, rows - 1 - step))
+            c = wp.where(down != 0, line, wp.where(across > 0, step, cols - 1 - step))
+            ceiling = wp.int16(least + LARGE_STEP)
+            lowest = wp.int16(FAR)
+            for j in range(lane, packs, width):
+                previous = load(before, line, old, j)
+                here = load(before, line, old, j + 1)
+                following = load(before, line, old, j + 2)
+                costs = load_costs(volume, r, c, j)
+                total = load(sums, r, c, j)
+                found = sum_pack()
+                for k in range(pack):
+                    lower = wp.where(k == 0, previous[pack - 1], here[(k + pack - 1) % pack])
+                    upper = wp.where(k == pack - 1, following[0], here[(k + 1) % pack])
+                    found[k] = wp.int16(costs[k]) + least_change(lower, here[k], upper, ceiling) - wp.int16(least)
+                    lowest = wp.min(lowest, found[k])
+                    total[k] = total[k] + found[k]
+                store(before, line, 1 - old, j + 1, found)
+                store(sums, r, c, j, total)
+            least = least_of_warp(int(lowest))
+
+    return warp_kernel
+
+
 @once
 def _kernel(pack: int) -> Any:
+    """Return the CPU kernel: one thread for some lines, all disparities of a pixel one after another."""
     cost_pack, sum_pack = pack_type(pack, wp.uint8), pack_type(pack, wp.int16)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
@@ -105,8 +188,7 @@ def _kernel(pack: int) -> Any:
                     for k in range(pack):  # written so that it becomes SIMD code
                         lower = wp.where(k == 0, below, here[(k + pack - 1) % pack])
                         upper = wp.where(k == pack - 1, above, here[(k + 1) % pack])
-                        step_cost = wp.min(wp.min(here[k], wp.min(lower, upper) + wp.int16(SMALL_STEP)), ceiling)
-                        found[k] = wp.int16(costs[k]) + step_cost - least
+                        found[k] = wp.int16(costs[k]) + least_change(lower, here[k], upper, ceiling) - least
                     for k in range(pack):
                         lowest[k] = wp.min(lowest[k], found[k])
                     for k in range(pack):

@@ -1,7 +1,7 @@
 """Conjugate gradients for the heights: minimise Σ w (h_j − h_i − g)² over the edges of a grid.
 
-The scalars of the iteration stay on the device, one slot per iteration, so that a launch never waits for a sum; the
-host reads them only to decide whether to stop.
+The scalars of the iteration stay on the device, in slots that two iterations take in turn, so that a launch never waits for a sum; the
+host reads them only to decide whether to stop. On CUDA the iterations between two readings are one graph.
 
 Float32 holds up because every product with the matrix is a sum of differences of neighbours (each exact to its own
 size), the sums of a picture run in float64, and the residual is carried along rather than recomputed: rounding of the
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from kernels import device as devices
 from kernels.surface.grid import EdgeWeights, Grid, Summer, Walk, end_cell, first_cell, run
 from kernels.surface.multigrid import Multigrid
 from kernels.surface.slopes import Slopes
@@ -21,7 +22,8 @@ from kernels.surface.slopes import Slopes
 wp.set_module_options({"enable_backward": False})
 
 CHECK_EVERY = 4
-"""Number of iterations between two readings of the residual on CUDA, where each reading waits for the device."""
+"""Number of iterations between two readings of the residual on CUDA, where each reading waits for the device. It is even, so that their
+graph ends in the slot in which it begins."""
 
 
 class Convergence(NamedTuple):
@@ -96,7 +98,7 @@ def _advance(first: int,
              walk: Walk,
              rz: wp.array(dtype=wp.float64),
              pq: wp.array(dtype=wp.float64),
-             step: int,
+             slot: int,
              goal: wp.float64,
              p: wp.array(dtype=wp.float32),
              q: wp.array(dtype=wp.float32),
@@ -104,7 +106,7 @@ def _advance(first: int,
              h: wp.array(dtype=wp.float32),
              residual: wp.array(dtype=wp.float32)):
     t = first + wp.tid()
-    alpha = _ratio(rz[step], pq[step], goal)
+    alpha = _ratio(rz[slot], pq[0], goal)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
         h[i] = h[i] + alpha * p[i]
         residual[i] = residual[i] - alpha * q[i]
@@ -114,14 +116,14 @@ def _advance(first: int,
 def _turn(first: int,
           walk: Walk,
           rz: wp.array(dtype=wp.float64),
-          step: int,
+          slot: int,
           goal: wp.float64,
           z: wp.array(dtype=wp.float32),
           # outputs
           p: wp.array(dtype=wp.float32)):
     """Compute the next direction of search."""
     t = first + wp.tid()
-    beta = _ratio(rz[step + 1], rz[step], goal)
+    beta = _ratio(rz[1 - slot], rz[slot], goal)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
         p[i] = z[i] + beta * p[i]
 
@@ -144,8 +146,8 @@ class Solver:
         self.p, self.q = (slopes.right, slopes.down) if overwrite else (grid.zeros(), grid.zeros())
         self.multigrid = Multigrid(grid, slopes.weights, target=self.residual, value=self.z, scratch=self.q)
         self.summer = Summer(grid)
-        self.rz = wp.zeros(max_iterations + 1, dtype=wp.float64, device=grid.device)
-        self.pq = wp.zeros(max_iterations, dtype=wp.float64, device=grid.device)
+        self.rz = wp.zeros(2, dtype=wp.float64, device=grid.device)
+        self.pq = wp.zeros(1, dtype=wp.float64, device=grid.device)
 
     def solve(
         self,
@@ -164,24 +166,33 @@ class Solver:
         Returns:
             How the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA.
         """
-        grid, every = self.grid, 1 if self.grid.device == "cpu" else CHECK_EVERY
+        grid, every = self.grid, CHECK_EVERY if self.grid.device != "cpu" or devices.has_graphs("cpu") else 1
         run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)
         wp.copy(self.p, self.z)
         start = square = self._square(0)
         goal, step = (tolerance * math.sqrt(start)) ** 2, 0
+        group = devices.Repeated(lambda: self._iterate(h, goal, range(step, step + every)), grid.device)
         while square > goal and step < self.max_iterations:
-            run(_multiply, grid.sums, [self.slopes.weights, self.p], [self.q, self.summer.partial])
-            self.summer.finish(self.pq, step)
-            run(_advance, grid.cells, [self.rz, self.pq, step, goal, self.p, self.q], [h, self.residual])
-            self._precondition(step + 1)
-            run(_turn, grid.cells, [self.rz, step, goal, self.z], [self.p])
-            step += 1
-            if step % every == 0 or step == self.max_iterations:
-                square = self._square(step)
-                if progress is not None and square > 0.0:
-                    progress(min(1.0, math.log(start / square) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
+            if step + every <= self.max_iterations:
+                group.run()
+            else:
+                every = self.max_iterations - step
+                self._iterate(h, goal, range(step, self.max_iterations))
+            step += every
+            square = self._square(step % 2)
+            if progress is not None and square > 0.0:
+                progress(min(1.0, math.log(start / square) / math.log(start / goal)) if start > goal > 0.0 else 1.0)
         return Convergence(step, math.sqrt(square) / math.sqrt(start) if start > 0.0 else 0.0, square <= goal)
+
+    def _iterate(self, h: wp.array, goal: float, steps: range) -> None:
+        """Do these steps; those after the goal is reached change nothing."""
+        for slot in (step % 2 for step in steps):
+            run(_multiply, self.grid.sums, [self.slopes.weights, self.p], [self.q, self.summer.partial])
+            self.summer.finish(self.pq, 0)
+            run(_advance, self.grid.cells, [self.rz, self.pq, slot, goal, self.p, self.q], [h, self.residual])
+            self._precondition(1 - slot)
+            run(_turn, self.grid.cells, [self.rz, slot, goal, self.z], [self.p])
 
     def _precondition(self, slot: int) -> None:
         """z = B·residual, rz[slot] = residual·z."""

@@ -7,8 +7,10 @@ readings gives the likelihood at all offsets.
 
 Neighbouring readings err alike: the shape of a part errs, and highlights and bounced light are not known exactly. So neither the curvature
 of the likelihood nor its height can be taken at face value. The lights are divided into groups by their direction, each of which throws
-shadows on other places. The offset is left open between all values that the groups together do not contradict by twice the standard error
-between them, and σ is at least that of leaving a group out in turn (the jackknife of Quenouille and Tukey).
+shadows on other places and tells more or less. The loss that each group is expected to have at an offset, if the best one is true, follows
+from the readings whose shadow changes; what the losses deviate from their common ratio to it is their error (the ratio estimator of
+Cochran, Sampling Techniques, 1977, chapter 6). The offset is left open between all values that the groups together do not contradict by
+twice this error, and σ is at least that of leaving a group out in turn (the jackknife of Quenouille and Tukey).
 
 A part moves along the lines of sight. The ray from a pixel to a distant light keeps its path in the image while a part moves, whether the
 pixel lies on that part or on another. So along the path only the gap between the ray and the surface changes, everywhere by
@@ -27,10 +29,23 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
-from kernels.surface.shadows import FIRST_STEP, MARGIN_PIXELS, MARGIN_SLOPE, Camera, Projection, pixel_span, project, surface_point
+from kernels.surface.shadows import (
+    FIRST_STEP,
+    MARGIN_PIXELS,
+    MARGIN_SLOPE,
+    Camera,
+    Projection,
+    between_pixels,
+    pixel_span,
+    project,
+    surface_point,
+)
 
 wp.set_module_options({"enable_backward": False})
 
+OUTLINE_0, OUTLINE_1, OUTLINE_2 = 1.875, -1.25, 0.375
+"""Weights of the last three gaps for that at the outline, which lies half a step farther on in the mean: the parabola through them. Flat
+parts have their largest and smallest gaps there; round ones have them elsewhere, and are too steep at the outline."""
 NO_GAP = -1.0e30
 """Stands for the largest gap where the path never crosses the surface that moves against the pixel."""
 
@@ -64,6 +79,7 @@ def _march(first: int,
     moves = part[row, col] == moving
     start = surface_point(row, col, height, camera)
     pixel = pixel_span(start[2], camera)
+    thin = wp.where(camera.perspective, pixel / wp.max(-start[2], 1.0e-9), pixel)  # a pixel, in the unit of gaps
     for light in range(toward.shape[0]):
         way = toward[light]
         across = wp.sqrt(way[0] * way[0] + way[1] * way[1])
@@ -71,25 +87,49 @@ def _march(first: int,
         travelled = FIRST_STEP * stride
         top, bottom, rear = float(NO_GAP), float(-NO_GAP), float(-NO_GAP)  # literals could not change inside the loop
         own = wp.uint8(0)
+        crossed, last = wp.int32(0), wp.int32(-1)  # pixels on the way of the part that is crossed, and that part
+        before, sooner, soonest, flat = float(0.0), float(0.0), float(0.0), bool(False)  # the last gaps to it, and whether it is flat
         for _ in range(rows + cols):
             point = start + travelled * way
             at = project(point, camera)
             c, r = int(wp.floor(at[0])), int(wp.floor(at[1]))
             if c < 0 or r < 0 or c >= cols or r >= rows or (camera.perspective and point[2] >= 0.0):
                 break
-            if part[r, c] >= 0:
-                if (part[r, c] == moving) == moves:
-                    if height[r, c] - point[2] > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across:
+            here = part[r, c]
+            if crossed > 2 and here != last and flat:
+                rim = OUTLINE_0 * before + OUTLINE_1 * sooner + OUTLINE_2 * soonest
+                top, bottom = wp.max(top, rim), wp.min(bottom, rim)
+            if here != last or (here == moving) == moves:
+                crossed = 0
+            last = here
+            if here >= 0:
+                # between pixels where all four are of one part: the largest of many gaps at the nearest pixels would be too large
+                level = height[r, c]
+                u, v = at[0] - 0.5, at[1] - 0.5
+                left, upper = int(wp.floor(u)), int(wp.floor(v))
+                if (left >= 0 and upper >= 0 and left < cols - 1 and upper < rows - 1 and part[upper, left] == here
+                        and part[upper, left + 1] == here and part[upper + 1, left] == here and part[upper + 1, left + 1] == here):
+                    level = between_pixels(height, u, v)
+                if (here == moving) == moves:
+                    if level - point[2] > MARGIN_PIXELS * pixel + MARGIN_SLOPE * travelled * across:
                         own = wp.uint8(1)
                         break
                 else:
-                    gap = wp.where(camera.perspective, wp.log(point[2] / height[r, c]), height[r, c] - point[2])
+                    gap = wp.where(camera.perspective, wp.log(point[2] / level), level - point[2])
                     top, bottom = wp.max(top, gap), wp.min(bottom, gap)
                     rear = wp.min(rear, gap - thickness[r, c])
+                    flat = thickness[r, c] < thin
+                    if crossed == 2 and flat:
+                        rim = OUTLINE_0 * sooner + OUTLINE_1 * before + OUTLINE_2 * gap
+                        top, bottom = wp.max(top, rim), wp.min(bottom, rim)
+                    soonest = sooner
+                    sooner = before
+                    before = gap
+                    crossed += 1
             travelled += stride
         highest[n, light] = top
         lowest[n, light] = bottom
-        back[n, light] = rear
+        back[n, light] = wp.min(rear, bottom)
         hidden[n, light] = own
 
 
@@ -118,6 +158,8 @@ def march_part(pixels: wp.array, toward: wp.array, height: wp.array, part: wp.ar
 
 INSIDE, BEHIND = 0.6, 0.4
 """Probability that a ray is hidden which lies behind the front of a part all along its way: before the guessed back, and behind it."""
+BEHIND_PLATE, FLAT = 0.1, 1.5
+"""The latter of a plate, and the guessed thickness below which a part may be one, in standard deviations of the gaps."""
 GROUPS = 8
 """Groups of lights, by their direction about the line of sight."""
 STEPS = 1024
@@ -126,6 +168,8 @@ LEAST_GAIN = 3.0
 """Log-likelihood, beyond twice its standard error between groups, by which an offset must be worse to be ruled out."""
 ERRORS = 2.0
 """Standard errors by which it must be worse."""
+LEAST_GROUPS = 1.5
+"""Effective number of groups, (Σ e)² / Σ e² of their expected losses e, below which none can confirm the others."""
 
 
 class Evidence(NamedTuple):
@@ -133,6 +177,7 @@ class Evidence(NamedTuple):
 
     offsets: np.ndarray  # [m] in the unit of the gaps
     gain: np.ndarray  # [groups, m] log-likelihood of each group of lights, less that of offset 0
+    expected: np.ndarray  # [groups, m] loss against the best offset that each group would have in the mean if that were the true one
 
 
 class Offset(NamedTuple):
@@ -143,6 +188,9 @@ class Offset(NamedTuple):
     low: float
     high: float
     """Bounds of the offsets that are not ruled out; the ends of the compared range where it is open."""
+    agreed_low: float
+    agreed_high: float
+    """The same bounds if the groups of lights did not contradict each other."""
 
 
 def weigh_offsets(shadows: PartShadows, odds: np.ndarray, on_part: np.ndarray, group: np.ndarray, *, reach: float,
@@ -163,31 +211,50 @@ def weigh_offsets(shadows: PartShadows, odds: np.ndarray, on_part: np.ndarray, g
     whose = np.broadcast_to(group[None], told.shape)[told]
     # a part that nears comes before others' pixels: free, hidden, then these lie behind its front, then behind its back; its own pixels
     # go the other way round
-    levels = [np.log(1 + share * np.expm1(odds[told])) for share in (0.0, 1.0, INSIDE, BEHIND)]
-    count = 2 * STEPS + 1
-    change = np.zeros((GROUPS, count + 1))
-    np.add.at(change, (whose, np.zeros_like(whose)), np.where(mine, levels[-1], levels[0]))
-    for gap, before, after in zip(gaps, levels[:-1], levels[1:], strict=True):
-        np.add.at(change, (whose, _bin(np.where(mine, gap, -gap), reach)), np.where(mine, before - after, after - before))
-    gain = _blurred(np.cumsum(change, axis=1)[:, :count], blur / reach * STEPS)
-    return Evidence(np.linspace(-reach, reach, count), gain - gain[:, STEPS, None])
+    flat = gaps[1] - gaps[2] < FLAT * blur  # as a plate: the readings choose whether light passes behind it
+    places = [_bin(np.where(mine, gap, -gap), reach) for gap in gaps]
+
+    def along(levels: list[np.ndarray]) -> np.ndarray:
+        change = np.zeros((GROUPS, 2 * STEPS + 2))
+        np.add.at(change, (whose, np.zeros_like(whose)), np.where(mine, levels[-1], levels[0]))
+        for place, before, after in zip(places, levels[:-1], levels[1:], strict=True):
+            np.add.at(change, (whose, place), np.where(mine, before - after, after - before))
+        return _blurred(np.cumsum(change, axis=1)[:, :-1], blur / reach * STEPS)
+
+    tried = [(0.0, 1.0, INSIDE, np.where(flat, behind, BEHIND)) for behind in (BEHIND, BEHIND_PLATE)]
+    states, gain = max(((states, along([np.log(1 + state * np.expm1(odds[told])) for state in states])) for states in tried),
+                       key=lambda one: float(one[1].sum(axis=0).max()))
+    best = int(np.argmax(gain.sum(axis=0)))
+    passed = np.sum([place <= best for place in places], axis=0)
+    sure = 1 / (1 + np.exp(-np.abs(odds[told])))  # probability that a reading's odds have the sign of its state
+    dark = 1 - sure + np.choose(np.where(mine, 3 - passed, passed), states) * (2 * sure - 1)
+    mean = along([dark * np.log(1 + state * np.expm1(np.abs(odds[told]))) + (1 - dark) * np.log(1 + state * np.expm1(-np.abs(odds[told])))
+                  for state in states])
+    return Evidence(np.linspace(-reach, reach, 2 * STEPS + 1), gain - gain[:, STEPS, None], mean[:, best, None] - mean)
 
 
 def choose_offset(evidence: Evidence, *, least_sigma: float) -> Offset:
     """Return the offset that the evidence speaks for, and its bounds; its standard deviation is `least_sigma` or more."""
-    offsets, gain = evidence
+    offsets, gain, expected = evidence
     whole = gain.sum(axis=0)
     best = int(np.argmax(whole))
     loss = gain[:, best, None] - gain
-    # groups that see nothing of the part neither confirm nor contradict
-    telling = max(2, int((np.ptp(gain, axis=1) > LEAST_GAIN / GROUPS).sum()))
-    error = np.sqrt(((loss - loss.sum(axis=0) / telling) ** 2 * (np.ptp(gain, axis=1) > LEAST_GAIN / GROUPS)[:, None]).sum(axis=0)
-                    * telling / (telling - 1))
-    open_still = loss.sum(axis=0) < ERRORS * error + LEAST_GAIN
-    low, high = offsets[np.flatnonzero(open_still)[[0, -1]]]
+    due = np.maximum(expected, 0) + LEAST_GAIN / GROUPS**2
+    error = np.sqrt(((loss - due * loss.sum(axis=0) / due.sum(axis=0)) ** 2).sum(axis=0))
+    groups = due.sum(axis=0) ** 2 / (due**2).sum(axis=0)
+    error *= np.sqrt(groups / np.maximum(groups - 1, 1e-9))
+    told = groups >= LEAST_GROUPS
+    low, high = _bounds(offsets, best, told & (loss.sum(axis=0) > ERRORS * error + LEAST_GAIN))
     apart = np.array([offsets[int(np.argmax(whole - one))] for one in gain])
     jackknife = float(np.sqrt((len(apart) - 1) / len(apart) * ((apart - apart.mean()) ** 2).sum()))
-    return Offset(float(offsets[best]), max(jackknife, float(high - low) / (2 * ERRORS), least_sigma), float(low), float(high))
+    return Offset(float(offsets[best]), max(jackknife, (high - low) / (2 * ERRORS), least_sigma), low, high,
+                  *_bounds(offsets, best, expected.sum(axis=0) > LEAST_GAIN))
+
+
+def _bounds(offsets: np.ndarray, best: int, worse: np.ndarray) -> tuple[float, float]:
+    """Return the first and the last offset that is not worse than the best."""
+    left = np.flatnonzero(~worse | (np.arange(len(offsets)) == best))
+    return float(offsets[left[0]]), float(offsets[left[-1]])
 
 
 def _bin(offset: np.ndarray, reach: float) -> np.ndarray:

@@ -19,6 +19,8 @@ from kernels.surface.fragments import LEAST_PART, Fragments, relabel, sizes_of
 
 MEETING = 0.6
 """Part of the edge between two fragments along which they must meet to belong together."""
+WHOLE = 0.75
+"""Part of its whole outline along which the smaller of two fragments must meet its neighbours, each shifted as fits it."""
 PLAY_PIXELS, PLAY_JUMP, PLAY_NOISE = 0.1, 0.6, 3.0
 """Distance within which two sides meet: in pixels; per difference between their slopes, because a crease may pass anywhere between two
 pixel centres; and in standard deviations of the noise of the loops."""
@@ -28,6 +30,10 @@ LEAST_PULL = 1e-9
 """Weight, of that of all edges, by which the constant of each part is drawn to 0, so that parts that share no edge have one."""
 LIKE_TURN = np.radians(5.0)
 """Angle between normals below which they are alike."""
+SLIVER_PIXELS = 3.0
+"""Mean width of a fragment below which it may be one of mixed pixels along an outline: twice its pixels over its cut edges."""
+SURROUNDED = 0.8
+"""Part of the outline of a strip that one neighbour has where it does not lie between two parts: a wire, or a groove."""
 ROUNDS = 8
 """Most rounds in which small fragments join their neighbours; each at least halves a chain of them."""
 
@@ -49,7 +55,10 @@ def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
     """
     seam = _Seam(found, height)
     for _ in range(ROUNDS):
-        if not _join_small(seam):
+        if not _absorb(seam, seam.size < LEAST_PART):
+            break
+    for _ in range(ROUNDS):
+        if not _absorb(seam, _slivers(seam)):
             break
     play = PLAY_PIXELS + PLAY_JUMP * found.jump + PLAY_NOISE * noise
     for one, other in seam.pairs():
@@ -117,15 +126,26 @@ class _Seam:
         self.size = np.bincount(into, weights=self.size, minlength=len(into)).astype(int)
 
 
-def _join_small(seam: _Seam) -> bool:
-    """Join each group too small to be a part to the larger neighbour whose normals are most like its own; return whether there was one."""
+def _slivers(seam: _Seam) -> np.ndarray:
+    """Return [groups] whether each is a strip along an outline: thin, and between others of which none surrounds it."""
+    pair, shared = np.unique(np.stack([np.concatenate(seam.sides()), np.concatenate(seam.sides()[::-1])]), axis=1, return_counts=True)
+    shared = np.where(pair[0] != pair[1], shared, 0)
+    outline, longest = np.zeros(len(seam.size), dtype=int), np.zeros(len(seam.size), dtype=int)
+    np.add.at(outline, pair[0], shared)
+    np.maximum.at(longest, pair[0], shared)
+    return (2 * seam.size < SLIVER_PIXELS * outline) & (longest < SURROUNDED * outline)
+
+
+def _absorb(seam: _Seam, little: np.ndarray) -> bool:
+    """Join each group that is `little` [groups] to the larger neighbour whose normals are most like its own; return whether there was
+    one."""
     first, second = seam.sides()
     rank = np.empty(len(seam.size), dtype=int)
     rank[np.argsort(seam.size, kind="stable")] = np.arange(len(seam.size))
     parted = first != second
     upward = rank[first] < rank[second]
     small, large = np.where(upward, first, second), np.where(upward, second, first)
-    usable = np.flatnonzero(parted & (seam.size[small] < LEAST_PART))
+    usable = np.flatnonzero(parted & little[small])
     if not len(usable):
         return False
     likeness = 1 / (LIKE_TURN**2 + seam.found.turn**2)
@@ -145,19 +165,29 @@ def _join_small(seam: _Seam) -> bool:
 
 
 def _join_meeting(seam: _Seam, low: int, high: int, play: np.ndarray) -> None:
-    """Join two groups if one shift makes them meet along most of the edge that they share."""
+    """Join two groups if one shift makes them meet along most of the edge that they share, and the smaller one meets its neighbours along
+    most of its whole outline: a short stretch of an outline meets whatever lies behind it."""
     first, second = seam.sides()
-    edges = np.flatnonzero(((first == low) & (second == high)) | ((first == high) & (second == low)))
+    outline = np.flatnonzero(((first == low) | (second == low)) & (first != second))
+    other = np.where(first[outline] == low, second[outline], first[outline])
+    met, shift = _met(seam, low, outline[other == high], play)
+    if met <= MEETING * np.count_nonzero(other == high):
+        return
+    if sum(_met(seam, low, outline[other == each], play)[0] for each in np.unique(other)) > WHOLE * len(outline):
+        into, added = np.arange(len(seam.size)), np.zeros(len(seam.size))
+        into[low], added[low] = high, shift
+        seam.move(into, added)
+
+
+def _met(seam: _Seam, low: int, edges: np.ndarray, play: np.ndarray) -> tuple[int, float]:
+    """Return at how many edges between a group and another the shift that is best makes them meet, and that shift of the group."""
     telling = edges[~seam.found.edge_on[edges]]
     if len(telling) <= MEETING * len(edges):
-        return
-    needed = np.where(first[telling] == low, 1, -1) * seam.rest()[telling]
+        return 0, 0.0
+    needed = np.where(seam.sides()[0][telling] == low, 1, -1) * seam.rest()[telling]
     reach = play[telling] + DRIFT * len(edges)
     bounds = np.concatenate([needed - reach, needed + reach])
     order = np.argsort(bounds, kind="stable")
     met = np.cumsum(np.repeat([1, -1], len(needed))[order])
     most = int(np.argmax(met))
-    if met[most] > MEETING * len(edges):
-        into, added = np.arange(len(seam.size)), np.zeros(len(seam.size))
-        into[low], added[low] = high, 0.5 * (bounds[order[most]] + bounds[order[most + 1]])
-        seam.move(into, added)
+    return int(met[most]), float(0.5 * (bounds[order[most]] + bounds[order[most + 1]]))

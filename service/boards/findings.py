@@ -11,7 +11,7 @@ from scipy.ndimage import find_objects, label
 from service.boards.stitching.comparison import Deviation
 from service.boards.stitching.grid import BoardGrid
 from service.boards.stitching.regions import RegionResult
-from service.boards.stitching.significance import Scan, core_of, grown, mean_of, weighted_centre
+from service.boards.stitching.significance import Scan, grown, mean_of, region_of, weighted_centre
 
 FINDINGS_FILE = "findings.csv"
 MOST_AREAS = 1000
@@ -36,37 +36,72 @@ class Defect(NamedTuple):
     """A connected area with a significant deviation."""
 
     area: Area
-    """Pixels whose smallest window has a mean of at least half the largest in the area; the middle is weighted by the deviation."""
+    """The connected pixels that deviate by at least half of the largest mean there; the middle is weighted by the deviation."""
     deviation_m: float
+    """Mean of these pixels, weighted by their variance."""
     sigma_m: float
     significance: float
-    """The largest |mean| less tolerance over σ of the windows there."""
+    """|deviation_m| less the tolerance over sigma_m."""
     peak_m: float
-    """Largest mean deviation of a smallest window."""
+    """The deviation that a twentieth of the pixels exceed."""
     volume_m3: float
 
 
-def find_defects(deviation: Deviation, scan: Scan) -> list[Defect]:
-    """Return the significant areas, the most significant first; those nearer to each other than two smallest windows are one."""
-    found = []
-    for rows, cols, near in _connected(grown(scan.significant, 2 * scan.sides_px[0] + 1)):
-        where = (rows, cols)
-        part = near & scan.significant[where]
-        inner = scan._replace(mean=scan.mean[where], mean_sigma=scan.mean_sigma[where], score=scan.score[where])
-        core = core_of(inner, part & deviation.known[where])
+def find_defects(deviation: Deviation, scan: Scan, tolerance_m: np.ndarray) -> tuple[list[Defect], np.ndarray]:
+    """Return the significant areas, the most significant first, and their pixels, [rows, cols] bool.
+
+    Areas to one side that are nearer to each other than two smallest windows are one. An area whose own mean is not significant, because
+    the windows over it hold other pixels too, is no defect.
+    """
+    found, taken = [], np.zeros(scan.side.shape, dtype=bool)
+    for sign in (1, -1):
+        for rows, cols, near in _connected(grown(sign * scan.side > 0, 2 * scan.sides_px[0] + 1)):
+            part = near & (sign * scan.side[rows, cols] > 0)
+            if (taken[rows, cols] & part).sum() > part.sum() / 2:
+                continue  # an area that was found from another part of it
+            where, core = _region(deviation, scan, (rows, cols), part)
+            for pixels in (core, core & (sign * scan.side[where] > 0)):
+                defect = _defect(deviation, scan, tolerance_m, where, pixels)
+                if defect is not None and sign * defect.deviation_m > 0 and defect.significance >= scan.threshold:
+                    found.append(defect)
+                    taken[where] |= pixels
+                    break
+    return sorted(found, key=lambda defect: -defect.significance), taken
+
+
+def _region(deviation: Deviation, scan: Scan, box: tuple[slice, slice], part: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
+    """Return the whole area that a significant part of a box belongs to: the rows and columns of a box around it, and its pixels there."""
+    rows, cols = scan.side.shape
+    grow = 2 * scan.sides_px[-1]
+    while True:
+        where = (slice(max(box[0].start - grow, 0), min(box[0].stop + grow, rows)),
+                 slice(max(box[1].start - grow, 0), min(box[1].stop + grow, cols)))
         cut = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
-        mean = mean_of(cut, core)
-        if mean is None:
-            continue
-        row, col = np.nonzero(core)
-        heights = cut.height[core]
-        middle = weighted_centre(heights, row.astype(np.float64), col.astype(np.float64))
-        area = _area(deviation.grid, row + rows.start, col + cols.start, (middle[0] + rows.start, middle[1] + cols.start))
-        known = inner.mean[core & np.isfinite(inner.mean)]
-        peak = float(known[np.abs(known).argmax()]) if known.size else mean.value
-        found.append(Defect(area, mean.value, mean.sigma, float(inner.score[part].max()), peak,
-                            float(heights.sum()) * deviation.grid.pixel_m**2))
-    return sorted(found, key=lambda defect: -defect.significance)
+        top, left = box[0].start - where[0].start, box[1].start - where[1].start
+        inside = np.zeros(cut.height.shape, dtype=bool)
+        inside[top : top + part.shape[0], left : left + part.shape[1]] = part
+        region = region_of(cut, scan._replace(side=scan.side[where]), inside)
+        if not any((region[0].any() and where[0].start > 0, region[-1].any() and where[0].stop < rows,
+                    region[:, 0].any() and where[1].start > 0, region[:, -1].any() and where[1].stop < cols)):
+            return where, region
+        grow *= 4
+
+
+def _defect(deviation: Deviation, scan: Scan, tolerance_m: np.ndarray, where: tuple[slice, slice], pixels: np.ndarray) -> Defect | None:
+    """Return what is said of some pixels of a box; None of no pixel."""
+    cut = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
+    factor = max(value for side, value in scan.spread.items() if side == scan.sides_px[0] or side * side <= pixels.sum())
+    mean = mean_of(cut, pixels, spread=factor)
+    if mean is None:
+        return None
+    row, col = np.nonzero(pixels)
+    heights = cut.height[pixels]
+    middle = weighted_centre(heights, row.astype(np.float64), col.astype(np.float64))
+    area = _area(deviation.grid, row + where[0].start, col + where[1].start, (middle[0] + where[0].start, middle[1] + where[1].start))
+    allowed = float(tolerance_m[where][pixels].mean())
+    peak = float(np.percentile(heights, 95 if mean.value > 0 else 5))
+    volume = float(heights.sum()) * deviation.grid.pixel_m**2
+    return Defect(area, mean.value, mean.sigma, (abs(mean.value) - allowed) / mean.sigma, peak, volume)
 
 
 def find_areas(grid: BoardGrid, pixels: np.ndarray) -> tuple[list[Area], int]:

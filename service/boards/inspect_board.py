@@ -22,7 +22,7 @@ from service.boards.stitching.regions import RegionResult, Verdict, check_region
 from service.boards.stitching.significance import Scan, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
 from service.boards.tiles import BoardTiles, read_tiles
-from service.depth.results.solution import statistics
+from service.depth.base.solution import statistics
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report
 from service.requests.inspect_board import BoardForm, InspectBoardRequest
@@ -166,8 +166,9 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     inspected = wanted & deviation.known & np.isfinite(scan.mean_sigma)
     if request.must_find_m is not None:
         inspected &= np.nan_to_num(scan.findable, nan=np.inf) <= request.must_find_m
-    inspected |= wanted & scan.significant & deviation.known
-    defects = find_defects(deviation, scan)
+    defects, significant = find_defects(deviation, scan, tolerance)
+    scan = scan._replace(significant=significant)
+    inspected |= wanted & significant & deviation.known
     regions, k = check_regions(deviation, nominal.regions, false_alarm=request.false_alarm / 2)
     return heights, _Judged(nominal, found, deviation, bow_and_twist(curved, grid), wanted, inspected, scan, defects, regions, k,
                             _verdict(defects, regions, inspected, wanted, request))
@@ -235,6 +236,7 @@ def _comparison(judged: _Judged, area_count: int) -> dict[str, Any]:
         "bow_and_twist_m": float(f"{judged.bow_m:.4g}"),
         "deviation_m": statistics(judged.deviation.height[known]), "sigma_m": statistics(judged.deviation.sigma[known]),
         "windows": {"sides_px": list(scan.sides_px), "tests": scan.tests, "threshold_sigma": float(f"{scan.threshold:.4g}"),
+                    "spread": {str(side): float(f"{value:.4g}") for side, value in scan.spread.items()},
                     "detectable_m": {str(side): float(f"{value:.4g}") for side, value in scan.detectable_m.items()}},
         "regions": {"tests": 2 * len(judged.regions), "threshold_sigma": float(f"{judged.region_threshold:.4g}")},
         "pixels": {"nominal": int(judged.wanted.sum()), "inspected": int(judged.inspected.sum()),

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import rank_filter
 
 from service.boards.stitching.stitching import TilePoints
 from service.depth.depth import depth
@@ -15,6 +16,9 @@ from stage.errors import BoardError, ManifestError
 from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
+
+SPIKE = 6.0
+"""σ beyond its neighbours from which on a point is an outlier."""
 
 
 class BoardTiles(NamedTuple):
@@ -74,8 +78,25 @@ def _points(file: Path, tile: Tile, maps: DepthMaps, number: int) -> TilePoints:
         raise ManifestError(f"{where}: its camera looks along the board, not at it: check its pose")
     middle = np.median(points, axis=0)
     local = (points - middle).astype(np.float32)
-    return TilePoints(tile.path, local[:, 0], local[:, 1], local[:, 2], (maps.sigma[used] * along).astype(np.float32),
+    height, sigma = without_spikes(local[:, 2], maps.sigma[used] * along, used)
+    return TilePoints(tile.path, local[:, 0], local[:, 1], height, sigma.astype(np.float32),
                       middle + pose[:3, 3], _distance(points, used, where))
+
+
+def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return heights and σ, both [n], of the used pixels of a tile, [rows, cols], with outliers moved to their neighbours.
+
+    An outlier lies beyond all of its eight neighbours but one by more than SPIKE σ. It is moved to the second of them, so that the slopes
+    around it are not its own, and its σ grows by as much as it was moved.
+    """
+    image = np.full(used.shape, np.nan, dtype=np.float32)
+    image[used] = height
+    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
+    low = rank_filter(np.where(used, image, np.inf), 1, footprint=ring, mode="constant", cval=np.inf)[used]
+    high = rank_filter(np.where(used, image, -np.inf), -2, footprint=ring, mode="constant", cval=-np.inf)[used]
+    beyond = np.maximum(low - height, height - high)
+    spike = np.isfinite(beyond) & (beyond > SPIKE * sigma)
+    return np.where(spike, np.clip(height, low, high), height), np.where(spike, np.hypot(sigma, beyond), sigma)
 
 
 def _pose(where: str, tile: Tile, maps: DepthMaps) -> np.ndarray:

@@ -15,7 +15,7 @@ from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, ball_from_circle, project, view_ball
 from service.light_estimation.ball_outline import ball_from_mask
 from service.light_estimation.grey_ball import fit_brightness, fit_direction
-from service.requests.calibrate import BallRequest
+from service.requests.calibrate import BallRequest, RigCalibrationRequest
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
@@ -43,7 +43,7 @@ DARK = 0.05
 """An outline whose brightest frame is darker than this part of the brightest pixels is that of a shadow."""
 
 
-def balls_of(request: BallRequest, camera: Camera, *, exactly: int | None = None, at_least: int = 1,
+def balls_of(request: BallRequest | RigCalibrationRequest, camera: Camera, *, exactly: int | None = None, at_least: int = 1,
            radii: Sequence[float] = (), heights: Sequence[float] = ()) -> list[Ball]:
     """Return the balls that a request names: those of its circles, then those of its masks.
 

@@ -15,9 +15,9 @@ from service.calibrate.solvers.laser_plane import board_plane, fit_light_plane, 
 from service.calibrate.solvers.laser_step import fit_step
 from service.calibrate.solvers.procam import find_corners
 from service.calibrate.solvers.step_stripe import StepStripe, split_stripe
+from service.depth.base.triangulation_check import check_perspective
 from service.depth.laser.laser import ambient_light
 from service.depth.laser.stripes import Signal, stripe_signal
-from service.depth.patterns.triangulation_check import check_perspective
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
 from stage.capture.capture import Capture

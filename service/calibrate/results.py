@@ -129,10 +129,16 @@ def write_lights(kind: str, request: Options, captures: LightCaptures, results: 
 def write_results(kind: str, request: Options, manifest: Manifest, manifest_path: Path, section: dict[str, Any]) -> Path:
     """Write calibration.json beside the manifest, with the sections of other commands that it held, then the manifest; return the path
     of the report."""
-    path = manifest_path.parent / CALIBRATION_FILE
+    path = write_report(kind, request, manifest_path.parent, section)
+    write_manifest(manifest, manifest_path)
+    return path
+
+
+def write_report(kind: str, request: Options, folder: Path, section: dict[str, Any]) -> Path:
+    """Write calibration.json into a folder, with the sections of other commands that it held; return its path."""
+    path = folder / CALIBRATION_FILE
     data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": versions()}}
     write_text(path, with_names(json.dumps(data, indent=2) + "\n"))
-    write_manifest(manifest, manifest_path)
     return path
 
 

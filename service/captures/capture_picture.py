@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.relight.sheet import BACKGROUND, display, fit, write_sheet
+from service.relight.sheet import BACKGROUND, display, dome_places, fit, write_sheet
 from stage.capture.capture import Capture
 from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.manifest import Frame
@@ -146,15 +146,14 @@ def _crossed(aspect: float) -> np.ndarray:
 def _dome(capture: Capture, images: Sequence[np.ndarray], directions: Mapping[str, np.ndarray],
           suspects: Mapping[str, float]) -> np.ndarray:
     """Return each light where it stands as the camera sees it: the angle from the view axis is the distance from the middle."""
-    angle = {name: float(np.degrees(np.arccos(np.clip(way[2], -1, 1)))) for name, way in directions.items()}
-    widest = max(*angle.values(), 10.0)  # its image ends at the edge
+    towards = np.array(list(directions.values()))
+    widest = max(float(np.degrees(np.arccos(np.clip(towards[:, 2].min(), -1, 1)))), 10.0)  # its image ends at the edge
     y, x = np.ogrid[:SIZE, :SIZE]
     radius, step = np.hypot(y - SIZE / 2, x - SIZE / 2), RING_DEGREES * REACH / widest
     nearest = step * np.clip((radius / step).round(), 1, 180 // RING_DEGREES)
     dome = np.where((np.abs(radius - nearest) < 0.6)[..., None], DIM, BACKGROUND)
-    places = {name: SIZE / 2 + np.array([-way[1], way[0]]) / max(float(np.hypot(*way[:2])), 1e-9) * angle[name] / widest * REACH
-              for name, way in directions.items()}
-    points = np.array(list(places.values()))
+    points = dome_places(towards, side=SIZE, reach=REACH, widest_degrees=widest)
+    places = dict(zip(directions, points, strict=True))
     apart = np.linalg.norm(points[:, None] - points, axis=-1) + np.diag(np.full(len(points), np.inf))
     rows = float(np.clip(np.median(apart.min(axis=1)) if len(points) > 1 else SIZE / 3, SMALLEST, LARGEST))
     shown = [(frame.image, image) for frame, image in zip(capture.manifest.frames, images, strict=True) if frame.image in places]

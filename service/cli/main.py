@@ -20,11 +20,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
              "depth as points."),
     "solve": ("solve", "Normals, albedo and height of a light-stage capture."),
     "export": ("export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
+    "inspect": ("export", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
+                "provenance, validators."),
     "basis": ("export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
     "join": ("export", "One surface from solved maps and a depth of the same view: the detail of the normals, and the shape and "
              "place of the depth."),
-    "inspect": ("inspect", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
-                "provenance, validators."),
     "depth": ("depth", "Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."),
     "separate": ("depth", "Direct and global light of a capture under fine, shifted phase patterns."),
     "scan": ("depth", "Shots of a scanning laser, from a platform that may move, as one point cloud."),
@@ -40,6 +40,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "drive": ("rig", "Levels at which the lamps of a rig light a subject as environments and animated lights would."),
     "play": ("stage", "Send cues to the lamps of a rig over sACN or Art-Net, and turn the lamps dark at the end."),
     "twin": ("stage", "A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."),
+    "capture": ("acquire", "Take a capture: switch each light or show each pattern, take the picture, check it, and write the capture "
+                "folder as it goes. Given again, the command takes the pictures that are missing."),
     "doctor": ("doctor", "Check this installation: versions, shadowed packages, devices, a kernel, a writable temporary folder; "
                "and the service here."),
     "serve": ("server", "Run the service: the API, and a worker on each device."),
@@ -51,7 +53,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("depth", "The raw frames that a time-of-flight camera would make of a depth."),
     "rig": ("rig", "Rigs of driven lamps: check them, make them from captures, tables and scenes, plan them; docs/drive.md."),
     "keys": ("keys", "Make, list and revoke the keys of the service."),
-    "import": ("imports", "Write a capture.json for files that are laid out another way; docs/captures.md shows each layout."),
+    "import": ("imports", "Write a capture.json for files that are laid out another way; docs/importing.md shows each."),
     "calibrate": ("calibrate", "Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with "
                   "residuals."),
     "submit": ("submit", "Submit work to a service, with the options of the commands that do it on this machine."),

@@ -1,4 +1,4 @@
-"""A client of the service for Python programs; docs/client.md explains its use."""
+"""A client of the service for Python programs; docs/python_client.md explains its use."""
 
 from types import TracebackType
 from typing import Self

@@ -14,10 +14,10 @@ import numpy as np
 
 from kernels import device as devices
 from kernels.status import Status, refuse_unsure
+from service.depth.base.solution import DepthSolution, point_cloud
 from service.depth.laser.laser import solve_laser
 from service.depth.patterns.coordinates import DecodedSolution
 from service.depth.patterns.patterns import solve_patterns
-from service.depth.results.solution import DepthSolution, point_cloud
 from service.depth.stereo.stereo import solve_stereo
 from service.depth.stereo.two_cameras import solve_two_cameras
 from service.depth.tof.tof import solve_tof

@@ -12,7 +12,7 @@ from kernels.tof.histogram.pulse_width import estimate_pulse
 from kernels.tof.histogram.returns import find_returns
 from kernels.tof.histogram.undeclared_pileup import estimate_pulses
 from service.asset.usd.depth_asset import write_points
-from service.depth.results.solution import srgb_bytes, white_of
+from service.depth.base.solution import srgb_bytes, white_of
 from service.depth.tof.count_scale import estimate_count_scale
 from service.depth.tof.histograms import pile_up_warning, scale_warnings
 from service.errors import RequestError

@@ -14,8 +14,8 @@ from kernels import device as devices
 from kernels.status import OK, Status
 from kernels.structured.pattern_frames import saturated_bits, upload
 from kernels.structured.separation import separate as separate_band
+from service.depth.base.solution import statistics
 from service.depth.depth import content_of
-from service.depth.results.solution import statistics
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, metadata, report

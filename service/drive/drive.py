@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from service.drive.cue_files import write_cue_files
+from service.drive.cue_files import drive_warnings, report_sections, write_cue_files
 from service.drive.dilation import Dilated, dilate
 from service.drive.judgement import Judgement
 from service.drive.light import collect_light, judge_all
 from service.drive.picture import write_picture
 from service.drive.primaries import WantedLevels, levels_for_light
 from service.drive.quantisation import quantise
-from service.drive.report import drive_warnings, report_sections
 from service.errors import RequestError
 from service.relight.attributes import FRAMES_PER_SECOND
 from service.relight.environments import Environments
@@ -102,7 +101,7 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     cues, report = write_cue_files(request, rig, quantised, numbers, rate, sections, warnings, timings)
     picture = write_picture(request.out, rig, light.far, quantised.level, factor, numbers)
     if request.capture is not None:
-        camera = TwinPicture(rig, TwinRequest(rig=request.rig, capture=request.capture, device=device), timings)
+        camera = TwinPicture(rig, TwinRequest(rig=request.rig, capture=request.capture, device=device, cache=request.cache), timings)
         warnings += tuple(camera.warnings)
         timings.stage("predicted", len(numbers))
         for index, number in enumerate(numbers):

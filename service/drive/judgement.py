@@ -80,8 +80,16 @@ def irradiance_of(direction: np.ndarray, energy: np.ndarray, normals: np.ndarray
 
 
 def environment_samples(environment: EnvironmentMap, most_rows: int = FOLDED_ROWS) -> tuple[np.ndarray, np.ndarray]:
-    """Return samples of a map, unit vectors [n, 3] and their energies [n, 3], as many as a map of `most_rows` rows has or fewer."""
-    radiance = environment.radiance
+    """Return samples of a map, unit vectors [n, 3] and their energies [n, 3], as many as a map of `most_rows` rows has or fewer.
+
+    They are found once for each map, and are not to be changed.
+    """
+    if most_rows not in environment.folded:
+        environment.folded[most_rows] = _folded(environment.radiance, most_rows)
+    return environment.folded[most_rows]
+
+
+def _folded(radiance: np.ndarray, most_rows: int) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = radiance.shape[:2]
     side = -(-rows // most_rows)
     directions, energies = [], []

@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, get_args
 
+import numpy as np
+
 from service.asset.content.card import find_frames
 from service.asset.content.repair import repair_heights
 from service.asset.usd.surroundings import Surroundings
@@ -15,7 +17,6 @@ from service.export.writers import WRITERS, Writer
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import export_metadata
 from service.requests.export import AssetFormat, ExportRequest, Geometry
-from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
 from stage.colour.environment_maps import check_environment
@@ -28,6 +29,8 @@ from stage.stack.fingerprint import combined, digest
 
 OPTIONS = ("rig", "environment", "card")
 """Options of what an asset brings along."""
+BLACK = 1e-3
+"""Sum of diffuse albedo and F0 below which a surface looks black: an image of 8 bits has three codes up to it."""
 EXPORTED_LAYERS = ("normal", "diffuse_albedo", "specular", "roughness", "regime", "height", "part")
 """The layers that an asset needs, half of those that `svbrdf` writes: at 4096 by 4096 pixels the rest takes 0.6 GiB."""
 
@@ -89,7 +92,7 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Timings) -> Exported:
     """Write an asset of solved maps."""
     maps = SurfaceMaps.read(path, layers=EXPORTED_LAYERS)
-    around = _open_surroundings(request, maps.camera)
+    around = _open_surroundings(request, maps)
     contents = {path.stem: digest(path), **_content_hashes(around)}
     maps = replace(maps, provenance={**maps.provenance, **export_metadata(request, contents)})
     timings.stage("asset", 1)
@@ -99,11 +102,24 @@ def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Ti
                             textures=request.textures, **more)
     warnings = [*repairs, *clipping_sentences({**(around.clipped or {}), **(around.rig.clipped if around.rig is not None else {})}),
                 *report.warnings]
+    if (plain := _plain(maps)) is not None:
+        warnings.append(plain)
     if maps.diffuse_albedo is None:
         warnings.append("the maps have no diffuse_albedo, so the asset is grey: solve with a method that gives it")
     warnings += [f"{layer}: {count} pixels have a value outside 0…1, which the texture cannot hold: they are clipped"
                  for layer, count in report.clipped_pixels.items() if count]
     return Exported(request.out, tuple(warnings), report.sizes, report.lights)
+
+
+def _plain(maps: SurfaceMaps) -> str | None:
+    """Return the sentence for an asset that is black or white all over, or None."""
+    layers = [layer[maps.mask] for layer in (maps.diffuse_albedo, maps.specular) if layer is not None]
+    if maps.diffuse_albedo is None or not maps.mask.any():
+        return None
+    shade = next((name for name, found in (("black", np.percentile(sum(layers), 99) < BLACK),
+                                           ("white", np.percentile(maps.diffuse_albedo[maps.mask], 10) >= 1)) if found), None)
+    return None if shade is None else (f"the asset is {shade} all over: check the irradiance or intensity of the lights of the capture, "
+                                       "and --albedo-scale of the solve")
 
 
 def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple[str, ...]], timings: Timings) -> Exported:
@@ -126,9 +142,10 @@ def _refuse_surroundings(request: ExportRequest) -> None:
         raise RequestError(f"{given}: lights and frames go with solved maps, into a .usdz, .usda or .usdc: leave the option out")
 
 
-def _open_surroundings(request: ExportRequest, camera: Camera) -> Surroundings:
-    """Open and check what the asset brings along."""
-    rig = None if request.rig is None else Capture.open(request.rig, request.pixels)
+def _open_surroundings(request: ExportRequest, maps: SurfaceMaps) -> Surroundings:
+    """Open and check what the asset brings along; the lights of the rig are those under which its albedo looks as the images do."""
+    camera = maps.camera
+    rig = None if request.rig is None else Capture.open(request.rig, request.pixels).with_brighter_lights(1 / maps.albedo_scale)
     if rig is not None and rig.camera != camera:
         differs = [name for name, value in rig.camera if value != getattr(camera, name)]
         raise RequestError(f"--rig {request.rig}: its camera differs from that of the maps in {', '.join(differs)}: "

@@ -1,5 +1,6 @@
 """The universes that drive a rig, under the protocol that was asked for."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from service.errors import RequestError
@@ -52,3 +53,11 @@ def driven_universes(path: Path, rig: Rig) -> dict[tuple[str, int], Universe]:
     if not found:
         raise ManifestError(f"{path}: lights[].address: no lamp has a sacn or artnet address: patch the lamps")
     return dict(sorted(found.items()))
+
+
+def hosts_of(universes: Mapping[tuple[str, int], Universe], host: str | None = None) -> dict[str, dict[int, str | None]]:
+    """Return the host of each universe, by protocol and number; `host` is that of all of them, None: each has that of its address."""
+    found: dict[str, dict[int, str | None]] = {}
+    for (protocol, number), universe in universes.items():
+        found.setdefault(protocol, {})[number] = universe.host if host is None else host
+    return found

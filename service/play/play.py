@@ -50,14 +50,31 @@ def play(request: PlayRequest, stop: threading.Event | None = None) -> PlayResul
         RequestError: an option cannot be used, a package is missing, or the network refuses.
         StageError: the cues or the rig are wrong, or do not fit each other; names file and field.
     """
+    return run(prepare(request), stop)
+
+
+class Prepared(NamedTuple):
+    """A show that is checked, and the outputs that send it."""
+
+    show: Show
+    outputs: dict[str, Output]
+
+
+def prepare(request: PlayRequest) -> Prepared:
+    """Read the cues and the rig of a request and open its outputs; nothing is sent yet. Raises as `play` does."""
     show = read_show(request)
-    outputs = {protocol: open_output(protocol, hosts, request) for protocol, hosts in show.hosts.items()}
-    with _ended_by_signals(stop or threading.Event()) as stopping:
-        _send(outputs, show.dark)  # now fixtures wait for the synchronisation, so that none shows a part of the first frame
+    return Prepared(show, {protocol: open_output(protocol, hosts, request) for protocol, hosts in show.hosts.items()})
+
+
+def run(prepared: Prepared, stop: threading.Event | None = None) -> PlayResult:
+    """Send a show that is prepared, and leave the lamps dark, as `play` does."""
+    show, outputs = prepared
+    with ended_by_signals(stop or threading.Event()) as stopping:
+        send(outputs, show.dark)  # now fixtures wait for the synchronisation, so that none shows a part of the first frame
         try:
             return _run(show, outputs, stopping)
         finally:
-            _black_out(outputs, show.dark)
+            black_out(outputs, show.dark)
 
 
 def _run(show: Show, outputs: dict[str, Output], stopping: threading.Event) -> PlayResult:
@@ -94,19 +111,20 @@ def _wait(until: float, outputs: dict[str, Output], stopping: threading.Event) -
     return True
 
 
-def _send(outputs: dict[str, Output], values: Values) -> None:
+def send(outputs: dict[str, Output], values: Values) -> None:
+    """Send a frame with the output of each protocol."""
     for protocol, output in outputs.items():
         output.set(values[protocol])
         output.send()
 
 
-def _black_out(outputs: dict[str, Output], dark: Values) -> None:
+def black_out(outputs: dict[str, Output], dark: Values) -> None:
     """Send dark frames with every output, also when another one fails, and end them."""
     refused: RequestError | None = None
     for _ in range(BLACKOUTS):
         for protocol, output in outputs.items():
             try:
-                _send({protocol: output}, dark)
+                send({protocol: output}, dark)
             except RequestError as error:
                 refused = error
         time.sleep(BLACKOUT_PAUSE_S)
@@ -118,7 +136,7 @@ def _black_out(outputs: dict[str, Output], dark: Values) -> None:
 
 
 @contextmanager
-def _ended_by_signals(stopping: threading.Event) -> Iterator[threading.Event]:
+def ended_by_signals(stopping: threading.Event) -> Iterator[threading.Event]:
     """Set an event at a signal, in place of an exception that could come between two universes or while the lamps are turned dark."""
     caught = [number for name in SIGNALS if (number := getattr(signal, name, None)) and signal.getsignal(number) is not signal.SIG_IGN]
     if threading.current_thread() is not threading.main_thread():  # only there signals can be caught

@@ -1,11 +1,11 @@
 """The show that is played: the values of every universe in every frame, checked before anything is sent."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import cycle, repeat
 from typing import NamedTuple
 
 from service.errors import RequestError
-from service.play.addresses import driven_universes, with_protocol
+from service.play.addresses import driven_universes, hosts_of, with_protocol
 from service.requests.play import PlayRequest
 from stage.errors import ManifestError
 from stage.rig.cues import Cues, FrameCue, read_cues
@@ -28,7 +28,12 @@ class Show(NamedTuple):
     @property
     def dark(self) -> Values:
         """The values of a frame in which every lamp is dark."""
-        return {protocol: dict.fromkeys(numbers, bytes(CHANNELS)) for protocol, numbers in self.hosts.items()}
+        return dark_values(self.hosts)
+
+
+def dark_values(hosts: Mapping[str, Iterable[int]]) -> Values:
+    """Return the values of a frame in which every lamp is dark, for the universes of each protocol."""
+    return {protocol: dict.fromkeys(numbers, bytes(CHANNELS)) for protocol, numbers in hosts.items()}
 
 
 def read_show(request: PlayRequest) -> Show:
@@ -41,9 +46,7 @@ def read_show(request: PlayRequest) -> Show:
     rig = read_rig(request.rig)
     cues = read_cues(request.cues, rig)
     universes = driven_universes(request.rig, with_protocol(rig, request.protocol))
-    hosts: dict[str, dict[int, str | None]] = {}
-    for (protocol, number), universe in universes.items():
-        hosts.setdefault(protocol, {})[number] = universe.host if request.host is None else request.host
+    hosts = hosts_of(universes, request.host)
     frames = tuple(_values(frame, f"{request.cues}: frames[{index}].dmx", request, hosts) for index, frame in enumerate(cues.frames))
     return Show(hosts, frames, _order(cues, request), request.frames_per_second or cues.frames_per_second)
 

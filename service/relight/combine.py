@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels import packs
+from kernels.images import ImagesOnDevice
 from kernels.relight.frames.combine import combine, combine_batch
 from service.requests.relight import CHUNK_FRAMES
 from stage.formats.exr_rows import BLOCK_ROWS
@@ -15,6 +15,9 @@ from stage.stack.stack import PIXEL_PAD, Stack
 CHUNK_BYTES = 256 << 20
 """Most bytes of linear frames, in float32, in a chunk. Two chunks are in memory at one time: one is computed while the previous one is
 written."""
+CUDA_CHUNK_BYTES = 2 << 30
+"""The same for frames that a model guides on CUDA: its responses, and images that the device's memory does not hold, are brought once for
+each chunk."""
 BLOCK_BYTES = 1280 << 20
 """Most bytes of a block of rows: the readings of its pixels, and its linear frames. Two blocks are in memory at one time. At 50 megapixels
 and 64 lights, a block of 64 frames has 128 rows; every block of every frame costs some milliseconds beyond its pixels."""
@@ -30,10 +33,10 @@ class RowBlock(NamedTuple):
     """The pixels of the rows in the stack; those of the last rows include its padding."""
 
 
-def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES) -> int:
-    """Return how many whole frames a chunk holds, `most` at most."""
+def chunk_frames(stack: Stack, most: int = CHUNK_FRAMES, *, of_cuda: bool = False) -> int:
+    """Return how many whole frames a chunk holds, `most` at most; `of_cuda` says that a model guides them on CUDA."""
     channels, _, pixels = stack.shape
-    return max(1, min(most, CHUNK_BYTES // (4 * channels * pixels)))
+    return max(1, min(most, (CUDA_CHUNK_BYTES if of_cuda else CHUNK_BYTES) // (4 * channels * pixels)))
 
 
 def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
@@ -47,7 +50,7 @@ def row_blocks(stack: Stack, width: int, pictures: int) -> Iterator[RowBlock]:
         yield RowBlock(first, last, slice(first * width, stack.shape[2] if last == height else last * width))
 
 
-def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | None, *, device: str,
+def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Sequence[int] | None, *,
                   pixels: slice | None = None) -> np.ndarray:
     """Return [frames, 3, pixels] float32 radiance of one chunk in the stack's scene-linear space, unclipped.
 
@@ -58,21 +61,21 @@ def linear_frames(stack: Stack, weights: np.ndarray, places: Sequence[int] | Non
             faster product is used.
         pixels: of a block of rows; None: all.
     """
-    channels, _, count = stack.shape
+    channels, _, count = images.stack.shape
     begin, end, _ = (pixels or slice(None)).indices(count)
     placed = weights
-    if places is not None and device != "cpu":
+    if places is not None and images.device != "cpu":
         placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
         placed[list(places)] = weights
-    bands = list(stack.bands(4 * channels * CHUNK_FRAMES)) if pixels is None else [(begin, end)]
+    bands = images.spans(4 * channels * CHUNK_FRAMES) if pixels is None else [(begin, end)]
     kept = slice(None) if places is None or len(placed) == len(weights) else list(places)
     frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float32)
     for start, stop in bands:
-        band = packs.upload(stack.band(start, stop), device=device)
+        band = images.band(start, stop, saturated=False)
         found = combine(band, weights[0]).numpy()[None] if places is None else combine_batch(band, placed).numpy()[kept]
         if frames is None:
             frames = found
         else:
             frames[:, :, start:stop] = found
     assert frames is not None
-    return frames[:, :, : min(end, stack.pixel_count) - begin]
+    return frames[:, :, : min(end, images.stack.pixel_count) - begin]

@@ -23,8 +23,10 @@ class EnvironmentMap:
     """An environment map in a working space."""
 
     def __init__(self, radiance: np.ndarray) -> None:
-        """Args: radiance: [rows, cols, 3] float32, scene-linear."""
+        """Take the radiance of a map, [rows, cols, 3] float32, scene-linear."""
         self.radiance = radiance
+        self.folded: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        """Directions and energies of samples that pixels were joined to, by their most rows; service/drive/judgement.py makes them."""
 
     @cached_property
     def samples(self) -> EnvironmentSamples:

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from kernels import packs
 from kernels.errors import ArrayError
+from kernels.images import ImagesOnDevice
+from kernels.packs import Band
 from kernels.relight.frames.near_sum import sum_near
 from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs, share_beyond
 from kernels.relight.model.captured import Captured
@@ -73,7 +74,7 @@ class Guide:
         except ArrayError as error:
             raise ResultError(f"{where}: cannot guide this capture: a model helps between four lights or more that are not all in one "
                               "plane") from error
-        self._model, self._lights, self._stack = SurfaceModel(maps, where, device, by_normal=True), lights, stack
+        self._model, self._lights, self._recorded = SurfaceModel(maps, where, device, by_normal=True), lights, ImagesOnDevice(stack, device)
         self._place = np.concatenate([lights.direction, np.zeros((len(lights.direction), 1))], axis=1)
         self._keep = len(self._place) * len(self._model.pixels) <= KEPT_BYTES
         self._seen: dict[int, wp.array] = {}
@@ -83,7 +84,7 @@ class Guide:
         self._model.profile = fit_profile(moments, self._model.pixels, maps.mask.shape)
         self.trust = self._fit(partial(compare_model, neighbours=neighbours, shares=shares), progress)
         """[n] β of the model's pixels between the captured lights, 0…1."""
-        self.stack = self._unclipped(clipping.level)
+        self.images = self._unclipped(clipping.level)
         """The captured images, with clipped readings as bright as the model has them."""
 
     @cached_property
@@ -99,24 +100,21 @@ class Guide:
         """Return [rows, n] float32 sums [rows, pixels padded] that are taken of every batch."""
         sums, done = np.zeros((rows, len(self._model.pixels)), dtype=np.float32), 0
         for batch in self._model.batches():
-            taken = take(self._captured(batch, self._stack, self._upload(batch, self._stack), self._visible(batch)))
+            taken = take(self._captured(batch, self._recorded, self._visible(batch)))
             sums[:, done : done + len(batch.pixels)] = taken.numpy()[:, : len(batch.pixels)]
             done += len(batch.pixels)
             if progress is not None:
                 progress.advance(done)
         return sums
 
-    def _captured(self, batch: ModelBatch, stack: Stack, band: packs.Band, visible: wp.array) -> Captured:
-        """Return the captured images of a batch, from a stack, beside the model."""
-        return Captured.of(band, batch.surface, visible, self._lights.direction, self._lights.irradiance, stack.scale)
+    def _captured(self, batch: ModelBatch, images: ImagesOnDevice[Stack], visible: wp.array, band: Band | None = None) -> Captured:
+        """Return the captured images of a batch beside the model; `band`, if they are on the device already."""
+        return Captured.of(band or images.pick(batch.pixels), batch.surface, visible, self._lights.direction, self._lights.irradiance,
+                           images.stack.scale)
 
-    def _upload(self, batch: ModelBatch, stack: Stack) -> packs.Band:
-        """Return the images of a batch on the device."""
-        return packs.upload(*stack.pick(batch.pixels), device=self._model.device)
-
-    def _unclipped(self, level: np.ndarray) -> Stack:
+    def _unclipped(self, level: np.ndarray) -> ImagesOnDevice[Stack]:
         """Return the captured images, where a reading is clipped at `level` [lights padded] and the model is brighter, by β brighter."""
-        lights, stack, count = self._lights, self._stack, len(self._lights.direction)
+        lights, stack, count = self._lights, self._recorded.stack, len(self._lights.direction)
         found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         done = 0
         for batch in self._model.batches():
@@ -135,9 +133,10 @@ class Guide:
                 at = np.flatnonzero(short.any(axis=0))
                 found.append((batch.pixels[at], np.full(len(at), light), (read + self.trust[part] * short)[:, at]))
         if not found:
-            return stack
+            return self._recorded
         pixel, light, radiance = zip(*found, strict=True)
-        return ReplacedStack.of(stack, np.concatenate(pixel), np.concatenate(light), np.concatenate(radiance, axis=1))
+        return ImagesOnDevice(ReplacedStack.of(stack, np.concatenate(pixel), np.concatenate(light), np.concatenate(radiance, axis=1)),
+                              self._model.device)
 
     def correct(self, frames: np.ndarray, lights: Sequence[ModelLight], *, specular: bool) -> np.ndarray | None:
         """Add to plain frames what the model says they miss, one frame after another.
@@ -152,7 +151,7 @@ class Guide:
         for batch in self._model.batches():
             part = slice(done, done + len(batch.pixels))
             done = part.stop
-            band = self._upload(batch, self.stack)
+            band = self.images.pick(batch.pixels)
             for index, light in enumerate(lights):
                 frame, mirror = frames[index : index + 1], None if mirrored is None else mirrored[index : index + 1]
                 self._add(frame, mirror, batch.pixels, part, self._lit(batch, band, light))
@@ -172,12 +171,12 @@ class Guide:
             _ = self.trust_beyond  # before several threads ask for it
         done = 0
         for batch in self._model.batches():
-            band = self._upload(batch, self.stack)
+            band = self.images.pick(batch.pixels)
 
             def use(at: slice, lit: LitModel, batch: ModelBatch = batch, done: int = done) -> None:
                 self._add(frames, mirrored, batch.pixels[at], slice(done + at.start, done + at.stop), lit)
 
-            self._range.light(batch, band, self.stack.scale, self._visible(batch), chunk, use)
+            self._range.light(batch, band, self.images.stack.scale, self._visible(batch), chunk, use)
             done += len(batch.pixels)
         return mirrored
 
@@ -190,7 +189,7 @@ class Guide:
         if mirrored is not None:
             mirrored[:, :, pixels] = np.clip(mirror, 0, np.maximum(guided, 0))
 
-    def _lit(self, batch: ModelBatch, band: packs.Band, light: ModelLight) -> LitModel:
+    def _lit(self, batch: ModelBatch, band: Band, light: ModelLight) -> LitModel:
         """Return the model of a batch under the light of one frame."""
         visible = self._visible(batch, light.marched)
 
@@ -198,7 +197,7 @@ class Guide:
             return shade(batch.surface, sources, visible).numpy()[:, : len(batch.pixels)].reshape(2, 3, -1)
 
         wanted = lit(light.wanted)
-        given = sum_shown(self._captured(batch, self.stack, band, visible), light.captured)
+        given = sum_shown(self._captured(batch, self.images, visible, band), light.captured)
         beyond = None
         if light.beyond is not None:
             outside = lit(light.beyond.wanted)
@@ -246,7 +245,7 @@ class Guide:
         """Return the model under near samples [2, 3, n], diffuse and specular, and the images and the model summed for them [3, n] each."""
         count = len(batch.pixels)
         wanted = shade(batch.surface, fine, visible).numpy()[:, :count].reshape(2, 3, -1)
-        captured = self._captured(batch, self.stack, self._upload(batch, self.stack), visible)
+        captured = self._captured(batch, self.images, visible)
         summed = sum_near(captured, coarse, triangles_between(self._lights.direction))
         pictures, told = summed.numpy()[:, :count].reshape(2, 3, -1)
         return wanted, pictures, told

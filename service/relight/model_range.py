@@ -27,8 +27,13 @@ from service.relight.range_light import RangeBeyond, RangeLight
 from service.relight.surface_model import ModelBatch, SurfaceModel
 from stage.capture.point_lights import DistantLights
 
-RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 64 << 20
-"""Most bytes of responses that a CPU thread and a CUDA device keep at one time; they choose how many pixels a portion has."""
+RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 256 << 20
+"""Most bytes of responses that a thread of the CPU and a CUDA device keep at one time, on a device with much memory more; they choose how
+many pixels a portion has."""
+CUDA_THREADS = 8
+"""Portions in work at one time on CUDA: while it computes one, threads of the host finish others."""
+HOST_BYTES = 8 << 20
+"""Most bytes of one kind of sums over the frames, in float32, that a thread beside a CUDA device keeps; it keeps some ten kinds."""
 HORIZON_FRAMES = 32
 """Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
 ROUNDING = 1e-4
@@ -173,8 +178,8 @@ class ModelRange:
             use: called, by several threads, with the pixels of the batch that a portion has, and the model there.
         """
         device = self._model.device
-        threads = devices.worker_count() if device == "cpu" else 1
-        packs = self._portion_packs
+        threads = devices.worker_count() if device == "cpu" else CUDA_THREADS
+        packs = self._portion_packs(batch.surface.packs, len(light.broad.places))
         memory: SimpleQueue[tuple[Responses, Responses]] = SimpleQueue()
         for _ in range(threads):
             memory.put((empty_responses(self._grid.count, packs, device), empty_responses(len(self._captured.place), packs, device)))
@@ -187,18 +192,21 @@ class ModelRange:
                 memory.put(room)
 
         with ThreadPoolExecutor(threads, thread_name_prefix="relit-model") as pool:
-            list(pool.map(work, self._portions(batch, band, visible, light.small)))
+            list(pool.map(work, self._portions(batch, band, visible, light.small, packs)))
 
-    @property
-    def _portion_packs(self) -> int:
-        """Return how many packs a portion has, at most."""
-        limit = RESPONSE_BYTES if self._model.device == "cpu" else CUDA_RESPONSE_BYTES
-        return max(1, limit // (4 * 4 * devices.pack_width(self._model.device) * self._grid.count))
+    def _portion_packs(self, packs: int, frames: int) -> int:
+        """Return how many packs a portion of a batch has, at most."""
+        device = self._model.device
+        pack = devices.pack_width(device)
+        pack_bytes = 4 * 4 * pack * self._grid.count
+        if device == "cpu":
+            return max(1, RESPONSE_BYTES // pack_bytes)
+        limit = devices.batch_bytes(device, CUDA_RESPONSE_BYTES) // CUDA_THREADS // pack_bytes
+        return max(1, min(limit, HOST_BYTES // (4 * 3 * pack * frames), -(-packs // CUDA_THREADS)))
 
-    def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: Sequence[SmallLights]) -> Iterator[Portion]:
-        """Cut a batch into portions whose responses fit into RESPONSE_BYTES."""
+    def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: Sequence[SmallLights], step: int) -> Iterator[Portion]:
+        """Cut a batch into portions of `step` packs."""
         pack, count = devices.pack_width(self._model.device), len(batch.pixels)
-        step = self._portion_packs
         horizons = [self._model.horizons(each.direction, batch) if len(each.direction) else None for each in small]
         for first in range(0, batch.surface.packs, step):
             packs = slice(first, min(first + step, batch.surface.packs))

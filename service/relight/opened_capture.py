@@ -14,6 +14,7 @@ from stage.capture.lighting import lights_from_centre
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour_spaces import linear_space
 from stage.motion.tracking import tracking_frames
+from stage.results.maps import capture_as_solved
 from stage.stack.ingest import Ingest
 
 
@@ -44,5 +45,7 @@ def open_capture(folder: Path, request: RelightRequest, captures: int, frames: S
     tracking = tracking_frames(capture, to=request.align_to) if request.aligned else None
     cache = request.cache / folder.name if request.cache is not None and captures > 1 else request.cache
     maps = None if request.maps is None else maps_file(request.maps, folder, captures)
+    if maps is not None:
+        capture = capture_as_solved(capture, maps)
     return OpenedCapture(capture, lights_from_centre(capture), len(capture.lit_by(PointLight)),
                          Ingest.of(capture, cache=cache, tracking=tracking), maps, linear_space(capture.manifest.color_space))

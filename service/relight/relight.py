@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from kernels.images import ImagesOnDevice
 from service.relight.attributes import time_attributes
 from service.relight.clipping import Clipping
 from service.relight.combine import chunk_frames, linear_frames, row_blocks
@@ -135,13 +136,15 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
     with timings.part("matte"):
         matte = frame_matte(request, opened.capture, stack)
         mattes.add(matte)
-    guide = None
+    guide, images = None, None
     if maps is not None and opened.maps is not None:
         with timings.part("guide"):
             guide = Guide(maps, opened.maps, stack, opened.lights, clipping, space=opened.space, device=device,
                           progress=None if plan.is_sequence else timings)
-            stack = guide.stack
+            images = guide.images
+            stack = images.stack
         findings.add_doubt(guide.doubt)
+    images = images or ImagesOnDevice(stack, device)
     if not plan.is_sequence:
         timings.stage("frames", len(plan.frames))
     form = FrameFormat.of(request, opened.capture.camera, opened.space, written, layers, matte)
@@ -150,7 +153,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         provenance["relit:frames_per_second"] = f"{plan.keys.frames_per_second:g}"
     alone = plan.total == 1 or plan.is_sequence  # decided from the whole range, so that --only gives bit-identical frames
     in_rows = guide is None and not alone and chunk_frames(stack) < CHUNK_FRAMES  # a model looks at whole frames
-    whole = chunk_frames(stack, CHUNK_FRAMES if guide is None else MODEL_CHUNK_FRAMES)
+    whole = chunk_frames(stack) if guide is None else chunk_frames(stack, MODEL_CHUNK_FRAMES, of_cuda=device != "cpu")
     size = max(1, (ROW_CHUNK_FRAMES if in_rows else whole) // max(1, len(plan.groups)))
     use = ModelUse.NONE if guide is None else ModelUse.FRAME if alone or size < RANGE_FRAMES else ModelUse.RANGE
     lighting = CaptureLighting(opened.lights, stack, plan.environments, opened.space, weighting=request.used_weights,
@@ -173,10 +176,10 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         for name, each in zip(plan.groups, single_lights, strict=False):
             groups[name] = list(islice(each, len(chunk)))
         if in_rows:
-            _write_rows(files, form, weights, stack, places, groups, writer, device, timings)
+            _write_rows(files, form, weights, images, places, groups, writer, timings)
             continue
         with timings.part("product"):
-            frames = linear_frames(stack, weights, places, device=device)
+            frames = linear_frames(images, weights, places)
         colours: dict[str, np.ndarray] = {}
         if guide is not None:
             with timings.part("guide"):
@@ -185,20 +188,20 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
                 colours[Layer.SPECULAR] = specular
         if groups:
             with timings.part("single lights"):
-                colours |= _lights_alone(groups, frames, stack, places, guide, device)
+                colours |= _lights_alone(groups, frames, images, places, guide)
         with timings.part("waiting for files"):
             writer.put(files, frames, form, colours)
 
 
-def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarray, stack: Stack, places: Sequence[int] | None,
-                groups: Mapping[str, Sequence[FrameLight]], writer: FrameWriter, device: str, timings: Timings) -> None:
+def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarray, images: ImagesOnDevice[Stack],
+                places: Sequence[int] | None, groups: Mapping[str, Sequence[FrameLight]], writer: FrameWriter, timings: Timings) -> None:
     """Make the frames of a chunk without a model, some rows of all of them at a time: the images are read once for the whole chunk."""
     with writer.in_rows(files, form) as put:
-        for block in row_blocks(stack, form.resolution[0], len(files) * (1 + len(groups))):
+        for block in row_blocks(images.stack, form.resolution[0], len(files) * (1 + len(groups))):
             with timings.part("product"):
-                frames = linear_frames(stack, weights, places, device=device, pixels=block.pixels)
+                frames = linear_frames(images, weights, places, pixels=block.pixels)
             with timings.part("single lights"):
-                colours = _lights_alone(groups, frames, stack, places, None, device, block.pixels)
+                colours = _lights_alone(groups, frames, images, places, None, block.pixels)
             with timings.part("waiting for files"):
                 put(block.first, block.last, frames, colours)
 
@@ -212,14 +215,14 @@ def _guide(guide: Guide, frames: np.ndarray, lights: Sequence[FrameLight], place
     return guide.correct(frames, [each.model for each in lights if each.model is not None], specular=specular)
 
 
-def _lights_alone(groups: Mapping[str, Sequence[FrameLight]], frames: np.ndarray, stack: Stack,
-                  places: Sequence[int] | None, guide: Guide | None, device: str, pixels: slice | None = None) -> dict[str, np.ndarray]:
+def _lights_alone(groups: Mapping[str, Sequence[FrameLight]], frames: np.ndarray, images: ImagesOnDevice[Stack],
+                  places: Sequence[int] | None, guide: Guide | None, pixels: slice | None = None) -> dict[str, np.ndarray]:
     """Return the frames under each light alone, which add up to the frames [frames, 3, pixels], by the names of their layers."""
     if len(groups) == 1:
         return {name: frames.copy() for name in groups}
     found = {}
     for name, light in groups.items():
-        found[name] = linear_frames(stack, np.stack([each.weights for each in light]), places, device=device, pixels=pixels)
+        found[name] = linear_frames(images, np.stack([each.weights for each in light]), places, pixels=pixels)
         if guide is not None:
             _guide(guide, found[name], light, places, specular=False)
     if guide is not None and found:

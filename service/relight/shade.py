@@ -151,10 +151,10 @@ def _shade_capture(capture: Capture, request: ShadeRequest, maps: SurfaceMaps, p
     clipping = Clipping.of(stack, capture.mask().reshape(-1))
     guide = Guide(maps, path, stack, lights, clipping, space=maps.color_space, device=device, progress=timings)
     timings.stage("shade", 2)
-    captured = CaptureLighting(lights, guide.stack, environments, maps.color_space, weighting=LightWeights.SMOOTH, device=device,
+    captured = CaptureLighting(lights, guide.images.stack, environments, maps.color_space, weighting=LightWeights.SMOOTH, device=device,
                                model=ModelUse.FRAME)
     light, = captured.frames([lighting])
-    frames = linear_frames(guide.stack, light.weights[None], None, device=device)
+    frames = linear_frames(guide.images, light.weights[None], None)
     findings = FrameFindings(guided=True)
     findings.add_beyond([None], [light.share_beyond], captured.beyond_degrees)
     findings.add_doubt(guide.doubt)

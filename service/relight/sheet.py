@@ -78,6 +78,24 @@ def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarra
     return pixels_of(oiio.ImageBufAlgo.resize(source, kernel, roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
 
 
+def dome_places(directions: np.ndarray, *, side: int, reach: float, widest_degrees: float) -> np.ndarray:
+    """Return where directions stand on a picture of the dome as the camera sees it: equal angles from the view axis are equal distances.
+
+    Args:
+        directions: [n, 3] unit vectors, z towards the camera.
+        side: of the picture, whose middle shows the view axis, pixels.
+        reach: distance of a direction at the widest angle from the middle, pixels.
+        widest_degrees: that angle.
+
+    Returns:
+        [n, 2] float64 row and column, pixels.
+    """
+    angle = np.degrees(np.arccos(np.clip(directions[:, 2], -1, 1)))
+    across = np.maximum(np.hypot(directions[:, 0], directions[:, 1]), 1e-9)
+    return np.asarray(side / 2 + np.stack([-directions[:, 1], directions[:, 0]], axis=1) / across[:, None] * angle[:, None]
+                      / widest_degrees * reach)
+
+
 def _sheet(rows: list[list[tuple[str, np.ndarray]]], tile: int) -> oiio.ImageBuf:
     width = max(sum(image.shape[1] + GAP for _, image in row) - GAP for row in rows) + 2 * MARGIN
     height = len(rows) * (tile + TITLE + GAP) - GAP + 2 * MARGIN

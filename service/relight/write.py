@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from kernels import device as devices
-from kernels.half import to_half
+from kernels.packs import to_half
 from service.relight.attributes import camera_attributes
 from service.relight.layers import StillLayer, in_parts
 from service.requests.light.picture_options import FrameCompression, Layer, PictureOptions
@@ -102,7 +102,7 @@ class FrameWriter:
     """Writes chunks of frames while the next are computed. A file exists only when its frame is whole."""
 
     def __init__(self, done: Callable[[int], None]) -> None:
-        """Args: done: called after each frame with the count so far, by one thread at a time."""
+        """Call `done` after each frame with the count so far, in one thread at a time."""
         self._done = done
         self._pool = ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-write")
         self._pending: list[Future[None]] = []

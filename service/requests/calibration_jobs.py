@@ -18,8 +18,10 @@ from service.requests.calibrate import (
     MirrorBallOptions,
     ProcamOptions,
     ResponseOptions,
+    RigCalibrationOptions,
     WhiteBalanceOptions,
 )
+from service.requests.drive import RIG, RigDocument
 from stage.model import Line
 
 MOST_CAPTURES = 100
@@ -168,6 +170,24 @@ class TofCalibrationJob(JobRequest):
     """Name of the relit.tof-sweep/1 file in the folder."""
 
 
+class RigCalibrationJob(JobRequest):
+    """Irradiance, colour and response of each primary of a rig, from a capture in which one shines at a time: measured.json (the rig),
+    calibration.json, and of a colour chart chart.json."""
+
+    kind: Literal["calibrate-rig"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture with a frame for each primary and level; its lights may be placeholders."""
+    rig: Annotated[RigDocument, Role.INPUT, RIG]
+    """The rig that was driven (JSON, schema relit.rig/1; docs/drive.md)."""
+    table: Annotated[Line, Role.INPUT, Spelling(metavar="NAME")]
+    """Name of the table in the capture's folder that says what each frame shows: CSV with the columns frame, light, primary, level."""
+    masks: Annotated[tuple[Line, ...], Role.INPUT, Spelling(flag="--ball-mask", metavar="NAME")] = ()
+    """Name of a mask image of the ball in the capture's folder, in place of `ball`."""
+    reflectances: Annotated[Line | None, Role.INPUT, Spelling(metavar="NAME")] = None
+    """Name of the table of the chart's reflectances in the capture's folder: CSV with the columns name, r, g, b."""
+    options: RigCalibrationOptions = RigCalibrationOptions()
+
+
 AnyCalibration = (MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob
-                  | StereoCalibrationJob | ResponseJob | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob)
+                  | StereoCalibrationJob | ResponseJob | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob | RigCalibrationJob)
 """Every kind of job that calibrates."""

@@ -1,5 +1,6 @@
 """The options of `relit drive`."""
 
+from abc import abstractmethod
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -7,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, Validat
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from service.requests.base.base import Choice, DeviceRequest, Options, Role, Spelling
+from service.requests.base.base import Choice, Options, Request, Role, Spelling
 from service.requests.light.picture_options import MAX_STOPS, FrameRate
 from service.requests.relight import LightWeights
 from stage.model import Finite, Line
@@ -46,37 +47,59 @@ class DriveOptions(Options):
     """Set values of environments to 0 that are negative beyond their noise, and say how many; without it such maps are refused."""
 
 
-class RigDocument(BaseModel):
-    """The content of a rig file as it was given, once it was found to be a rig.
-
-    It is kept unchanged, because cues are for the rig with the digest of its file.
-    """
+class _CheckedDocument(BaseModel):
+    """The content of a file as it was given, once a model of its schema has taken it; it is kept unchanged."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    schema_: Literal["relit.rig/1"] = Field(alias="schema")
-    """The kind and version of the file."""
+    @classmethod
+    @abstractmethod
+    def _model(cls) -> type[BaseModel]:
+        """Return the model, imported with NumPy, without which requests and the command line start."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        from stage.rig.rig import Rig  # with NumPy, without which requests and the command line start
-
         try:
-            Rig.model_validate(self.model_dump(by_alias=True))
+            self._model().model_validate(self.model_dump(by_alias=True))
         except ValidationError as error:
             raise ValueError(describe(error)) from error
         return self
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler, /) -> JsonSchemaValue:
-        """Return the JSON schema of a rig."""
+        """Return the JSON schema of the model."""
+        model = cls._model()
+        model.model_rebuild()
+        return handler(model.__pydantic_core_schema__)
+
+
+class RigDocument(_CheckedDocument):
+    """The content of a rig file; cues are for the rig with the digest of its file."""
+
+    schema_: Literal["relit.rig/1"] = Field(alias="schema")
+    """The kind and version of the file."""
+
+    @classmethod
+    def _model(cls) -> type[BaseModel]:
         from stage.rig.rig import Rig
 
-        Rig.model_rebuild()
-        return handler(Rig.__pydantic_core_schema__)
+        return Rig
 
 
-class DriveRequest(DriveOptions, DeviceRequest):
+class ChartDocument(_CheckedDocument):
+    """The content of a chart file."""
+
+    schema_: Literal["relit.chart/1"] = Field(alias="schema")
+    """The kind and version of the file."""
+
+    @classmethod
+    def _model(cls) -> type[BaseModel]:
+        from stage.rig.chart import Chart
+
+        return Chart
+
+
+class DriveRequest(DriveOptions, Request):
     """Levels at which the lamps of a rig light a subject as environments and animated lights would."""
 
     rig: Annotated[Path, Role.INPUT, RIG]

@@ -1,7 +1,7 @@
 """The options of `relit export` and `relit inspect`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -9,6 +9,25 @@ from service.requests.base.base import Choice, Options, PixelOptions, Role, Spel
 from stage.model import Line
 
 AssetFormat = Literal["usdz", "usda", "usdc", "glb"]
+
+
+class FormatFacts(NamedTuple):
+    """The facts of a file format of assets that all may ask for; service/export/writers.py has what writes and reads it."""
+
+    media_type: str | None = None
+    """Its type at the IANA, which downloads name; None: it has none."""
+    time_sampled: bool = False
+    """True if the steps of a sequence can be written into it one after another."""
+
+
+FORMATS: dict[AssetFormat, FormatFacts] = {
+    "usdz": FormatFacts("model/vnd.usdz+zip", time_sampled=True),
+    "usda": FormatFacts("model/vnd.usda"),
+    "usdc": FormatFacts(time_sampled=True),
+    "glb": FormatFacts("model/gltf-binary"),
+}
+TIME_SAMPLED = [name for name, facts in FORMATS.items() if facts.time_sampled]
+"""Formats of the asset of a sequence."""
 
 FIRST_VERSION = "1"
 """Version of an asset that nobody gave one."""

@@ -29,8 +29,29 @@ class DiligentImport(ImportRequest):
     """An object's folder of the DiLiGenT benchmark."""
 
 
-class LpImport(ImportRequest):
-    """An RTI light list (.lp) with its images; SRC may be the .lp file."""
+class ScanUnit(Choice):
+    """The unit of coordinates."""
+
+    M = "m"
+    CM = "cm"
+    MM = "mm"
+    UM = "um"
+    INCH = "in"
+
+
+class ScansImport(ImportRequest):
+    """PLY files of one object scanned from several places, whose scanner is found, or the frames of a depth camera, as a scan set."""
+
+    unit: ScanUnit = ScanUnit.M
+    """The unit of the coordinates."""
+    viewpoint_m: Annotated[tuple[Finite, Finite, Finite] | None, Commas, Spelling(flag="--viewpoint", metavar="X,Y,Z")] = None
+    """Where the scanner stood in the frame of every scan, metres; None: it is estimated."""
+    poses: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE.conf")] = None
+    """Poses of the scans, in the format of the Stanford 3D Scanning Repository; None: the only .conf file of SRC, if there is one."""
+    every: Count = 1
+    """Take the first of so many depth images."""
+    depth_unit_m: Positive = 0.001
+    """Metres in one unit of a depth image."""
 
 
 class OpencvGrayImport(ImportRequest):
@@ -80,7 +101,18 @@ class CameraOptions(LensOptions):
     estimates it; else it is 0 for an orthographic camera."""
 
 
-class ImageOptions(Options):
+class EncodingOptions(Options):
+    """The encoding of images."""
+
+    color_space: ColorSpaceName | None = None
+    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
+
+
+class LpImport(CameraOptions, EncodingOptions, ImportRequest):
+    """An RTI light list (.lp) with its images; SRC may be the .lp file."""
+
+
+class ImageOptions(EncodingOptions):
     """The images of the folder that are frames, and their encoding."""
 
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
@@ -89,8 +121,6 @@ class ImageOptions(Options):
     """Image of the mask; None: the one with the word mask in its name, if there is one."""
     ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
     """Image without any of the lights, which is subtracted; None: the one with the word ambient in its name, if there is one."""
-    color_space: ColorSpaceName | None = None
-    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
 
 
 class Sense(Choice):
@@ -159,7 +189,7 @@ class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
     """File with the matrix of the camera: K of a .mat file, or an OpenCV file (.yml, .xml, .json); None: as the other options say."""
 
 
-class RelightlabImport(ImportRequest):
+class RelightlabImport(EncodingOptions, ImportRequest):
     """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""
 
 

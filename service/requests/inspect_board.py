@@ -24,7 +24,7 @@ class InspectBoardOptions(Options):
     points of a tile."""
     placement_m: Positive | None = None
     """Standard deviation of the place of a board in its fixture along x and y, metres. None: 5 pixels."""
-    remove: BoardForm = BoardForm.PLANE
+    remove: BoardForm = BoardForm.QUADRATIC
     """The form of the board that is removed from the deviations before they are judged."""
     tolerance_m: NotNegative = 0.0
     """Deviation in metres up to which a place is no defect; in a region of the design, the wider of its limits counts if it is larger."""

@@ -11,7 +11,7 @@ from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
-from service.requests.drive import RIG, DriveOptions, RigDocument
+from service.requests.drive import RIG, ChartDocument, DriveOptions, RigDocument
 from service.requests.export import AssetFormat, ExportOptions
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light.light_keys import LightKeys
@@ -240,7 +240,8 @@ class GaugeBoardJob(JobRequest):
 
 
 class DriveJob(JobRequest):
-    """Levels at which the lamps of a rig light a subject as an environment would: cues.csv, cues.json, report.json, preview.png."""
+    """Levels at which the lamps of a rig light a subject as an environment would: cues.csv, cues.json, report.json, preview.png, and with a
+    capture predicted.####.exr."""
 
     kind: Literal["drive"]
     rig: Annotated[RigDocument, Role.INPUT, RIG]
@@ -249,6 +250,10 @@ class DriveJob(JobRequest):
     """Lat-long environment."""
     keys: Annotated[LightKeys | None, Role.INPUT, KEYS] = None
     """Light keys (JSON, schema relit.keys/1; docs/relight.md)."""
+    chart: Annotated[ChartDocument | None, Role.INPUT, Spelling(metavar="FILE")] = None
+    """Chart (JSON, schema relit.chart/1; docs/drive.md): what the camera sees of its patches under each primary."""
+    capture: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """A capture under single lights from where the lamps stand, which is shown at the levels of each frame."""
     options: DriveOptions = DriveOptions()
 
     @model_validator(mode="after")

@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.requests.base.base import Choice, Options, PixelOptions, Request, Role, Spelling
+from service.requests.base.base import Choice, Commas, Options, PixelOptions, Request, Role, Spelling
 from service.requests.drive import RIG
-from stage.model import Count, Finite, Line, NotNegativeCount, Positive
+from stage.model import Count, Finite, Line, NotNegative, NotNegativeCount, Positive
 
 
 class Protocol(Choice):
@@ -50,6 +50,27 @@ class PlayRequest(DrivenOptions):
     """The address of the network interface of this machine that sends; None: the system chooses."""
 
 
+class PictureFormat(Choice):
+    """The format of the pictures of the twin's camera."""
+
+    EXR = "exr", "scene-linear floating point"
+    PNG = "png", "8 bits, sRGB"
+
+
+class PictureFault(Choice):
+    """What goes wrong with a picture of the twin's camera."""
+
+    DEAD = "dead", "no lamp shines"
+    WRONG = "wrong", "the next lamp of the rig shines in place of each"
+    DOUBLED = "doubled", "the picture before comes again"
+    DROPPED = "dropped", "no picture comes"
+    LATE = "late", "the picture comes 2 s later"
+    MOVED = "moved", "everything is 3 pixels further right"
+    CLIPPED = "clipped", "the exposure is 16 times as long"
+    AMBIENT = "ambient", "light that is not the rig's is on"
+    FOCUS = "focus", "the picture is blurred"
+
+
 class TwinRequest(DrivenOptions, PixelOptions, Request):
     """A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."""
 
@@ -59,6 +80,8 @@ class TwinRequest(DrivenOptions, PixelOptions, Request):
     """Folder with a capture.json: images under single lights from where the lamps of the rig stand."""
     interface: Line = "127.0.0.1"
     """The address of this machine to listen on; 0.0.0.0: all of them, and multicast."""
+    play: Annotated[Path | None, Role.INPUT, Spelling(metavar="CUES")] = None
+    """Send these cues (cues.json or its folder) to the twin, over and over, as `relit play --loop` in another terminal does."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8571
     """The port of the page on this machine; 0: any free one."""
     exposure: Finite = 0.0
@@ -68,6 +91,16 @@ class TwinRequest(DrivenOptions, PixelOptions, Request):
     then."""
     record: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE.csv")] = None
     """Write the levels of all frames that are received, a line for each."""
+    pictures: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FOLDER")] = None
+    """Be a camera too: write a picture into this folder at each POST to /release of the page, which may have ?exposure_s=."""
+    picture_format: PictureFormat = PictureFormat.EXR
+    """The format of these pictures."""
+    noise: NotNegative = 0.0
+    """The noise of these pictures: its standard deviation at half of full scale."""
+    faults: Annotated[tuple[Line, ...], Commas, Spelling(metavar="KIND@N,…")] = ()
+    """What goes wrong at which release, counted from 1: dead@17, or ambient@17- from release 17 on."""
+    seed: NotNegativeCount = 0
+    """The seed of the noise."""
     frames: Count | None = None
     """End when so many whole frames have been received."""
     after: Positive | None = None

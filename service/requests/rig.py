@@ -7,6 +7,7 @@ from pydantic import Field
 
 from service.requests.base.base import CAPTURE, Choice, Commas, Options, Role, Spelling
 from service.requests.drive import RIG
+from service.requests.light.picture_options import FrameRate
 from service.requests.play import Protocol
 from stage.model import Count, Finite, FirstFault, Line, NotNegativeCount, Positive
 
@@ -79,6 +80,21 @@ class RigFromMvrRequest(Options):
     """The number that the protocol gives to universe 1 of the scene; the others follow it."""
     irradiance: Positive = 1.0
     """The luminance of the irradiance of every lamp at the subject with all its primaries at full level; a scene has none."""
+
+
+class RigSweepRequest(Options):
+    """Cues that light one primary after another at several levels, for `relit play` while a camera takes an image of each."""
+
+    rig: Annotated[Path, Role.INPUT, RIG]
+    """The rig (JSON, schema relit.rig/1); docs/drive.md."""
+    out: Annotated[Path, Role.OUTPUT]
+    """Folder of the results: cues.json, and cues.csv for `relit calibrate rig`."""
+    levels: Annotated[int, Field(ge=1, le=256)] = 5
+    """Even drives of each primary, the last at full; 1: full level alone, which measures no response."""
+    lights: Annotated[tuple[Line, ...], Spelling(flag="--light", metavar="NAME")] = ()
+    """A lamp to light; may be given several times. None: all."""
+    frames_per_second: FrameRate = 0.5
+    """Frames per second."""
 
 
 class RigPlanRequest(Options):

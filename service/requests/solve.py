@@ -17,6 +17,10 @@ MAX_SIGMA = 30.0
 little more than that the surface faces the camera."""
 
 
+BRIGHT_ALBEDO, ALBEDO_PERCENTILE = 0.8, 99.0
+"""The albedo, that of white paint, which bright pixels of a capture of relative lights are given, and the percentile that is bright."""
+
+
 class Method(Choice):
     """The method that solves normals."""
 
@@ -42,6 +46,13 @@ class LightsKnown(Choice):
     UNKNOWN = "unknown", "distant lights that are found from the images; those of the manifest are placeholders"
 
 
+class Materials(Choice):
+    """The roughness and F0 of each pixel of the maps."""
+
+    COHERENT = "coherent", "by its own evidence and that of neighbours of its colour: borders stay where there is evidence, speckle goes"
+    EACH_PIXEL = "each-pixel", "what its own readings say"
+
+
 class SolveOptions(StackOptions):
     """Options for solving normals, albedo and height."""
 
@@ -52,9 +63,15 @@ class SolveOptions(StackOptions):
     """How far the lights of the manifest are trusted."""
     intensities: Intensities = Intensities.CHOSEN
     """The intensities of distant lights that are used; the report says what was found."""
+    materials: Materials = Materials.COHERENT
+    """How roughness and F0 of a pixel are chosen."""
     max_sigma: Positive | None = Field(default=None, description=(
         "Largest standard error, in degrees, of a normal that counts as solved; less certain ones are kept outside the mask, with the "
         f"status unsure. None: {MAX_SIGMA:g}; 180 refuses none."))
+    albedo_scale: Positive | None = Field(default=None, description=(
+        "Factor of the albedo over that under the lights of the manifest, for captures whose irradiance_scale is relative: 1 keeps it, the "
+        "factor of another report makes both alike. None: the one under which percentile "
+        f"{ALBEDO_PERCENTILE:g} of the albedo is {BRIGHT_ALBEDO:g}; a sequence has that of its first step. The report records it."))
     least_confidence: Fraction | None = None
     """Least confidence, 0 to 1, of a normal that counts as solved; less certain ones are kept outside the mask, with the status unsure.
     None: any."""

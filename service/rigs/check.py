@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.relight.model.beyond import reach
-from service.relight.sheet import BACKGROUND, display, write_sheet
+from service.relight.sheet import BACKGROUND, display, dome_places, write_sheet
 from service.requests.rig import RigCheckRequest
-from stage.rig.patch import Universe, patch_faults, slot
+from stage.rig.patch import Universe, fixed_channels, patch_faults, slot
 from stage.rig.rig import Rig, read_rig
 from stage.transforms import fibonacci_sphere
 
@@ -44,10 +44,11 @@ def check_rig(request: RigCheckRequest) -> RigCheck:
         StorageError: the rig cannot be read or the picture not be written.
     """
     rig = read_rig(request.rig)
-    channels: Counter[Universe] = Counter()
+    used: set[tuple[Universe, int]] = {(universe, each.channel) for lamp in rig.lights for universe, each in fixed_channels(lamp)}
     for index, primary in rig.emitters:
         if (place := slot(rig.lights[index], primary)) is not None:
-            channels[place.universe] += place.bits // 8
+            used |= {(place.universe, place.channel + byte) for byte in range(place.bits // 8)}
+    channels = Counter(universe for universe, _ in sorted(used, key=lambda each: (each[0].protocol, each[0].number)))
     nearest = np.arccos(np.clip((fibonacci_sphere(PROBES) @ rig.directions.T).max(axis=1), -1, 1))
     uncovered = float((nearest > 2 * reach(rig.directions)).mean())
     warnings = []
@@ -68,11 +69,10 @@ def _draw(rig: Rig, path: Path) -> None:
     tiles = []
     for name, sign in (("front", 1.0), ("back, seen from the front", -1.0)):
         picture = np.tile(BACKGROUND, (SIDE, SIDE, 1))
-        for direction, shown in zip(rig.directions, colour, strict=True):
-            if sign * direction[2] < 0:
-                continue
-            polar = np.arccos(np.clip(sign * direction[2], -1, 1)) / (np.pi / 2)  # equal angles are equal distances
-            side = polar * direction[:2] / max(np.hypot(*direction[:2]), 1e-12) * (SIDE / 2 - 2 * LAMP)
-            picture[np.hypot(across - SIDE / 2 - side[0], down - SIDE / 2 + side[1]) <= LAMP] = shown
+        turned = rig.directions * [1.0, 1.0, sign]
+        places = dome_places(turned, side=SIDE, reach=SIDE / 2 - 2 * LAMP, widest_degrees=90.0)
+        for (row, column), shown, z in zip(places, colour, turned[:, 2], strict=True):
+            if z >= 0:
+                picture[np.hypot(across - column, down - row) <= LAMP] = shown
         tiles.append((f"{rig.name}: {name}", picture))
     write_sheet(path, [tiles], height=SIDE)

@@ -1,6 +1,6 @@
 """Make a rig of the lamps that lit a capture, or of a table of lamps."""
 
-import csv
+
 from itertools import repeat
 from pathlib import Path
 
@@ -9,13 +9,13 @@ import numpy as np
 from service.errors import RequestError
 from service.requests.rig import Primaries, RigFromCaptureRequest, RigFromCsvRequest
 from service.rigs.lamps import addresses, checked
-from stage import inputs
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.lighting import lights_from_centre
 from stage.capture.point_lights import place_lights
 from stage.colour.colour_spaces import linear_space
 from stage.errors import ManifestError
+from stage.formats.csv_table import read_table
 from stage.rig.rig import RIG_SCHEMA, Lamp, Primary, Rig, write_rig
 
 RGB = ("red", "green", "blue")
@@ -73,19 +73,11 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
     unknown = [name for name in request.primaries if name not in COLOURS]
     if unknown or len(set(request.primaries)) < len(request.primaries):
         raise RequestError(f"--primaries {','.join(request.primaries)}: give different ones of {', '.join(COLOURS)}")
-    try:
-        text = inputs.read_bytes(request.table).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ManifestError(f"{request.table}: is not UTF-8 text") from error
-    rows = csv.DictReader(text.splitlines())
-    heads = [head.strip().lower() for head in rows.fieldnames or ()]
-    for column in ("name", "x", "y", "z"):
-        if column not in heads:
-            raise ManifestError(f"{request.table}: has no column {column}: its first line names the columns name, x, y, z")
+    rows = read_table(request.table, ("name", "x", "y", "z"))
+    heads = rows.fieldnames or ()
     if ("universe" in heads) != ("channel" in heads):
         raise ManifestError(f"{request.table}: has one of the columns universe and channel: give both or neither")
     patched = "universe" in heads
-    rows.fieldnames = heads
     patch = repeat(None) if patched else addresses(request, request.primaries)
     lamps = []
     for row, address in zip(rows, patch, strict=False):

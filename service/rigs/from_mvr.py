@@ -44,7 +44,7 @@ def rig_from_mvr(request: RigFromMvrRequest) -> MadeRig:
     scene = read_scene(inputs.read_bytes(request.scene), str(request.scene))
     if not scene.fixtures:
         raise ManifestError(f"{request.scene}: has no fixtures")
-    warnings = ["the irradiances are nominal, a scene has none: measure those of your lamps, and write them into the rig"]
+    warnings = ["the irradiances are nominal, a scene has none: measure those of your lamps (relit calibrate rig)"]
     modes: dict[tuple[str | None, str | None], Mode] = {}
     lamps: list[Lamp] = []
     names = _names([(fixture.name, fixture.identity) for fixture in scene.fixtures])
@@ -86,6 +86,9 @@ def _lamp(request: RigFromMvrRequest, fixture: "Fixture", cell: "Cell", name: st
                                  for emitter in cell.emitters if emitter.dmx_break in fixture.addresses}, where)
     if address is None:
         missing.append(f"{where}: has no address")
+    else:
+        address["fixed"], elsewhere = _fixed(fixture, cell, address["universe"] - request.universe)
+        missing += [f"{where}: its {name} lies in another universe than its primaries, and is not driven" for name in elsewhere]
     place = fixture.scene_from_fixture @ (*cell.place_mm, 1.0)
     primaries = [{"name": emitter.name, "irradiance": tuple((request.irradiance * emitter.irradiance).tolist())}
                  for emitter in cell.emitters]
@@ -115,6 +118,20 @@ def _address(request: RigFromMvrRequest, channels: dict[str, int], where: str) -
                             "patch it within one")
     return {"protocol": request.protocol.value, "universe": request.universe + universes[0],
             "channels": {name: channel % CHANNELS + 1 for name, channel in channels.items()}}
+
+
+def _fixed(fixture: "Fixture", cell: "Cell", universe: int) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the channels of a lamp that keep one value, and the names of those outside of a universe of the scene, from 0."""
+    found, elsewhere = [], []
+    for held in cell.fixed:
+        first = fixture.addresses.get(held.dmx_break)
+        for offset, value in zip(held.offsets, held.values, strict=False):
+            number, channel = divmod(-CHANNELS if first is None else first + offset, CHANNELS)
+            if number == universe:
+                found.append({"name": held.name, "channel": channel + 1, "value": value})
+            elif held.name not in elsewhere:
+                elsewhere.append(held.name)
+    return found, elsewhere
 
 
 def _names(given: list[tuple[str, str]]) -> list[str]:

@@ -43,6 +43,17 @@ class Emitter(NamedTuple):
     """[3] linear Rec.709; those of a lamp have the luminance 1 together."""
 
 
+class Fixed(NamedTuple):
+    """A channel that drives no primary, and keeps one value."""
+
+    name: str
+    """Its attribute."""
+    dmx_break: int
+    offsets: tuple[int, ...]
+    values: tuple[int, ...]
+    """The value of each byte, coarse first."""
+
+
 class Cell(NamedTuple):
     """One lamp of a fixture: its only one, or a pixel of a bar."""
 
@@ -51,6 +62,8 @@ class Cell(NamedTuple):
     place_mm: np.ndarray
     """[3], in the frame of the fixture."""
     emitters: tuple[Emitter, ...]
+    fixed: tuple[Fixed, ...]
+    """Its own other channels, and those of no pixel."""
 
 
 class Channel(NamedTuple):
@@ -65,6 +78,8 @@ class Channel(NamedTuple):
     offsets: tuple[int, ...]
     emitter: Any
     """The emitter of pygdtf that it drives, or None."""
+    values: tuple[int, ...]
+    """The value of each byte at which the lamp shines, where it drives no primary."""
 
 
 class Mode(NamedTuple):
@@ -116,14 +131,16 @@ def _mode(fixture: Any, mode: Any, where: str) -> Mode:
     if not lights:
         return Mode([], [f"{where}: has no emitters that Relit can drive, and is left out"])
     warnings = []
-    others = sorted({channel.attribute for channel in channels} - {channel.attribute for channel in lights} - {"NoFeature", "None"})
+    driven = {channel.attribute for channel in lights}
+    others = [channel for channel in channels if channel.attribute not in driven | {"NoFeature", "None"}]
     if others:
-        dark = " (while its Dimmer is at 0 it is dark)" if "Dimmer" in others else ""
-        warnings.append(f"{where}: {', '.join(others)}: these channels are not driven, relit play sends 0 to them{dark}: choose a mode "
-                        "without them, or set them at the fixture")
+        held = {channel.attribute: " ".join(map(str, channel.values)) for channel in others}
+        warnings.append(f"{where}: {', '.join(f'{name} {values}' for name, values in sorted(held.items()))}: these channels keep the "
+                        "values: check that the lamp is fully lit and still under them")
     pixels = max(Counter(channel.attribute for channel in lights).values()) > 1
     cells = []
-    for part in dict.fromkeys(channel.part if pixels else "" for channel in lights):
+    parts = dict.fromkeys(channel.part if pixels else "" for channel in lights)
+    for part in parts:
         members = [channel for channel in lights if not pixels or channel.part == part]
         names = [NAMES.get(channel.attribute, "white") for channel in members]
         if len(set(names)) < len(names):
@@ -134,7 +151,9 @@ def _mode(fixture: Any, mode: Any, where: str) -> Mode:
             warnings.append(f"{where}: {', '.join(outside)}: the colour lies outside of Rec.709, and what was negative is 0")
         cells.append(Cell(part, members[0].place_mm, tuple(
             Emitter(name, channel.dmx_break, channel.offsets, light)
-            for name, channel, light in zip(names, members, irradiance, strict=True))))
+            for name, channel, light in zip(names, members, irradiance, strict=True)), tuple(
+            Fixed(channel.attribute, channel.dmx_break, channel.offsets, channel.values)
+            for channel in others if channel.part == part or channel.part not in parts)))
     return Mode(cells, list(dict.fromkeys(warnings)))
 
 
@@ -160,7 +179,7 @@ def _channels(fixture: Any, mode: Any) -> list[Channel]:
             dmx_break = channel.dmx_break if given is None else given.dmx_break
             found.append(Channel(str(channel.attribute), part or shape.name, 1000 * fixture_from_geometry[:3, 3],
                                  1 if dmx_break == "Overwrite" else dmx_break, tuple(first + offset - 1 for offset in channel.offset),
-                                 _emitter(fixture, channel)))
+                                 _emitter(fixture, channel), _lit_values(channel)))
         for child in getattr(shape, "geometries", ()):
             visit(child, fixture_from_geometry, part, breaks)
 
@@ -199,3 +218,21 @@ def _emitter(fixture: Any, channel: Any) -> Any:
     named = {str(function.emitter) for logical in channel.logical_channels for function in logical.channel_functions
              if function.emitter is not None}
     return next((emitter for emitter in fixture.emitters if emitter.name in named), None)
+
+
+def _lit_values(channel: Any) -> tuple[int, ...]:
+    """Return the value of each byte of a channel at which the lamp shines, if the channel drives no primary.
+
+    A dimmer is at full, an emitter that is no primary at 0; others have the value that the file gives for shining at full (Highlight), else
+    that of a fixture that nobody touches (the default of its first function). A value of fewer bytes than the channel is repeated (GDTF,
+    DMXValue).
+    """
+    bytes_needed, attribute = len(channel.offset), str(channel.attribute)
+    if attribute == "Dimmer" or attribute.startswith("ColorAdd_"):
+        return (255 if attribute == "Dimmer" else 0,) * bytes_needed
+    functions = channel.logical_channels[0].channel_functions
+    given = channel.highlight or channel.default
+    if channel.highlight is None and channel.initial_function is None and not channel.default.value and functions:
+        given = functions[0].default
+    parts = given.get_value(components=True) if given.byte_count > 1 else [given.value & 255]
+    return tuple((parts * bytes_needed)[:bytes_needed])

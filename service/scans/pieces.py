@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from service.solve.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
-from service.solve.sharing.sharing import digest
+from service.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
+from service.sharing.sharing import digest
 from stage.errors import storage
 from stage.files import replacing
 from stage.results.depth_maps import DEPTH_FILE
@@ -33,7 +33,7 @@ class FolderPieces:
     """Pieces as files of a folder, which one process makes."""
 
     def __init__(self, folder: Path) -> None:
-        """Args: folder: need not exist."""
+        """Keep the pieces in a folder, which need not exist."""
         self._folder = folder
 
     def read(self, name: str) -> bytes | None:

@@ -157,7 +157,16 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
                         table=table if request.turntable is TableUse.ANGLES else None,
                         targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
     return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, registration_facts(found, known),
-                   missed + registration_warnings(found, known))
+                   missed + _without_viewpoint(listed, known) + registration_warnings(found, known))
+
+
+def _without_viewpoint(listed: ScanSet, known: list[ScanFacts]) -> list[str]:
+    """Return a warning if the origin is taken for the scanner and lies among the points."""
+    inside = [scan.name for entry, scan in zip(listed.scans, known, strict=True)
+              if entry.viewpoint_m is None and float(np.linalg.norm(scan.middle)) < scan.extent_m / 2]
+    return [] if not inside else [
+        f"{', '.join(inside)}: viewpoint_m is missing, and the origin, which is taken for the scanner, lies among the points: normals may "
+        "look the wrong way; relit import scans estimates where the scanner stood"]
 
 
 def _missed(request: RegisterRequest, scans: Sequence[ScanFacts]) -> list[str]:

@@ -29,7 +29,7 @@ class StepProgress:
     """The progress of one step, whose stages are named after it."""
 
     def __init__(self, inner: Progress | None, number: int, count: int) -> None:
-        """Args: inner: is told; number: of the step, from 1; count: of all steps."""
+        """Tell `inner` of the step with this number, from 1, of `count` steps."""
         self._inner, self._place = inner, f"{number}/{count}"
 
     def stage(self, name: str, total: int) -> None:

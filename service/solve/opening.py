@@ -6,11 +6,12 @@ from kernels import device as devices
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.solve import SVBRDF_LIGHTS, Intensities, LightsKnown, Method, SolveRequest
+from service.sharing.sharing import SharedSolve
+from service.solve.albedo_scale import check_request, moderate
 from service.solve.base.solution import SolveInput
 from service.solve.height.distance import Distance, find_distance
 from service.solve.lights.intensities import LightsOverTime, choose_intensities
 from service.solve.methods.methods import METHODS, Solver
-from service.solve.sharing.sharing import SharedSolve
 from stage.capture.capture import Capture
 from stage.capture.lighting import check_surface, distant_lights
 from stage.capture.manifest import FILE_NAME
@@ -40,6 +41,8 @@ class Opened(NamedTuple):
     """Facts about the lights for the report."""
     found: "UnknownLights | RefinedLights | None" = None
     """The way in which the lights were found, where they are those of the images."""
+    brighter: float = 1.0
+    """The factor by which the lights of the solve are brighter than those of the manifest, whose common factor is not known."""
     distance: Distance | None = None
     """The way in which the distance of the surface was found, where the manifest does not say it."""
 
@@ -91,16 +94,20 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
     given = SolveInput(stack, capture.camera, mask, chosen, timings, request.cache, sharing=sharing,
                        relative=unknown or capture.manifest.irradiance_scale == "relative",
                        refine_intensities=request.intensities is Intensities.CHOSEN, pairs=pairs)
+    check_request(request, capture, relative=given.relative)
+    brighter = 1.0
+    if isinstance(lights, DistantLights | PlacedLights) and not unknown:
+        lights, brighter = moderate(given, lights, capture)
     if request.lights is not LightsKnown.DECLARED:
         timings.stage("lights", 1)
         found = _find_lights(request.lights, given, lights, capture)
-        return Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, distance)
+        return Opened(capture, method, found.lights, found.lights, solver, given, found.facts, found, brighter, distance)
     used: Any = lights
     facts: dict[str, Any] = {}
     if isinstance(lights, DistantLights) and given.refine_intensities:
         timings.stage("intensities", 1)
         used, facts = choose_intensities(given, lights) if over_time is None else over_time.choose(given, lights)
-    return Opened(capture, method, used, lights, solver, given, facts, distance=distance)
+    return Opened(capture, method, used, lights, solver, given, facts, brighter=brighter, distance=distance)
 
 
 def _default_method(capture: Capture, *, unknown: bool) -> Method:

@@ -11,23 +11,30 @@ from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.surface.integrate import Integration
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import HASHING, REPORT_FILE, metadata, report
-from service.requests.solve import MAX_SIGMA, Method, SolveRequest
-from service.solve.base.solution import Solution, SolveInput, SuspectLight, mark_not_facing, refine_status
+from service.requests.solve import MAX_SIGMA, Materials, Method, SolveRequest
+from service.sharing.sharing import SharedSolve
+from service.solve.albedo_scale import scale_albedo
+from service.solve.base.solution import Solution, SolveInput, SuspectLight, mark_not_facing, raise_error, refine_status
+from service.solve.coherent_materials import agree_on_materials
 from service.solve.height import integrability
 from service.solve.height.height import guessed_part, height_warnings, integrate
 from service.solve.height.parts import Placement, numbered, place_solution
-from service.solve.lights.diagnosis import diagnose, raise_error
+from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
-from service.solve.sharing.sharing import SharedSolve
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour_spaces import linear_space
 from stage.colour.radiance import clipping_sentences
 from stage.files import write_text
-from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.results.maps import ALBEDO_SCALE, MAPS_FILE, SurfaceMaps
 from stage.stack.ingest import LAYOUT
+
+MANY_AMBIGUOUS = 0.25
+"""Part of the solved pixels with an ambiguous normal from which it is said."""
+MANY_ABOVE_ONE = 0.01
+"""Part of the solved pixels with an albedo above 1 from which it is said: noise and highlights reach that at less."""
 
 
 class SolveResult(NamedTuple):
@@ -59,7 +66,8 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
     """
     opened = open_solve(request, capture, Timings(progress), sharing, over_time)
     judged = _judge(request, opened, opened.solver(opened.given, opened.lights))
-    return _write(request, opened, judged)
+    scale = scale_albedo(judged.solution, request, opened.brighter, over_time) if opened.given.relative else 1.0
+    return _write(request, opened, judged, scale)
 
 
 def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: LightsOverTime | None = None) -> None:
@@ -96,6 +104,10 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         _say_of_pairs(given, opened.method, solution)
     given.timings.stage("diagnosis", 1)
     diagnose(given, opened.capture, opened.lights, opened.declared, solution)
+    if "left_out_misfit" in solution.facts:
+        from service.solve.methods.support import raise_undescribed
+
+        raise_undescribed(solution)
     if opened.found is not None:
         solution.warnings += opened.found.warnings
         raise_error(solution, opened.found.doubt(solution.normal))
@@ -104,7 +116,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         solution.warnings.append(opened.distance.warning)
         raise_error(solution, opened.distance.normal_degrees)
     estimated = np.isin(solution.status, ESTIMATED).reshape(shape)
-    sigma = solution.standard_error() if solution.sigma is None else solution.sigma  # as half: an image has tens of millions of pixels
+    sigma = solution.sigma  # as half: an image has tens of millions of pixels
     if solution.integration is None:  # near lights have found the height with the normals
         solution.integration = integrate(given, solution.normal, estimated, sigma=sigma)
         solution.height = None if solution.integration is None else solution.integration.height.numpy()
@@ -114,27 +126,38 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
         solution.warnings += placement.warnings()
     if solution.judged_by_surface and solution.height is not None:
         normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
-        factor = integrability.doubt(sigma.astype(np.float32).reshape(shape), normal, solution.height, estimated, opened.capture.camera)
-        solution.confidence = (solution.confidence * factor.reshape(-1)).astype(np.float16)
+        raise_error(solution, integrability.doubt(normal, solution.height, estimated, opened.capture.camera).reshape(-1))
+    if request.materials is Materials.COHERENT:
+        agree_on_materials(solution, sigma, shape)
     refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)
     return _Judged(solution, placement, estimated, guessed_part(sigma, estimated))
 
 
-def _write(request: SolveRequest, opened: Opened, judged: _Judged) -> SolveResult:
-    """Write the maps and the report of a solution."""
+def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale: float) -> SolveResult:
+    """Write the maps and the report of a solution, whose albedo is scaled already."""
     capture, method, given, solution = opened.capture, opened.method, opened.given, judged.solution
     stack, mask, timings = given.stack, given.mask, given.timings
     status = solution.status.reshape(mask.shape)
     solved = np.isin(status, SOLVED)
     counts = {s.name.lower(): int(np.count_nonzero(status[mask] == s)) for s in Status}
+    above = 0 if solution.albedo is None else int((solution.albedo.reshape(3, *mask.shape)[:, solved] > 1).any(axis=0).sum())
+    if above > MANY_ABOVE_ONE * solved.sum() and method is not Method.REFERENCE:
+        solution.warnings.append(_above_one(above / solved.sum(), capture))
     if not solved.any():
         solution.warnings.append(_nothing_solved(counts))
-    solution.warnings += height_warnings(judged.guessed, method)
+    elif not counts[Status.OK.name.lower()]:
+        solution.warnings.append("no normal is sure to five degrees: all that are solved are ambiguous or not_converged, and the layer "
+                                 "sigma says how far each is off")
+    elif (share := counts[Status.AMBIGUOUS.name.lower()] / solved.sum()) > MANY_AMBIGUOUS:
+        solution.warnings.append(f"{100 * share:.0f} % of the solved normals are ambiguous, with a standard error above five degrees: the "
+                                 "layer sigma says how far each is off")
+    solution.warnings += height_warnings(judged.guessed, method, mask)
     outdated = devices.outdated_driver() if request.device is None else None
     solution.warnings += [outdated] if outdated else []
     solution.warnings += [*capture.doubts, *clipping_sentences(capture.clipped)]
     sources = metadata(request, method=method, capture=capture.name, inputs=stack.key, contents=solution.contents) | {HASHING: str(LAYOUT)}
+    sources |= {ALBEDO_SCALE: f"{albedo_scale:g}"} if albedo_scale != 1 else {}
     maps = _maps(solution, solved, judged.estimated, method, capture, sources)
     timings.stage("write", 1)
     maps_path, report_path = request.out / MAPS_FILE, request.out / REPORT_FILE
@@ -152,7 +175,7 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged) -> SolveResul
         timings_s=timings.close(),
         pixels={"mask": int(mask.sum()), **counts},
         residual={**_residual_statistics(solution.residual.reshape(mask.shape)[solved]), "meaning": METHODS[method].residual},
-        albedo_above_one=int((maps.diffuse_albedo[solved] > 1).any(axis=-1).sum()) if maps.diffuse_albedo is not None else 0,
+        albedo_above_one=above,
         height=_height_report(solution.integration, judged.guessed, capture),
         **({} if judged.placement is None else {"parts": [part.facts() for part in judged.placement.parts]}),
         **({} if stack.motion is None else {"motion": stack.motion}),
@@ -224,6 +247,14 @@ def _nothing_solved(counts: Mapping[str, int]) -> str:
     keep = ("; --max-sigma 180 keeps unsure normals" if common == Status.UNSURE.name.lower() else
             "; check the lights, the exposure and the mask")
     return f"no pixel is solved: {share:.0f} % of the mask have the status {common}, and the layer status says why for every pixel{keep}"
+
+
+def _above_one(part: float, capture: Capture) -> str:
+    """Return the sentence for an object that returns more light than arrives."""
+    relative = capture.manifest.irradiance_scale == "relative"
+    return (f"diffuse_albedo: is above 1 at {100 * part:.0f} % of the solved pixels, which no texture holds: " + (
+        "leave --albedo-scale out, or give a smaller one" if relative else
+        "frames[].light are too weak by a factor; declare irradiance_scale relative if it is not known"))
 
 
 def _residual_statistics(residual: np.ndarray) -> dict[str, float]:

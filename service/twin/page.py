@@ -4,15 +4,17 @@ import socket
 import tempfile
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import uvicorn
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Query, Response
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 
+from service.twin.camera import TwinCamera
 from service.twin.listener import Listener
+from service.twin.local_page import HEADERS
 from service.twin.picture import TwinPicture
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import Rig
@@ -22,18 +24,17 @@ STATIC, PAGE = SERVICE / "server" / "pages" / "static", SERVICE / "twin" / "stat
 """The style and the modules of the service's pages, and the page of the twin."""
 PICTURE_ROWS = 480
 """The most rows of the picture on the page, of which a browser draws several a second."""
-HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
-           "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"}
 
 
-def serve_page(listening: socket.socket, rig: Rig, listener: Listener, picture: TwinPicture) -> None:
+def serve_page(listening: socket.socket, rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCamera | None) -> None:
     """Serve the page on a socket until the program is interrupted."""
-    config = uvicorn.Config(make_app(rig, listener, picture), ws="none", log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    app = make_app(rig, listener, picture, camera)
+    config = uvicorn.Config(app, ws="none", log_level="warning", access_log=False, timeout_graceful_shutdown=1)
     uvicorn.Server(config).run(sockets=[listening])
 
 
-def make_app(rig: Rig, listener: Listener, picture: TwinPicture) -> FastAPI:
-    """Return the app of the page."""
+def make_app(rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCamera | None = None) -> FastAPI:
+    """Return the app of the page; with a camera, a POST to /release takes a picture."""
     app = FastAPI(title="Relit twin", docs_url=None, redoc_url=None, openapi_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
     lamps = np.array([index for index, _ in rig.emitters])
@@ -70,5 +71,11 @@ def make_app(rig: Rig, listener: Listener, picture: TwinPicture) -> FastAPI:
             path = Path(folder) / "picture.png"
             picture.write(path, levels, most_rows=PICTURE_ROWS)
             return Response(path.read_bytes(), media_type="image/png", headers=HEADERS)
+
+    if camera is not None:
+        @app.post("/release")
+        def release(exposure_s: Annotated[float | None, Query(gt=0, allow_inf_nan=False)] = None) -> dict[str, int]:
+            camera.release(exposure_s)
+            return {"released": camera.released}
 
     return app

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from kernels import device as devices
+from kernels.images import ImagesOnDevice
 from service.relight.combine import linear_frames
 from service.relight.sheet import display, fit
 from service.relight.weights.weighting import light_weights
@@ -36,20 +37,21 @@ class TwinPicture:
             StageError: bad input; names file and field.
         """
         timings.stage("open", 1)
-        self._device = devices.resolve(request.device)
+        device = devices.resolve(request.device)
         capture = Capture.open(request.capture, request.pixels)
         lights = lights_from_centre(capture)
         timings.stage("ingest", len(capture.sources()))
-        self._stack = merge_brackets(open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done)),
-                                     capture.sources(), lights)
+        stack = merge_brackets(open_stack(capture, cache=request.cache, progress=lambda done, _: timings.advance(done)),
+                               capture.sources(), lights)
+        self._images = ImagesOnDevice(stack, device)
         self._size = capture.camera.height, capture.camera.width
-        self._space = linear_space(capture.manifest.color_space)
+        self.space = linear_space(capture.manifest.color_space)
         self._gain = np.float32(2.0**request.exposure)
         self._captured = lights.irradiance
         lamps = np.array([index for index, _ in rig.emitters])
         cosine = rig.directions @ lights.direction.T
         self._light = cosine.argmax(axis=1)[lamps]  # [emitters] the captured light that stands nearest
-        self._irradiance = np.array([primary.irradiance for _, primary in rig.emitters]) @ rgb_matrix(rig.color_space, self._space).T
+        self._irradiance = np.array([primary.irradiance for _, primary in rig.emitters]) @ rgb_matrix(rig.color_space, self.space).T
         degrees = np.degrees(np.arccos(np.clip(cosine.max(axis=1), -1, 1)))
         self.warnings = listed((f"the lamp {rig.lights[index].name} stands {degrees[index]:.3g}° from the nearest captured light, whose "
                                 "image stands for it" for index in np.flatnonzero(degrees > FAR_DEGREES)), "further lamps stand so far too")
@@ -58,8 +60,8 @@ class TwinPicture:
         """Return the picture at levels [emitters], [rows, cols, 3] float32, in the scene-linear space of the capture."""
         energy = np.zeros((1, *self._captured.shape))
         np.add.at(energy[0], self._light, levels[:, None] * self._irradiance)
-        weights = light_weights(energy, self._captured, self._stack.scale)
-        frame = linear_frames(self._stack, weights, None, device=self._device)[0]
+        weights = light_weights(energy, self._captured, self._images.stack.scale)
+        frame = linear_frames(self._images, weights, None)[0]
         return np.ascontiguousarray(frame.T).reshape(*self._size, 3)
 
     def write(self, path: Path, levels: np.ndarray, *, most_rows: int | None = None) -> None:
@@ -73,10 +75,10 @@ class TwinPicture:
         """
         radiance = self.radiance(levels)
         if path.suffix.lower() == ".exr":
-            exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self._space, metadata={})
+            exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self.space, metadata={})
             return
         radiance = fit(radiance, min(len(radiance), most_rows or len(radiance)), kernel="triangle")
-        shown = display(radiance * self._gain, self._space)
+        shown = display(radiance * self._gain, self.space)
         shown[~radiance.any(axis=-1)] = 0.0  # and not the background of a sheet
         with replacing(path, flush=False) as temporary:
             write_png(temporary, np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8), srgb=True)

@@ -2,25 +2,32 @@
 
 import csv
 import io
-import socket
+import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from service.errors import RequestError
 from service.play.addresses import driven_universes, with_protocol
+from service.play.play import Prepared, prepare, run
 from service.reporting.progress import Progress, Timings
-from service.requests.play import TwinRequest
+from service.requests.play import PlayRequest, TwinRequest
+from service.twin.camera import TwinCamera, fault_spans
 from service.twin.fixtures import UniverseId
-from service.twin.listener import Listener
+from service.twin.listener import ANY, Listener
+from service.twin.local_page import page_address, page_socket
 from service.twin.page import serve_page
 from service.twin.picture import TwinPicture
+from stage.errors import storage
 from stage.files import write_text
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import Rig, read_rig
 
 PICTURES = (".exr", ".png")
+LOOPBACK = "127.0.0.1"
 
 
 class TwinResult(NamedTuple):
@@ -38,6 +45,8 @@ class Twin(NamedTuple):
     rig: Rig
     universes: Collection[UniverseId]
     picture: TwinPicture
+    player: Prepared | None
+    """The cues that are sent to it from here."""
 
 
 def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
@@ -49,8 +58,16 @@ def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
     """
     if request.snapshot is not None and request.snapshot.suffix.lower() not in PICTURES:
         raise RequestError(f"--snapshot {request.snapshot}: end the name in {' or '.join(PICTURES)}")
+    if request.pictures is not None and (request.snapshot or request.frames or request.after):
+        raise RequestError("--pictures needs the page: leave out --snapshot, --frames and --after")
+    fault_spans(request.faults)
     rig = with_protocol(read_rig(request.rig), request.protocol)
-    return Twin(rig, driven_universes(request.rig, rig).keys(), TwinPicture(rig, request, Timings(progress)))
+    universes = driven_universes(request.rig, rig).keys()
+    player = None
+    if request.play is not None:
+        host = LOOPBACK if request.interface == ANY else request.interface
+        player = prepare(PlayRequest(cues=request.play, rig=request.rig, protocol=request.protocol, loop=True, host=host))
+    return Twin(rig, universes, TwinPicture(rig, request, Timings(progress)), player)
 
 
 def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None], None]) -> TwinResult:
@@ -63,17 +80,22 @@ def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None],
         RequestError: a port is in use, or no frame came.
         StorageError: a file cannot be written.
     """
-    rig, universes, picture = twin
+    rig, universes, picture, player = twin
+    if request.pictures is not None:
+        with storage("write", request.pictures):
+            request.pictures.mkdir(parents=True, exist_ok=True)
     ends = request.frames is not None or request.after is not None or request.snapshot is not None
     most = 1 if ends and request.after is None and request.frames is None else request.frames
     with Listener(universes, request.interface, keep=request.record is not None, most=most) as listener:
-        page = None if ends else _page_socket(request.port)
-        listening(None if page is None else "http://{}:{}".format(*page.getsockname()))
+        page = None if ends else page_socket(request.port, "--port")
+        listening(None if page is None else page_address(page))
         try:
-            if page is not None:
-                serve_page(page, rig, listener, picture)
-            else:
-                listener.wait(most, None if request.after is None else time.monotonic() + request.after)
+            with _playing(player):
+                if page is not None:
+                    camera = None if request.pictures is None else TwinCamera(rig, picture, listener, request.pictures, request)
+                    serve_page(page, rig, listener, picture, camera)
+                else:
+                    listener.wait(most, None if request.after is None else time.monotonic() + request.after)
         except KeyboardInterrupt:
             pass  # which ends a rehearsal as it should
     if request.snapshot is not None:
@@ -85,6 +107,22 @@ def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None],
     return TwinResult(listener.last.number, listener.fixtures.out_of_order)
 
 
+@contextmanager
+def _playing(player: Prepared | None) -> Iterator[None]:
+    """Send a show from a thread until the block ends, if there is one."""
+    if player is None:
+        yield
+        return
+    stop = threading.Event()
+    with ThreadPoolExecutor(1, thread_name_prefix="relit-play") as pool:
+        playing = pool.submit(run, player, stop)
+        try:
+            yield
+        finally:
+            stop.set()
+    playing.result()
+
+
 def _record(path: Path, rig: Rig, listener: Listener) -> None:
     """Write the levels of every frame as a table."""
     text = io.StringIO()
@@ -94,10 +132,3 @@ def _record(path: Path, rig: Rig, listener: Listener) -> None:
         levels = levels_of_universes(rig, dict(frame.values))
         table.writerow([frame.number, f"{frame.time_s:.6f}", *(f"{level:.9g}" for level in levels)])
     write_text(path, text.getvalue())
-
-
-def _page_socket(port: int) -> socket.socket:
-    try:
-        return socket.create_server(("127.0.0.1", port))
-    except OSError as error:
-        raise RequestError(f"--port {port}: cannot serve the page: {(error.strerror or str(error)).lower()}") from error

@@ -34,7 +34,7 @@ from stage.files import replacing, write_text
 from stage.motion.tracking import tracking_frames
 from stage.results.depth_maps import DEPTH_FILE
 from stage.results.light_basis import numbers
-from stage.results.maps import MAPS_FILE
+from stage.results.maps import MAPS_FILE, capture_as_solved
 from stage.results.matte import matte_of
 from stage.stack.brackets import merge_brackets, one_frame_a_light
 from stage.stack.fingerprint import digest
@@ -115,6 +115,8 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     capture = Capture.open(request.capture, request.pixels)
     _check_outputs(request, capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
+    if result is not None and not result.of_depth:
+        capture = capture_as_solved(capture, result.path)
     report = SolveReport([], {}, None) if result is None else read_report(result.path)
     mask = _mask(capture)
     images = read_images(capture, mask, timings)

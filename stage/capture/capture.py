@@ -105,6 +105,34 @@ class Capture:
             raise ManifestError(f"{self.folder / FILE_NAME}: {name} leads out of the capture's folder")
         return self.folder / name
 
+    def at_distance(self, surface_z_m: float) -> "Capture":
+        """Return the capture with the place of its surface, the mean camera-frame z in metres."""
+        camera = self.manifest.camera.model_copy(update={"surface_z_m": surface_z_m})
+        return replace(self, manifest=self.manifest.model_copy(update={"camera": camera}),
+                       whole=None if self.whole is None else self.whole.at_distance(surface_z_m))
+
+    def with_brighter_lights(self, factor: float) -> "Capture":
+        """Return the capture with the irradiance, intensity or radiance of every light times a factor, for maps whose albedo is smaller by
+        it; gradients and environments, which have a radiance of their own, stay."""
+        if factor == 1:
+            return self
+
+        def times(values: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(factor * value for value in values)
+
+        def brighter(frame: Frame) -> Frame:
+            light = frame.light
+            if isinstance(light, DistantLight):
+                return frame.model_copy(update={"light": light.model_copy(update={"irradiance": times(light.irradiance)})})
+            if isinstance(light, PointLight):
+                return frame.model_copy(update={"light": light.model_copy(update={"intensity": times(light.intensity)})})
+            if isinstance(light, ExtendedLight):
+                return frame.model_copy(update={"light": light.model_copy(update={"radiance": tuple(map(times, light.radiance))})})
+            return frame
+
+        return replace(self, manifest=self.manifest.model_copy(update={"frames": tuple(map(brighter, self.manifest.frames))}),
+                       whole=None if self.whole is None else self.whole.with_brighter_lights(factor))
+
     def lit_by(self, *kinds: type[LightKind]) -> list[tuple[Frame, LightKind]]:
         """Return the frames whose light is of one of these types, each with its light, in manifest order."""
         return [(frame, frame.light) for frame in self.manifest.frames if isinstance(frame.light, kinds)]

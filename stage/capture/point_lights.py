@@ -87,7 +87,7 @@ def place_lights(capture: Capture) -> PlacedLights:
     camera, mask = capture.camera, capture.mask()
     if not camera.metric:
         field = "surface_z_m" if camera.projection == "perspective" else "pixel_size_m"
-        told = " (relit solve estimates it from the images)" if distance_is_missing(capture) else ""
+        told = " (relit solve estimates it from the images, and relight takes it from --maps)" if distance_is_missing(capture) else ""
         raise ManifestError(f"{where}: camera.{field}: is missing: near lights need the place of the surface in metres{told}")
     centre = camera.points(np.full(mask.shape, camera.surface_z_m or 0.0))[mask].mean(axis=0, dtype=np.float64)
     _check_places(frames, place, camera, mask, str(where))

@@ -1,4 +1,4 @@
-"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, raw), the header first, then pixels; writing of PNG."""
+"""Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, PPM, raw), the header first, then pixels; writing of PNG."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ from stage.formats.exif import Exposure, sound
 from stage.formats.orientation import TURNS, UPRIGHT, upright, upright_size
 from stage.pixels import Crop
 
-OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp"}
+OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp", ".ppm", ".pgm"}
 ORIENTED_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg"}
 """Suffixes of files with an orientation that their decoder leaves to the reader; that of JPEG XL turns the pixels by itself."""
 SUFFIXES = {".exr", ".avif", *OIIO_SUFFIXES, *camera_raw.SUFFIXES}

@@ -21,15 +21,25 @@ T = TypeVar("T")
 class Guess(NamedTuple):
     """The probable layout of a folder."""
 
+    source: Path
+    """The folder, or the file of it that is imported."""
     layout: str
     """The layout in words: `an object of the DiLiGenT benchmark`."""
     reason: str
     assumed: tuple[str, ...]
     """Assumptions of the command that the files do not tell."""
-    command: str
-    """The command to run; words in capitals are to be replaced."""
+    arguments: tuple[str, ...]
+    """The arguments of `relit import` without a folder for the capture; words in capitals are to be replaced."""
+    sure: bool
+    """Whether the files say all that the arguments do, but for conventions of the layout, which `assumed` names."""
     then: str
     """The command that makes the result."""
+
+
+    @property
+    def command(self) -> str:
+        """The command to run."""
+        return shlex.join(["relit", "import", *self.arguments])
 
 
 class Folder(NamedTuple):
@@ -48,15 +58,17 @@ class Folder(NamedTuple):
         return [*here, *above]
 
 
-def made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, assumed: tuple[str, ...] = ()) -> Guess:
+def made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, sure: bool = False,
+         assumed: tuple[str, ...] = ()) -> Guess:
     """Return a guess.
 
     Args:
         words: the layout and arguments of `relit import`.
+        source: the folder of the capture.
         solve: whether `relit solve` makes the result; else `relit depth`.
     """
     program = "solve" if solve else "depth"
-    return Guess(layout, reason, assumed, shlex.join(["relit", "import", *map(str, words)]),
+    return Guess(source, layout, reason, assumed, tuple(map(str, words)), sure,
                  shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
 
 

@@ -1,44 +1,34 @@
-"""Guesses the layout of a folder and the command that imports it; what the files do not say stands in the command in capitals."""
+"""Guesses the layout of a folder and the command that imports it; what the files do not say stands in the command in capitals.
 
+Names and tables are looked at first, then the images themselves (stage.importers.content).
+"""
+
+import re
 import shlex
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
-from stage.formats import images
-from stage.importers import kinect
+from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
-from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, made, spelling, tried
+from stage.importers.content import Pictures
+from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, made, tried
 from stage.importers.laser import OFF_WORDS
-from stage.importers.layout import image_names, image_resolution, natural_order
+from stage.importers.layout import image_names, natural_order
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
-from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
 from stage.importers.plane_table import NAMES as PLANES
 from stage.importers.plane_table import read_planes
 from stage.importers.raw_arrays import ArrayFiles
-from stage.importers.sequences import GrayStack
 from stage.importers.video import is_video
 from stage.tof.raw_frames import read_array
 
-PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
-              (3840, 2160))
-"""Sizes of projectors, the more frequent first."""
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
 """Words in the names of files that hold planes, and of images of a stripe."""
-SAMPLE = 4000
-"""Pixels of an image that are compared."""
-STEADY = 0.05
-"""Largest difference of the sums of images over their median at which they count as an image and its inverse, or as steps of a wave."""
-MOST_STEPS = 16
-FEWEST_PHOTOS = 4
-"""Images of one size that may be frames of one capture; fewer are likelier pictures of something."""
 
 
 def guess(source: Path) -> Guess:
@@ -49,14 +39,31 @@ def guess(source: Path) -> Guess:
         raise ManifestError(f"{source}: is a capture already: relit info {shlex.quote(str(source))} looks at it")
     pictures = tuple(name for name in image_names(source) if not words_of(name) & (MASK_WORDS | AMBIENT_WORDS))
     refuse_twins(source, pictures)
-    folder = Folder(source, names, pictures)
-    for look in (_diligent, _relightlab, _lp, _kinect, _laser, _near_lights, _table, _scanner, _gray, _phase, _correlations, _histograms,
-                 _video, _photos):
+    shown = Pictures(source, pictures)
+    folder = Folder(source, names, shown.names)
+    ways: tuple[Callable[[Folder], Guess | None], ...] = (
+        _diligent, _relightlab, _lp, _kinect, _scans, _laser, _near_lights, partial(_table, shown=shown),
+        partial(guess_images.scanner, shown=shown), partial(guess_images.gray, shown=shown), partial(guess_images.phase, shown=shown),
+        _correlations, _histograms, _video, partial(guess_images.photos, shown=shown))
+    for look in ways:
         if (found := look(folder)) is not None:
             return found
     suffixes = Counter(Path(name).suffix.lower() for name in names)
     held = ", ".join(f"{count} {suffix or 'without suffix'}" for suffix, count in suffixes.items())
-    raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows: docs/captures.md shows them")
+    raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows: docs/importing.md shows them")
+
+
+def guess_each(source: Path) -> tuple[Guess, ...]:
+    """Return what the files of a folder seem to be, or those of each folder in it where the folder itself has no images and arrays."""
+    with storage("read", source):
+        children = natural_order(path.name for path in source.iterdir() if path.is_dir() and not path.name.startswith("."))
+    try:
+        return (guess(source),)
+    except ManifestError:
+        inside = [name for name in children if image_names(source / name)]
+        if image_names(source) or not inside:
+            raise
+    return tuple(guess(source / name) for name in inside)
 
 
 def _diligent(folder: Folder) -> Guess | None:
@@ -64,23 +71,23 @@ def _diligent(folder: Folder) -> Guess | None:
     if not wanted <= set(folder.names):
         return None
     return made("an object of the DiLiGenT benchmark", "it has filenames.txt, light_directions.txt and light_intensities.txt",
-                 ["diligent", folder.path], folder.path, solve=True)
+                 ["diligent", folder.path], folder.path, solve=True, sure=True)
 
 
 def _relightlab(folder: Folder) -> Guess | None:
     files = [name for suffix in (".relight", ".dome") for name in folder.names if name.lower().endswith(suffix)]
     if not files:
         return None
-    return made("a project or a dome of RelightLab", f"it has {files[0]}", ["relightlab", folder.path / files[0], folder.path],
-                 folder.path, solve=True)
+    return made("a project or a dome of RelightLab", f"it has {files[0]}", ["relightlab", folder.path / files[0]],
+                 folder.path, solve=True, sure=True)
 
 
 def _lp(folder: Folder) -> Guess | None:
     files = [name for name in folder.names if name.lower().endswith(".lp")]
     if not files:
         return None
-    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0], folder.path], folder.path,
-                 solve=True)
+    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0]], folder.path,
+                 solve=True, sure=True)
 
 
 def _kinect(folder: Folder) -> Guess | None:
@@ -91,8 +98,23 @@ def _kinect(folder: Folder) -> Guess | None:
     more = ["--packet", folder.path / packets[0]] if len(packets) > 1 else []
     return made("depth packets of a Kinect v2",
                  f"{packets[0]} has the size of a packet of libfreenect2, and {tables[0]} that of P0 tables",
-                 ["kinect", folder.path, *more, "--focal-px", "365.456", "--principal-px", "254.878,205.395"], folder.path, solve=False,
+                 ["kinect", folder.path, *more, "--focal-px", "365.456", "--principal-px", "254.878,205.395"], folder.path,
+                 solve=False, sure=True,
                  assumed=("the intrinsics are those of a usual device: getIrCameraParams of yours says better ones",))
+
+
+def _scans(folder: Folder) -> Guess | None:
+    depths = [name for name in folder.names if name.lower().endswith(".depth.png")]
+    if depths:
+        return made("frames of a depth camera", f"it has {len(depths)} depth images, as {depths[0]}", ["scans", folder.path], folder.path,
+                    solve=False, assumed=("depths are in millimetres: else --depth-unit-m",))._replace(
+                        then="relit register SCAN_SET --out registered")
+    clouds = [name for name in folder.names if name.lower().endswith(".ply")]
+    if not clouds or folder.pictures:
+        return None
+    found = made("scans of one object", f"it has {len(clouds)} PLY files, as {clouds[0]}", ["scans", folder.path], folder.path, solve=False,
+                 assumed=("coordinates are in metres: else --unit mm",))
+    return found._replace(then=shlex.join(["relit", "register", str(folder.path), "--out", f"{folder.path.resolve().name}-registered"]))
 
 
 def _laser(folder: Folder) -> Guess | None:
@@ -140,13 +162,13 @@ def _near_lights(folder: Folder) -> Guess | None:
         words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
                  "--unit-m", "0.001", *chosen]
         return made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
-                     folder.path, solve=True, assumed=("axes and millimetres are those of near_ps",
+                     folder.path, solve=True, sure=True, assumed=("axes and millimetres are those of near_ps",
                                           "nothing says how far the object is: relit solve estimates it; --surface-z-m gives it",
                                           *encoding(folder)))
     return None
 
 
-def _table(folder: Folder) -> Guess | None:
+def _table(folder: Folder, shown: Pictures) -> Guess | None:
     if not folder.pictures:
         return None
     for path in folder.with_suffix(*TABLES):
@@ -160,68 +182,28 @@ def _table(folder: Folder) -> Guess | None:
             continue
         reason = f"{path} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
         ahead = table.vectors[:, 2].mean() > 0
-        axes = f"right,up,{'towards' if ahead else 'away'}"
+        across, up = guess_images.followed(shown, table.vectors) if table.names is None and not chosen else (0.0, 0.0)
+        mirrored = min(across, up) < -guess_images.FOLLOWED and max(across, up) > guess_images.FOLLOWED  # else an object may be hollow
+        axes = (f"{'left' if mirrored and across < 0 else 'right'},{'down' if mirrored and up < 0 else 'up'},"
+                f"{'towards' if ahead else 'away'}")
         return made("images under one far light each with a table of the lights", reason,
                      ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
-                     folder.path, solve=True, assumed=(
+                     folder.path, solve=True, sure=mirrored or min(across, up) > -guess_images.FOLLOWED, assumed=(
+                         "the bright side of the object tells where x and y point, and vectors point to the light" if mirrored else
                          "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
                          f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side",
                          *encoding(folder)))
     return None
 
 
-def _scanner(folder: Folder) -> Guess | None:
-    count = len(folder.pictures)
-    for path in folder.with_suffix(".xml", ".yml", ".yaml"):
-        matrices = arrays_of(path)
-        if not set(PROJECTOR_MATRIX) & set(matrices):
-            continue
-        size = projector_size(path)
-        if size is None:
-            continue
-        bits = [min(most, (side - 1).bit_length()) for most, side in zip((10, 6), size, strict=True)]
-        codecs = {2 + bits[0]: ("slstudio-gray", "column"), 2 + sum(bits): ("slstudio-gray", "both"), 6: ("slstudio-phase-2x3", "column"),
-                  12: ("slstudio-phase-2x3", "both"), 3: ("slstudio-phase-3", "column"), 4: ("slstudio-phase-4", "column")}
-        if count not in codecs:
-            continue
-        codec, axis = codecs[count]
-        return made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
-                     ["scanner", folder.path, "--calibration", path, "--codec", codec, "--axis", axis, "--unit-m", "0.001"], folder.path,
-                     solve=False, assumed=("the calibration is in millimetres",))
-    return None
-
-
-def _gray(folder: Folder) -> Guess | None:
-    count = len(folder.pictures)
-    sizes = [size for size in PROJECTORS if len(GrayStack().entries(size)) == count]
-    if not sizes or not _steady(_sums(folder, folder.pictures[:-2], 2)):
-        return None
-    names = [f"{width}x{height}" for width, height in sizes]
-    return made("a Gray code in OpenCV's order", f"{count} images, each second of which is the inverse of the one before",
-                 ["opencv-gray", folder.path, "--projector", names[0]], folder.path, solve=False,
-                 assumed=(f"the projector has {' or '.join(names)} pixels: these have as many bits",))
-
-
-def _phase(folder: Folder) -> Guess | None:
-    count = len(folder.pictures)
-    for steps in range(3, MOST_STEPS + 1):
-        if count % steps == 0 and count > steps and _steady(_sums(folder, folder.pictures, steps)):
-            return made("phase shifts", f"the sums of each {steps} images are alike", [
-                "phase", folder.path, "--projector", "WIDTHxHEIGHT", "--periods", ",".join(f"P{n + 1}" for n in range(count // steps)),
-                "--steps", steps], folder.path, solve=False, assumed=(
-                    "WIDTHxHEIGHT is the projector in pixels, P1 and so on are the periods in its pixels",
-                    "the columns are coded, and waves move to larger columns: else --axis and --shift"))
-    return None
-
-
 def _correlations(folder: Folder) -> Guess | None:
     planes = [name for name in folder.names if name.lower().endswith(".npy") and _shape(folder.path / name, 2)]
-    spelled = Counter(spelling(name) for name in planes)
-    group = next((spelling for spelling, number in spelled.items() if number >= 3 and "*" in spelling), None)
+    spelled = Counter(re.sub(r"\d+", "*", name) for name in planes)
+    group = next((spelling for spelling, number in spelled.items() if number >= 3 and spelling.count("*") == 1), None)
     if group is None:
         return None
-    chosen = natural_order(name for name in planes if spelling(name) == group)
-    numbers = [int("".join(filter(str.isdigit, Path(name).stem.removeprefix(group.split("*")[0]))) or -1) for name in chosen]
+    chosen = natural_order(name for name in planes if re.sub(r"\d+", "*", name) == group)
+    numbers = [int(re.findall(r"\d+", name)[0]) for name in chosen]
     told = max(numbers) >= 90 and max(numbers) < 360
     phases = ",".join(map(str, numbers)) if told else ",".join(f"{360 * step / len(chosen):g}" for step in range(len(chosen)))
     return made("correlation images of a time-of-flight camera", f"{len(chosen)} arrays of one image each, {chosen[0]} to {chosen[-1]}",
@@ -257,45 +239,7 @@ def _video(folder: Folder) -> Guess | None:
             "a Gray code of columns and rows with inverses, then white and black: else --sequence, --inverses, or relit import phase"))
 
 
-def _photos(folder: Folder) -> Guess | None:
-    if len(folder.pictures) < FEWEST_PHOTOS or not _of_one_size(folder):
-        return None
-    found = made("images under lights of which nothing says where they were", f"{len(folder.pictures)} images of one size and no table",
-                  ["photos", folder.path], folder.path, solve=True, assumed=(
-                      "each image has one far light of its own, and the camera stood still", *encoding(folder)))
-    return found._replace(then=found.then + " --lights unknown")
-
-
-def _of_one_size(folder: Folder) -> bool:
-    sizes = {tried(partial(image_resolution, folder.path / name)) for name in folder.pictures}
-    return len(sizes) == 1 and None not in sizes
-
-
 def _shape(path: Path, dimensions: int) -> bool:
     """Return whether a .npy file holds real numbers in so many dimensions."""
     found = tried(partial(read_array, path))
     return found is not None and found.ndim == dimensions and found.dtype.kind in "fiu" and min(found.shape) > 1
-
-
-def _sums(folder: Folder, names: tuple[str, ...], count: int) -> Iterator[np.ndarray]:
-    """Yield the sum of each so many images, at a sample of pixels."""
-    for at in range(0, len(names) - count + 1, count):
-        total = 0.0
-        for name in names[at:at + count]:
-            grey = images.read_pixels(folder.path / name).astype(np.float32).mean(axis=-1).ravel()
-            total = total + grey[::max(1, len(grey) // SAMPLE)]
-        yield np.asarray(total)
-
-
-def _steady(sums: Iterator[np.ndarray]) -> bool:
-    """Return whether sums of images are alike, over more than one of them."""
-    first, count = None, 0
-    for total in sums:
-        if first is None:
-            first, scale = total, float(np.median(total))
-            if scale <= 0:
-                return False
-        elif total.shape != first.shape or np.median(np.abs(total - first)) > STEADY * scale:
-            return False
-        count += 1
-    return count > 1

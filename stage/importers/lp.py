@@ -11,16 +11,19 @@ from typing import Any
 import numpy as np
 
 from stage.capture.manifest import SCHEMA
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
+from stage.importers.camera_options import View
 from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, read_lines, write_capture
 from stage.text import name_fault
 
 
-def import_folder(source: Path, destination: Path) -> Path:
+def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None) -> Path:
     """Write a capture.json for an RTI capture.
 
     Args:
         source: the .lp file, or a folder with exactly one .lp file.
+        color_space: that of the images; None: by their depth.
     """
     path = _find(source)
     folder = path.parent
@@ -36,13 +39,13 @@ def import_folder(source: Path, destination: Path) -> Path:
     first = folder / frames[0]["image"]
     resolution = image_resolution(first)
     mask = "mask.png" if (folder / "mask.png").exists() else None
-    space = color_space_of(first)
+    space = color_space or color_space_of(first)
     return write_capture({
         "schema": SCHEMA,
         "name": path.stem,
         "color_space": space,
-        "assumed": assumed_encoding(space),
-        "camera": {"projection": "orthographic", "resolution": resolution},
+        "assumed": assumed_encoding(space, color_space),
+        "camera": (view or View()).entry(resolution),
         "mask": mask,
         "irradiance_scale": "relative",
         "frames": frames,

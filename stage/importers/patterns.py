@@ -13,7 +13,7 @@ from stage.errors import ManifestError
 from stage.importers.camera_options import MASK_WORDS, only_image
 from stage.importers.layout import Imported, image_names, image_resolution, write_capture
 from stage.importers.opencv_file import camera_from_projector, lens, pick, read_matrices
-from stage.importers.sequences import Entry, GrayStack, PhaseStack, describe, gray_entries
+from stage.importers.pattern_order import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
 
 CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc")

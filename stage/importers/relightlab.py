@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from stage.capture.manifest import SCHEMA
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Selection, select
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, read_json, write_capture
@@ -25,12 +26,13 @@ POSITIONS = {"spherical": "positionsSphere", "lights3d": "positions3d"}
 MM, MOST_MM = 0.001, 1e9
 
 
-def import_folder(source: Path, destination: Path | None) -> Imported:
+def import_folder(source: Path, destination: Path | None, *, color_space: ColorSpaceName | None = None) -> Imported:
     """Write a capture.json for a project or a dome of RelightLab.
 
     Args:
         source: a .relight or .dome file, or a folder with exactly one of them.
         destination: the folder of the capture, which gets links to, or copies of, the images; None: the folder of the images.
+        color_space: that of the images; None: by their depth.
     """
     path = _find(source)
     data = _read(path)
@@ -68,9 +70,9 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
     frames = [{"image": name, "light": {"type": "point", "position_m": (MM * vector).tolist(), "intensity": power.tolist()} if near else
                {"type": "distant", "direction": vector.tolist(), "irradiance": power.tolist()}}
               for name, vector, power in zip(names, vectors, strength, strict=True)]
-    space, mask = color_space_of(folder / names[0]), select(folder, Selection()).mask
+    space, mask = color_space or color_space_of(folder / names[0]), select(folder, Selection()).mask
     written = write_capture({"schema": SCHEMA, "name": path.stem, "color_space": space, "camera": camera, "mask": mask,
-                             "irradiance_scale": "relative", "assumed": assumed_encoding(space),
+                             "irradiance_scale": "relative", "assumed": assumed_encoding(space, color_space),
                              "frames": frames}, path, destination or folder, folder=folder)
     crop = ("crop", f"{path} crops the images; the capture has them whole") if data.get("crop") else None
     return Imported(written, tuple(fact for fact in (
@@ -78,7 +80,7 @@ def import_folder(source: Path, destination: Path | None) -> Imported:
             "in the order of the images" if path.suffix.lower() == ".dome" else f"{len(entries) - len(used)} images are skipped there")),
         ("axes", "those of RelightLab: x right, y up, z towards the camera (right-handed); vectors point to the light"),
         ("strength", "equal: relit calibrate intensity measures it" if adjust is None else "the reciprocal of ledAdjust"),
-        ("colour", space + ", by the depth of the images"),
+        ("colour", space + ("" if color_space else ", by the depth of the images")),
         ("camera", "orthographic, " + (f"{width_mm:g} mm wide" if width_mm > 0 else "of unknown scale: imageWidth is not set")),
         ("mask", mask or "none: every pixel is taken"), crop) if fact is not None))
 

@@ -32,7 +32,7 @@ class Readings:
     """The readings of single pixels under lights that are evenly spaced over those of a stack."""
 
     def __init__(self, stack: Stack, width: int) -> None:
-        """Args: stack: of the captured images; width: of an image."""
+        """Take the stack of the captured images, which are `width` pixels wide."""
         count = stack.light_count
         self._stack, self._width, self.light_count = stack, width, count
         self._lights = np.unique(np.linspace(0, count - 1, min(count, MOST_LIGHTS)).round().astype(int))

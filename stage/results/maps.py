@@ -1,6 +1,6 @@
 """The solved surface maps of one capture, and their file, maps.exr."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 
 from stage.capture.camera import Camera
+from stage.capture.capture import Capture
+from stage.capture.point_lights import distance_is_missing
 from stage.errors import ResultError
 from stage.formats import exr
 from stage.results.result_metadata import camera_and_provenance, result_metadata
 
 MAPS_FILE = "maps.exr"
+ALBEDO_SCALE = "relit:albedo_scale"
+"""The attribute with the factor between the albedo of the maps and that under the lights of the capture, where it is not 1."""
 _RGB, _XYZ = ("R", "G", "B"), ("X", "Y", "Z")
 LAYERS: dict[str, tuple[tuple[str, ...], type[np.floating[Any]]]] = {
     "normal": (_XYZ, np.float32),
@@ -65,6 +69,11 @@ class SurfaceMaps:
     estimated: np.ndarray | None = None  # [rows, cols] bool, where values are kept though they may not count as solved; None: the mask
     color_space: str = "lin_rec709_scene"
     provenance: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def albedo_scale(self) -> float:
+        """The factor between the albedo of these maps and that under the lights of the capture."""
+        return _albedo_scale(self.provenance)
 
     def layers(self) -> dict[str, np.ndarray]:
         """Return the layers that were estimated by their names, in the order of the file."""
@@ -134,3 +143,15 @@ class SurfaceMaps:
         return cls(camera=camera, mask=mask, estimated=estimated, color_space=exr.color_space_of(metadata), provenance=provenance, **found)
 
 
+def capture_as_solved(capture: Capture, path: Path) -> Capture:
+    """Return a capture with what its solve has added: the distance of the surface, where the manifest lacks it and its near lights need it,
+    and lights under which the albedo of the maps in this file looks as the images do."""
+    metadata = exr.read_header(path).metadata
+    found = camera_and_provenance(metadata, path, file_name=MAPS_FILE)[0].surface_z_m
+    if found is not None and distance_is_missing(capture):
+        capture = capture.at_distance(found)
+    return capture.with_brighter_lights(1 / _albedo_scale(metadata))
+
+
+def _albedo_scale(metadata: Mapping[str, object]) -> float:
+    return float(str(metadata.get(ALBEDO_SCALE, 1)))

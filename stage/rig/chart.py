@@ -52,6 +52,8 @@ class Chart(Strict):
     """The readings of the patches under white light of the environment, at an irradiance of 1 in each channel."""
     primaries: dict[Text, Annotated[tuple[Rgb, ...], FirstFault]] | None = None
     """The readings of the patches under each primary at full level, by its name."""
+    irradiance: dict[Text, Rgb] | None = None
+    """The irradiance of each primary under which it was read; None: that of every lamp at full level."""
     spectra: ChartSpectra | None = None
     """The spectra; None: readings are given."""
 
@@ -62,6 +64,11 @@ class Chart(Strict):
         for name, readings in (self.primaries or {}).items():
             if len(readings) != len(self.target or ()):
                 raise ValueError(f"primaries.{name}: has {len(readings)} patches, target has {len(self.target or ())}")
+        if self.irradiance is not None:
+            if self.spectra is not None or set(self.irradiance) != set(self.primaries or {}):
+                raise ValueError("irradiance: must name each of primaries, and no other")
+            if dark := [name for name, value in self.irradiance.items() if not max(value) > 0]:
+                raise ValueError(f"irradiance.{dark[0]}: must be above 0 in one channel")
         return self
 
 
@@ -88,7 +95,11 @@ class ChartReadings(NamedTuple):
             missing = [primary.name for primary in lamp.primaries if primary.name not in (self.chart.primaries or {})]
             if missing:
                 raise ManifestError(f"{self.path}: primaries: has no readings under {missing[0]}, which the lamp {lamp.name} has")
-            return np.array([(self.chart.primaries or {})[primary.name] for primary in lamp.primaries])
+            readings = np.array([(self.chart.primaries or {})[primary.name] for primary in lamp.primaries])
+            if self.chart.irradiance is None:
+                return readings
+            power = [sum(primary.irradiance) / sum(self.chart.irradiance[primary.name]) for primary in lamp.primaries]
+            return readings * np.array(power)[:, None, None]
         for primary in lamp.primaries:
             if primary.spectrum is None:
                 raise ManifestError(f"{self.path}: spectra: the primary {primary.name} of the lamp {lamp.name} has no spectrum in the rig")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stage.rig.rig import CHANNELS, DMX, Lamp, Primary, Rig
+from stage.rig.rig import CHANNELS, DMX, FixedChannel, Lamp, Primary, Rig
 
 
 class Universe(NamedTuple):
@@ -33,6 +33,14 @@ def slot(lamp: Lamp, primary: Primary) -> Slot | None:
     return Slot(Universe(address.protocol, address.universe, address.host), address.channels[primary.name], lamp.bits)
 
 
+def fixed_channels(lamp: Lamp) -> list[tuple[Universe, FixedChannel]]:
+    """Return the channels of a lamp that keep one value, each with its universe."""
+    address = lamp.address
+    if address is None or address.universe is None:
+        return []
+    return [(Universe(address.protocol, address.universe, address.host), each) for each in address.fixed]
+
+
 def patch_faults(rig: Rig) -> Iterator[str]:
     """Yield what keeps lamps of a rig from being driven, as `field: what is wrong`."""
     taken: dict[tuple[str, int, str | None, int], str] = {}
@@ -56,6 +64,11 @@ def patch_faults(rig: Rig) -> Iterator[str]:
                 other = taken.setdefault((*place.universe, channel), name)
                 if other != name:
                     yield f"{where}.channels.{primary.name}: channel {channel} of universe {place.universe.number} is already {other}"
+        for number, (universe, each) in enumerate(fixed_channels(lamp)):
+            name = f"{each.name} at {each.value}"  # which several lamps may share
+            other = taken.setdefault((*universe, each.channel), name)
+            if other != name:
+                yield f"{where}.fixed[{number}].channel: channel {each.channel} of universe {universe.number} is already {other}"
 
 
 def drive_for_light(light: np.ndarray, primary: Primary) -> np.ndarray:
@@ -72,6 +85,13 @@ def light_at_drive(drive: np.ndarray, primary: Primary) -> np.ndarray:
     if primary.response is None:
         return np.asarray(drive, dtype=np.float64)
     return np.interp(drive, *np.array(primary.response).T)
+
+
+def drive_steps(rig: Rig, levels: np.ndarray) -> np.ndarray:
+    """Return the drive of each of `rig.emitters` in steps of its bits, the nearest to levels [frames, emitters], 0 to 1: int64 alike."""
+    columns = [np.rint(drive_for_light(levels[:, column], primary) * (2 ** rig.lights[index].bits - 1))
+               for column, (index, primary) in enumerate(rig.emitters)]
+    return np.stack(columns, axis=1).astype(np.int64)
 
 
 def universe_values(rig: Rig, steps: np.ndarray) -> dict[Universe, np.ndarray]:
@@ -94,20 +114,28 @@ def universe_values(rig: Rig, steps: np.ndarray) -> dict[Universe, np.ndarray]:
             values[:, place.channel] = steps[:, column] & 255
         else:
             values[:, place.channel - 1] = steps[:, column]
+    for lamp in rig.lights:
+        for universe, each in fixed_channels(lamp):
+            found.setdefault(universe, np.zeros((len(steps), CHANNELS), dtype=np.uint8))[:, each.channel - 1] = each.value
     return {universe: found[universe] for universe in sorted(found, key=lambda each: (each.protocol, each.number, each.host or ""))}
 
 
 def levels_of_universes(rig: Rig, values: dict[tuple[str, int], np.ndarray]) -> np.ndarray:
-    """Return the light of each of `rig.emitters`, 0 to 1, when universes have these values; what is not received is dark.
+    """Return the light of each of `rig.emitters`, 0 to 1, when universes have these values.
+
+    What is not received is dark, and so is a lamp whose fixed channels have other values than the rig says: its light is not known then.
 
     Args:
         values: [512] uint8 by protocol and number of the universe.
     """
     levels = np.zeros(len(rig.emitters))
+    nothing = np.zeros(CHANNELS, dtype=np.uint8)
+    ready = [all(values.get(universe[:2], nothing)[each.channel - 1] == each.value for universe, each in fixed_channels(lamp))
+             for lamp in rig.lights]
     for column, (index, primary) in enumerate(rig.emitters):
         place = slot(rig.lights[index], primary)
         received = None if place is None else values.get((place.universe.protocol, place.universe.number))
-        if place is None or received is None:
+        if place is None or received is None or not ready[index]:
             continue
         step = int(received[place.channel - 1])
         if place.bits == 16:

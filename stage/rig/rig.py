@@ -18,6 +18,7 @@ from stage.colour.colour_spaces import LightSpaceName
 from stage.files import write_text
 from stage.model import Direction, FirstFault, Fraction, LitRgb, NotNegative, Positive, Strict, Text, Vector
 from stage.records import faults_of_each, read_record
+from stage.rig.controllers import Controllers
 
 RIG_SCHEMA = "relit.rig/1"
 CHANNELS = 512
@@ -77,6 +78,17 @@ class Primary(Strict):
         return self
 
 
+class FixedChannel(Strict):
+    """A channel of a lamp that keeps one value while the lamp is driven, such as that of a dimmer, a shutter or a colour wheel."""
+
+    name: Text
+    """What the channel drives, such as Dimmer."""
+    channel: Annotated[int, Field(ge=1, le=CHANNELS)]
+    """The channel, 1 to 512, in the universe of the lamp."""
+    value: Annotated[int, Field(ge=0, le=255)]
+    """The value that it keeps; when the stage is turned dark it is 0, as all channels are."""
+
+
 class Address(Strict):
     """The way a lamp is driven."""
 
@@ -86,6 +98,8 @@ class Address(Strict):
     """The DMX universe: 1 to 63999 for sacn, 0 to 32767 for artnet."""
     channels: dict[Text, Annotated[int, Field(ge=1, le=CHANNELS)]] = Field(default_factory=dict)
     """The channel of each primary by its name, 1 to 512; with 16 bits the coarse one, and the fine one follows it."""
+    fixed: Annotated[tuple[FixedChannel, ...], FirstFault] = ()
+    """The other channels of the lamp. Lamps may share one, such as a master dimmer; the light of the primaries is that at these values."""
     host: Text | None = None
     """The address of the node that the universe is sent to; None: multicast for sacn, broadcast for artnet."""
 
@@ -97,6 +111,8 @@ class Address(Strict):
                 raise ValueError(f"universe is missing: {self.protocol} needs it")
             if not first <= self.universe <= last:
                 raise ValueError(f"universe is {self.universe}: {self.protocol} has {first} to {last}")
+        elif self.fixed:
+            raise ValueError(f"fixed is for {' and '.join(DMX)}, not for {self.protocol}")
         return self
 
 
@@ -154,6 +170,8 @@ class Rig(Strict):
     """The scene-linear colour space of the irradiances."""
     subject_m: Vector = (0.0, 0.0, 0.0)
     """The place of the subject, in metres."""
+    controllers: Controllers = Controllers()
+    """The controllers of lamps that are switched over a serial port or by HTTP."""
     camera: Camera | None = None
     """The camera at the rig, as in capture.json; None: it is not known."""
     lights: Annotated[tuple[Lamp, ...], Field(min_length=1), FirstFault]
@@ -161,6 +179,10 @@ class Rig(Strict):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        protocols = {lamp.address.protocol for lamp in self.lights if lamp.address is not None}
+        for protocol in ("serial", "http"):
+            if protocol in protocols and getattr(self.controllers, protocol) is None:
+                raise ValueError(f"controllers.{protocol} is missing: lamps have the protocol {protocol}")
         first: dict[str, int] = {}
         for index, lamp in enumerate(self.lights):
             if first.setdefault(lamp.name, index) != index:
@@ -173,7 +195,7 @@ class Rig(Strict):
     def directions(self) -> np.ndarray:
         """Return the unit vectors [lights, 3] from the subject to the lamps, float64."""
         found = np.array([lamp.direction if lamp.position_m is None else np.subtract(lamp.position_m, self.subject_m)
-                          for lamp in self.lights], dtype=np.float64)
+                          for lamp in self.lights], dtype=np.float64).reshape(-1, 3)
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
     @property

@@ -2,9 +2,11 @@
 
 import json
 import re
+from importlib.resources import files
 
 import pytest
 
+from docs.tools.colour_table import colour_table
 from docs.tools.manifest_examples import EXAMPLES
 from docs.tools.manifest_page import PAGE, fields_of, page
 from stage.capture.light import DistantLight
@@ -86,3 +88,7 @@ def test_words_of_values():
                 "| `stripe_px` | number, above 0, pixels | `1` |", "| `exposure_s` | number, above 0, seconds | optional |"):
         assert row in text
     assert "None" not in text and Frame in EXAMPLES and DistantLight in EXAMPLES and UncalibratedProjector in EXAMPLES
+
+
+def test_the_module_of_the_pages_is_the_newest():
+    assert (files("service.server.pages") / "static" / "view" / "colour_table.js").read_text() == colour_table(), "run make colour-table"

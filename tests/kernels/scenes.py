@@ -7,7 +7,7 @@ import numpy as np
 from kernels import packs
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
-from kernels.photometric.model.misfit import Misfit, Uncertainty, uncertainty_of
+from kernels.photometric.model.misfit import Misfit, standard_error
 
 GREY = (0.2126, 0.7152, 0.0722)
 HALF_ROUNDING = 2.0**-11
@@ -27,9 +27,9 @@ class Solved(NamedTuple):
     agreeing: np.ndarray  # [pixel]
     weights: np.ndarray  # [light, pixel]
 
-    def uncertainty(self, misfit: Misfit = Misfit()) -> Uncertainty:  # noqa: B008  (immutable)
-        """Return how sure the normals are, [pixel]."""
-        return uncertainty_of(self.across, self.squares, self.freedom, self.agreeing, misfit)
+    def sigma(self, misfit: Misfit = Misfit()) -> np.ndarray:  # noqa: B008  (immutable)
+        """Return the standard error of the normals in degrees, [pixel]."""
+        return standard_error(self.across, self.squares, self.freedom, self.agreeing, misfit)
 
 
 def cap(count: int, largest_degrees: float) -> np.ndarray:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.reference.microfacet import diffuse, specular
 from tests.scenes.captures import Scene, write_capture
@@ -145,6 +146,45 @@ def ball_before_body(*, gap: float = 0.3) -> list[Part]:
     """A small glossy ball `gap` in front of a broad body."""
     return [Part((0.1, 0.15, 0.5 + gap), (0.3, 0.3, 0.3), f0=(0.04,) * 3, roughness=0.35),
             Part((0.0, 0.0, -0.1), (1.0, 0.9, 0.5), albedo=(0.4, 0.45, 0.5))]
+
+
+KINDS = ("ball", "egg", "disc", "hole", "touch", "rod", "two")
+
+
+class Layout(NamedTuple):
+    """A random object of parts, and what it is seen by."""
+
+    parts: list[Part]  # the body last
+    lights: np.ndarray  # [lights, 3]
+    distance: float | None
+
+    def shoot(self, *, side: int, seed: int = 0) -> Shot:
+        """Ray cast it with 2 % noise."""
+        return shoot(self.parts, self.lights, side=side, across=2.4, distance=self.distance, noise=0.02, seed=seed)
+
+
+def random_layout(kind: str, seed: int) -> Layout:
+    """A part or two before a body at a random place: a ball of radius .3 under 128 lights, an egg, a disc, a disc with a hole, a ball that
+    touches, a rod or two eggs, under 33 to 128 lights."""
+    rng = np.random.default_rng(1000 * seed + sum(map(ord, kind)))
+    body = Part((0, 0, -0.3), tuple(rng.uniform([0.9, 0.85, 0.4], [1.05, 1.05, 0.7])), albedo=tuple(rng.uniform(0.3, 0.6, 3)))
+    shine: dict[str, Any] = {"f0": (0.04,) * 3, "roughness": float(rng.uniform(0.25, 0.6))} if rng.random() < 0.5 else {}
+    (x, y), gap = rng.uniform(-0.4, 0.4, 2), rng.uniform(0.1, 0.8) + 0.2
+    normal = np.array([*rng.uniform(-0.7, 0.7, 2), 1])
+    disc: dict[str, Any] = shine | {"normal": tuple(normal / np.linalg.norm(normal))}
+    front = {"ball": lambda: [Part((x, y, 0.3 + gap), (0.3,) * 3, **shine)],
+             "egg": lambda: [Part((x, y, 0.35 + gap), tuple(rng.uniform(0.15, 0.4, 3)), **shine)],
+             "disc": lambda: [Part((x, y, 0.3 + gap), (rng.uniform(0.2, 0.45),) * 3, **disc)],
+             "hole": lambda: [Part((0.6 * x, 0.6 * y, 0.3 + gap), (0.45,) * 3, hole=rng.uniform(0.18, 0.3), **disc)],
+             "touch": lambda: [Part((x, y, 0.15 + rng.uniform(0, 0.15)), (0.3,) * 3, **shine)],
+             "rod": lambda: [Part((x, y, 0.2 + gap), (0.55, *(rng.uniform(0.06, 0.12),) * 2), **shine)],
+             "two": lambda: [Part((x - 0.4, y, 0.3 + gap), (0.24,) * 3, **shine),
+                             Part((x + 0.4, -y, 0.4 + rng.uniform(0.1, 0.8)), (0.28, 0.2, 0.2))]}[kind]()
+    count = 128 if kind == "ball" else int(rng.choice([33, 48, 96, 128]))
+    distance, least = None if rng.random() < 0.7 else 4.0, float(rng.choice([-1, 0.1]))
+    lights = sphere_lights(count, least_z=least)
+    turned = Rotation.random(random_state=seed).as_matrix() if least < 0 else np.eye(3)
+    return Layout([*front, body], lights @ turned.T, distance)
 
 
 def disc_over_plane(*, slope: float = 0.58, gap: float = 0.5) -> list[Part]:

@@ -10,6 +10,7 @@ import numpy as np
 from stage.rig.cues import rig_digest
 from stage.rig.patch import universe_values
 from stage.rig.rig import read_rig
+from tests.scenes.rigs import write_rig
 
 
 def loopback() -> str:
@@ -18,18 +19,11 @@ def loopback() -> str:
     return f"127.{1 + number // 62500 % 250}.{number // 250 % 250}.{1 + number % 250}"
 
 
-def write_rig_file(path: Path, directions: np.ndarray, *, host: str | None, universes: int = 1, protocol: str = "sacn",
-                   bits: int = 8, **changes: Any) -> Path:
-    """A rig of RGB lamps in these directions, dealt to universes in turn."""
-    width = bits // 8
-    lights = []
-    for index, direction in enumerate(np.asarray(directions).tolist()):
-        first = 1 + 3 * width * (index // universes)
-        primaries = [{"name": name, "irradiance": [0.05 + (c == k) for c in range(3)]} for k, name in enumerate("rgb")]
-        lights.append({"name": f"lamp {index}", "type": "distant", "direction": direction, "bits": bits, "primaries": primaries,
-                       "address": {"protocol": protocol, "universe": 1 + index % universes, "host": host,
-                                   "channels": {name: first + k * width for k, name in enumerate("rgb")}}})
-    path.write_text(json.dumps({"schema": "relit.rig/1", "name": "dome", "lights": lights, **changes}))
+def write_rig_file(path: Path, directions: np.ndarray, *, host: str | None, universes: int = 1, dimmer: int | None = None, **options: Any
+                   ) -> Path:
+    """A rig of RGB lamps in these directions, dealt to universes in turn; with a master dimmer on this channel of each."""
+    write_rig(path, directions, {name: [0.05 + (c == k) for c in range(3)] for k, name in enumerate("rgb")}, host=host, universes=universes,
+              names="lamp {}", fixed=() if dimmer is None else ({"name": "Dimmer", "channel": dimmer, "value": 255},), **options)
     return path
 
 

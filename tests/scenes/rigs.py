@@ -15,16 +15,19 @@ SUN = np.array([0.4, 0.6, 0.69]) / np.linalg.norm([0.4, 0.6, 0.69])
 NORMALS = fibonacci_sphere(300)
 
 
-def write_rig(path: Path, directions, primaries=RGB, irradiance=1.0, **fields) -> dict:
-    """Write a rig of distant lamps with these primaries, patched one after another, and return its content."""
+def write_rig(path: Path, directions, primaries=RGB, irradiance=1.0, *, name: str | None = None, protocol: str = "sacn",
+              host: str | None = None, universes: int | None = None, names: str = "L{:03d}", fixed=(), **fields) -> dict:
+    """Write a rig of distant lamps with these primaries, patched one after another or dealt to universes in turn; return its content."""
     width = len(primaries) * fields.get("bits", 8) // 8
     a_universe = 512 // width
-    lights = [{"name": f"L{index:03d}", "type": "distant", "direction": list(direction), **fields,
-               "primaries": [{"name": name, "irradiance": [irradiance * part for part in colour]} for name, colour in primaries.items()],
-               "address": {"protocol": "sacn", "universe": 1 + index // a_universe, "channels": {
-                   name: 1 + index % a_universe * width + place * width // len(primaries) for place, name in enumerate(primaries)}}}
-              for index, direction in enumerate(np.asarray(directions).tolist())]
-    data = {"schema": "relit.rig/1", "name": path.stem, "color_space": "lin_rec709_scene", "lights": lights}
+    lights = []
+    for index, direction in enumerate(np.asarray(directions).tolist()):
+        universe, place = divmod(index, a_universe) if universes is None else divmod(index, universes)[::-1]
+        lights.append({"name": names.format(index), "type": "distant", "direction": direction, **fields, "primaries": [
+            {"name": primary, "irradiance": [irradiance * part for part in colour]} for primary, colour in primaries.items()],
+            "address": {"protocol": protocol, "universe": 1 + universe, "host": host, "fixed": fixed, "channels": {
+                primary: 1 + place * width + number * width // len(primaries) for number, primary in enumerate(primaries)}}})
+    data = {"schema": "relit.rig/1", "name": name or path.stem, "color_space": "lin_rec709_scene", "lights": lights}
     path.write_text(json.dumps(data))
     return data
 

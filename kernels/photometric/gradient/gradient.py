@@ -1,7 +1,7 @@
 """Diffuse normals and albedo from responses to spherical gradients.
 
 Lambertian and convex: M₀ = ρ/π ∫ cos θ dω = ρ and M = ρ/π ∫ ω cos θ dω = (2/3) ρ n over the hemisphere about n, so the normal is
-M/|M|, the albedo M₀, and (3/2)|M|/M₀ is one. Occlusion and light from neighbours make it less: the confidence says so.
+M/|M|, the albedo M₀, and (3/2)|M|/M₀ is one. Occlusion and light from neighbours make it less: the standard error says so.
 
 Source: Ma et al., "Rapid Acquisition of Specular and Diffuse Normal Maps from Polarized Spherical Gradient Illumination",
 EGSR 2007, section 3.1.
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import warp as wp
 
 from kernels import device as devices
-from kernels.normal_equations import CONFIDENCE_HALF
 from kernels.packs import zeros
 from kernels.photometric.gradient.moments import Moments
 from kernels.status import DARK, ILL_POSED, OK
@@ -33,7 +32,7 @@ class GradientFit(NamedTuple):
 
     normal: wp.array  # [3, pixels] float32, unit
     albedo: wp.array  # [3, pixels] float32, scene-linear
-    confidence: wp.array  # [pixels] float32, 0…1
+    sigma: wp.array  # [pixels] float32, standard error of the normal, degrees
     bent: wp.array  # [pixels] float32, the part of the standard error that a length other than one stands for, degrees
     length: wp.array  # [pixels] float32, (3/2)|M|/M₀: one on a convex Lambertian surface
     status: wp.array  # [pixels] int32, kernels.status.Status
@@ -41,14 +40,14 @@ class GradientFit(NamedTuple):
 
 def diffuse_normals(diffuse: Moments, grey_weights: tuple[float, float, float], *, gain: float, pixel_count: int,
                     device: str) -> GradientFit:
-    """Estimate normal, albedo and confidence from diffuse responses; not synchronised on CUDA.
+    """Estimate normal, albedo and standard error from diffuse responses; not synchronised on CUDA.
 
     Args:
         grey_weights: of the channels, for the normal; they add up to one.
         gain: diffuse light over what the frames hold of it: 2 behind a crossed analyser, else 1.
 
     Convention:
-        confidence = 1 / (1 + σ/1°) with σ² = 2 v s² (M₀/|M|)² + 2e + tilt², v the variance of M, s² the residual variance with
+        σ² = 2 v s² (M₀/|M|)² + 2e + tilt², v the variance of M, s² the residual variance with
         one pseudo-observation of 1 %, and e how far (3/2)|M|/M₀ is from one, less twice what rounding and residual explain: light
         that is missing or added across the normal tilts M by δ and changes its length by δ²/2.
     """
@@ -71,7 +70,7 @@ def _diffuse_kernel(first: int,
                     # outputs
                     normal: wp.array2d(dtype=float),  # [3, N]
                     albedo: wp.array2d(dtype=float),  # [3, N]
-                    confidence: wp.array(dtype=float),  # [N]
+                    sigma: wp.array(dtype=float),  # [N]
                     bend: wp.array(dtype=float),  # [N]
                     length: wp.array(dtype=float),  # [N]
                     status: wp.array(dtype=int)):  # [N]
@@ -100,5 +99,5 @@ def _diffuse_kernel(first: int,
     noise = 2.0 * variance[p] * squares / ((spare[p] + 1.0) * size * size)
     explained = wp.static(2.0 * 1.5) * wp.sqrt(variance[p]) * (ROUNDING + residual[p])
     bent = 2.0 * wp.max(wp.abs(1.0 - 1.5 * size) - explained, 0.0)
-    bend[p] = wp.sqrt(bent) / CONFIDENCE_HALF
-    confidence[p] = 1.0 / (1.0 + wp.sqrt(noise + bent + tilt[p] * tilt[p]) / CONFIDENCE_HALF)
+    bend[p] = wp.degrees(wp.sqrt(bent))
+    sigma[p] = wp.degrees(wp.sqrt(noise + bent + tilt[p] * tilt[p]))

@@ -17,6 +17,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, channels_type, pack_type, zeros
 from kernels.status import DARK, OK, TOO_FEW_LIGHTS
 
@@ -72,6 +73,7 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
 def _moments_kernel(pack: int) -> Any:
     half_pack, byte_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8)
     float_pack, int_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.int32), channels_type(pack)
+    load, load_byte = pack_load(pack, wp.float16), pack_load(pack, wp.uint8)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def moments_kernel(first: int,
@@ -96,10 +98,10 @@ def _moments_kernel(pack: int) -> Any:
         m0, mx, my, mz = channels(), channels(), channels(), channels()  # right-hand sides, and then M₀ and M
         for frame in range(frames.shape[0]):
             light = frames[frame]
-            red = values[light, p]
-            green = values[lights + light, p]
-            blue = values[2 * lights + light, p]
-            bits = saturated[light / 8, p]
+            red = load(values, light, p)
+            green = load(values, lights + light, p)
+            blue = load(values, 2 * lights + light, p)
+            bits = load_byte(saturated, light / 8, p)
             shift = light % 8
             unit = scale[frame]
             mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
@@ -120,7 +122,7 @@ def _moments_kernel(pack: int) -> Any:
                 gyy[k] += w * y * y
                 gzz[k] += w * z * z
             for c in range(3):
-                reading = values[c * lights + light, p]
+                reading = load(values, c * lights + light, p)
                 for k in range(pack):
                     value = wp.where(used[k] > 0.0, unit * float(reading[k]), 0.0)
                     m0[c, k] += mean * value
@@ -157,13 +159,13 @@ def _moments_kernel(pack: int) -> Any:
         squares = float_pack()
         for frame in range(frames.shape[0]):
             light = frames[frame]
-            cut = saturated[light / 8, p]
+            cut = load_byte(saturated, light / 8, p)
             shift = light % 8
             unit = scale[frame]
             mean, x, y, z = rows[frame][0], rows[frame][1], rows[frame][2], rows[frame][3]
             read, told = float_pack(), float_pack()
             for c in range(3):
-                reading = values[c * lights + light, p]
+                reading = load(values, c * lights + light, p)
                 for k in range(pack):
                     read[k] += grey[c] * float(reading[k])
                     told[k] += grey[c] * (mean * m0[c, k] + x * mx[c, k] + y * my[c, k] + z * mz[c, k])

@@ -8,6 +8,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, vector_at, zeros
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearLights, directions_in, falloff_or_none, toward_or_none
@@ -62,7 +63,7 @@ def albedo_of(above: float, below: float) -> float:
 
 @once
 def _albedo_kernel(pack: int, near: bool = False) -> Any:
-    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    half_pack, float_pack, load = pack_type(pack, wp.float16), pack_type(pack, wp.float32), pack_load(pack, wp.float16)
     directions_of, step = directions_in(pack, near)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -84,9 +85,9 @@ def _albedo_kernel(pack: int, near: bool = False) -> Any:
         below_r, below_g, below_b = float_pack(), float_pack(), float_pack()
         lights = directions.shape[0]
         for light in range(lights):
-            red = values[light, p]
-            green = values[lights + light, p]
-            blue = values[2 * lights + light, p]
+            red = load(values, light, p)
+            green = load(values, lights + light, p)
+            blue = load(values, 2 * lights + light, p)
             at = p * pack_stride + light * light_stride
             weight = weights[at]
             lx, ly, lz = directions_of(directions, toward, light, at)

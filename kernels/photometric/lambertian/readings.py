@@ -13,6 +13,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, new_array, pack_type
 
 UNIT_TOLERANCE = 1e-3
@@ -146,6 +147,7 @@ def grey_readings(band: Band, factors: np.ndarray) -> Readings:
 @once
 def _grey_kernel(pack: int) -> Any:
     half_pack, byte_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.uint8), pack_type(pack, wp.float32)
+    load, load_byte, store = pack_load(pack, wp.float16), pack_load(pack, wp.uint8), pack_store(pack, wp.float32, 1)
 
     @wp.kernel(enable_backward=False, module="unique")
     def grey_kernel(first: int,
@@ -164,16 +166,16 @@ def _grey_kernel(pack: int) -> Any:
             shift = light % 8
             fr, fg, fb = factors[light, 0], factors[light, 1], factors[light, 2]
             for p in range(begin, end):
-                red = values[light, p]
-                green = values[lights + light, p]
-                blue = values[2 * lights + light, p]
-                bits = saturated[light / 8, p]
+                red = load(values, light, p)
+                green = load(values, lights + light, p)
+                blue = load(values, 2 * lights + light, p)
+                bits = load_byte(saturated, light / 8, p)
                 grey = float_pack()
                 for k in range(pack):
                     value = fr * float(red[k]) + fg * float(green[k]) + fb * float(blue[k])
                     cut = (int(bits[k]) >> shift) & 1
                     measured = wp.where(value < LARGEST, wp.max(value, 0.0), 0.0)  # 0 also for NaN
                     grey[k] = wp.where(cut == 0, measured, 0.0)
-                readings[p * pack_stride + light * light_stride] = grey
+                store(readings, p * pack_stride + light * light_stride, grey)
 
     return grey_kernel

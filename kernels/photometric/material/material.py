@@ -28,10 +28,11 @@ from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.photometric.material.material_kernel import GIVEN, GIVEN_F0, NEUTRAL, TINTED, material_kernel
+from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.lobes import direction_reflectance
 from kernels.photometric.model.response_table import COLUMNS
 from kernels.photometric.model.robust_weights import WEIGHT_ROWS
-from kernels.photometric.model.samples import Samples, choose, per_pixel, scratch_memory, to_host
+from kernels.photometric.model.samples import Samples, per_pixel, scratch_memory, to_host
 from kernels.photometric.model.tabulated_lobes import tabulated_reflectance
 from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, criteria
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from kernels.photometric.material.material import BRIGHTEST_DIELECTRIC, COST_FLOOR, Material, fit_given
 from kernels.photometric.model.candidates import LEAST_NZ, rings
-from kernels.photometric.model.samples import Samples, choose, to_host
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import Samples, to_host
 from kernels.photometric.search.hypotheses import Diffuse
 
 WIDE = ((4.0, 9.0, 15.0), 12)

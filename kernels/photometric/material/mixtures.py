@@ -21,9 +21,10 @@ from kernels.packs import channels_type, pack_type, vector_at
 from kernels.photometric.material.material import COST_FLOOR, Material
 from kernels.photometric.material.material_kernel import REWEIGHTINGS, common_weight
 from kernels.photometric.material.shared_materials import LEAST_GAIN
+from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.lobes import RESPONSES, Reflectance, direction_reflectance
 from kernels.photometric.model.robust_weights import LOG_GROUP, WEIGHT_ROWS, Criteria, plain_weights, weigh
-from kernels.photometric.model.samples import Samples, choose, per_pixel, samples_type, scratch_memory, scratch_type, to_host
+from kernels.photometric.model.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 from kernels.photometric.search.hypotheses import Diffuse, criteria
 
 MIXED_ROWS = 6

@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.errors import ArrayError
-from kernels.normal_equations import CONFIDENCE_HALF
 from kernels.photometric.model.samples import evenly
 
 SMOOTHNESS = np.radians(32.0)
@@ -74,13 +73,6 @@ class PairFits(NamedTuple):
     freedom: np.ndarray  # [2, pairs]
 
 
-class Uncertainty(NamedTuple):
-    """The uncertainty of normals."""
-
-    sigma: np.ndarray  # [pixels] standard error, degrees
-    confidence: np.ndarray  # [pixels] 0…1
-
-
 def measure_misfit(pairs: PairFits) -> Misfit:
     """Return what pairs of neighbouring pixels say about the misfit of an object."""
     lights, _, count = pairs.readings.shape
@@ -111,17 +103,16 @@ def _share(common: np.ndarray, total: np.ndarray) -> float:
     return float(np.clip((middle - error) / max(np.median(total), 1e-30), 0, 1))
 
 
-def uncertainty_of(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray, agreeing: np.ndarray, misfit: Misfit) -> Uncertainty:
-    """Return the standard error and the confidence of normals, of which the [pixels] of a NormalFit are given."""
+def standard_error(across: np.ndarray, squares: np.ndarray, freedom: np.ndarray, agreeing: np.ndarray, misfit: Misfit) -> np.ndarray:
+    """Return the standard error of normals in degrees, [pixels] float32, of which the [pixels] of a NormalFit are given."""
     across, squares, freedom = (np.asarray(values, dtype=np.float64) for values in (across, squares, freedom))
     level = np.where(freedom > 0, misfit.level, max(misfit.level, UNKNOWN_LEVEL))
     variance = (PRIOR * level + squares) / (PRIOR + freedom)
     share = np.interp(np.log(np.maximum(variance, 1e-30)), np.log(np.maximum(misfit.residuals, 1e-30)), misfit.share)
     own = across * variance * np.maximum(1 + share * misfit.excess * freedom, 0.0)
     right = np.clip((agreeing - MAJORITY) / (CLEAR_MAJORITY - MAJORITY), 0, 1)
-    sigma = np.minimum(np.degrees(np.sqrt(right * own + (1 - right) * np.maximum(own, WRONG_FIT**2))), LARGEST_ERROR)
-    confidence = right / (1 + np.sqrt(own) / CONFIDENCE_HALF)
-    return Uncertainty(sigma.astype(np.float32), confidence.astype(np.float32))
+    sigma = np.degrees(np.sqrt(right * own + (1 - right) * np.maximum(own, WRONG_FIT**2)))
+    return np.minimum(sigma, LARGEST_ERROR).astype(np.float32)
 
 
 def _median_of_chi_squared(freedom: np.ndarray) -> np.ndarray:

@@ -24,58 +24,76 @@ from kernels.packs import pack_type, vector_at
 from kernels.photometric.model.candidates import candidate_at, rings
 from kernels.photometric.model.samples import Samples, per_pixel, to_host
 from kernels.photometric.search.normal_search import Found
-from kernels.photometric.search.survey import Survey, evidence
+from kernels.photometric.search.survey import Survey, evidence, noise_of
 
 LEAST_RISE = 0.05
 """Least rise of the cost in the flattest direction as a fraction of the mean: less is rounding."""
-CAMERA_COST = 0.03
-"""Cost of a reading that the noise of a camera explains, 2 % of it; misfit beyond is that of the model."""
-UNAVERAGED = 1 / 24
+CAMERA_COST = 0.01
+"""Cost of a reading that the noise of a camera explains, 1 % of it; misfit beyond is that of the model."""
+UNAVERAGED = 1 / 8
 """Part of the variance of one reading's misfit that remains however many lights there are, because the misfit of neighbouring lights is
 alike."""
+FREE = 0.4
+"""Part of the variance by the curvature of the mixture, and of the squared spread of models averaged, that errors have: lobes that are free
+let a normal go further than the truth does, and a mean errs less than what it is the mean of."""
 SOFTNESS = 0.2
 """Part of the whole cost by which costs of candidates may differ through misfit of the model alone."""
 BREAKDOWN = 0.5
 """Cost of a reading at which half of the readings contradict the normal, a contradiction costing about 1: no robust fit survives that."""
-FLATTEST, MOST_ELSEWHERE = 16.0, 25.0
-"""Most that the flatness of a mode and that other modes count in the standard deviation, degrees, 30 together: beyond, it is the
-probability that says that nothing is known."""
+FLATTEST, MOST_ELSEWHERE, MOST = 16.0, 25.0, 29.0
+"""Most that the flatness of a mode and that other modes count in the standard deviation, and the most that it says, degrees: normals of
+which hardly anything is known count as solved unless less than that is asked for."""
 APART_DEGREES, APART_SIGMAS = 4.0, 3.0
 """A candidate belongs to another mode when it is further away than this, in degrees and in standard deviations."""
 
 
-class Certainty(NamedTuple):
-    """The certainty of each sampled normal."""
-
-    sigma: np.ndarray  # [n] float32, degrees: standard deviation about the mode, and the distance of other modes times their probability
-    probability: np.ndarray  # [n] float32, 0…1, that the normal is at the right mode
+UNDESCRIBED = 0.9
+"""Logarithm of the factor on the standard deviation where half of the readings contradict the normal."""
 
 
-def assess(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray) -> Certainty:
-    """Return how sure the normals of a search are; waits for the device.
+class SingleLobe(NamedTuple):
+    """The joint fit of a single lobe, where it takes part in the average of a pixel's normals; [n] each."""
+
+    weight: np.ndarray  # 0…1, of its normal
+    cost: np.ndarray  # per light
+    openness: np.ndarray  # variance of its normal per unit of noise, squared radians
+
+
+def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, single: SingleLobe | None) -> np.ndarray:
+    """Return the standard deviation, in degrees, of the normals of a search, [n] float32; waits for the device.
 
     Args:
         normal: [n, 3] unit, the result, which may be an average of several searches.
         spread: [n] of that average, degrees.
+        single: the single lobe, whose curvature and noise count by its weight; None: it takes no part.
     """
     lights = samples.light_count
     total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)
     mean = lights * np.maximum(found.best.curvature.astype(np.float64), 1e-12)
     swing = np.minimum(lights * found.best.swing, (1 - LEAST_RISE) * mean)
-    around = np.minimum(np.degrees(1.0) ** 2 * 2 * noise * mean / (mean**2 - swing**2), FLATTEST**2)
-    unaveraged = UNAVERAGED * lights * np.clip(1 - CAMERA_COST / noise, 0, 1)
-    variance = np.minimum(around * (1 + unaveraged) + spread.astype(np.float64) ** 2, FLATTEST**2)
+    mixed, around = np.ones(len(normal)), FREE * _around(2 * mean / (mean**2 - swing**2), noise, lights)
+    if single is not None:
+        mixed = 1 - single.weight.astype(np.float64)
+        alone = noise_of(lights * single.cost.astype(np.float64), surplus)
+        around = mixed * around + single.weight * _around(single.openness.astype(np.float64), alone, lights)
+        noise = mixed * noise + single.weight * alone
+    variance = np.minimum(around + FREE * spread.astype(np.float64) ** 2, FLATTEST**2)
     apart = np.maximum(APART_DEGREES, APART_SIGMAS * np.sqrt(variance))
     softness = 2 * noise + SOFTNESS * total
     judged = np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1)
     here, there, moment = _masses(found.survey, normal, judged).astype(np.float64).T
     here = np.maximum(here, math.pi * variance)
-    whole = here + there
-    elsewhere = there / whole * np.sqrt(moment / np.maximum(there, 1e-20))
-    explained = np.clip(1 - (noise / BREAKDOWN) ** 2, 0, 1)
-    checked = (surplus + 1) / (surplus + 2)
-    sigma = np.sqrt(variance + np.minimum(elsewhere, MOST_ELSEWHERE) ** 2)
-    return Certainty(sigma.astype(np.float32), (checked * explained * here / whole).astype(np.float32))
+    elsewhere = mixed * there / (here + there) * np.sqrt(moment / np.maximum(there, 1e-20))
+    unchecked = (surplus + 2) / (surplus + 1)
+    undescribed = np.exp(UNDESCRIBED * np.minimum(noise / BREAKDOWN, 1) ** 2)
+    sigma = unchecked * undescribed * np.sqrt(variance + np.minimum(elsewhere, MOST_ELSEWHERE) ** 2)
+    return np.asarray(np.minimum(sigma, MOST), dtype=np.float32)
+
+
+def _around(openness: np.ndarray, noise: np.ndarray, lights: int) -> np.ndarray:
+    """Return the variance about a mode, [n] squared degrees, of a normal whose variance per unit of noise is given in squared radians."""
+    unaveraged = UNAVERAGED * lights * np.clip(1 - CAMERA_COST / noise, 0, 1)
+    return np.asarray(np.minimum(np.degrees(1.0) ** 2 * openness * noise, FLATTEST**2) * (1 + unaveraged))
 
 
 def _masses(surveyed: Survey | None, normal: np.ndarray, judged: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.model.samples import Samples, choose, device_values, host_values
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import Samples, device_values, host_values
 from kernels.photometric.search.descent import COLD, WARM, descend
 from kernels.photometric.search.hypotheses import Diffuse, predict
 from kernels.spread import MAD_TO_SIGMA

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kernels.photometric.model.samples import Samples, choose
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import Samples
 from kernels.photometric.search.descent import WARM, Descent, descend
 from kernels.photometric.search.hypotheses import Diffuse, Prior, SearchOptions
 from kernels.photometric.search.survey import CLOSE, Survey, Sweep, survey
@@ -34,13 +35,17 @@ def neighbours(pixels: np.ndarray, width: int) -> np.ndarray:
 
     `pixels` are [n] row-major positions in an image of this width, ascending.
     """
-    rows, columns = np.divmod(pixels, width)
     found = np.full((len(STEPS), len(pixels)), -1, dtype=np.int32)
-    for step, (down, right) in enumerate(STEPS):
-        wanted = (rows + down) * width + columns + right
-        place = np.minimum(np.searchsorted(pixels, wanted), len(pixels) - 1)
+    if not len(pixels):
+        return found
+    columns = pixels % width
+    steps = [down * width + right for down, right in STEPS]
+    first = int(pixels[0]) + min(steps)
+    place = np.full(int(pixels[-1]) + max(steps) - first + 1, -1, dtype=np.int32)  # of each pixel of the image about the chosen ones
+    place[pixels - first] = np.arange(len(pixels), dtype=np.int32)
+    for step, (_, right) in enumerate(STEPS):
         inside = (columns + right >= 0) & (columns + right < width)
-        found[step] = np.where(inside & (pixels[place] == wanted), place, -1)
+        found[step] = np.where(inside, place[pixels - first + steps[step]], -1)
     return found
 
 

@@ -36,6 +36,8 @@ damping of 0.01 the cost of real and path-traced objects ends up to two per cent
 LEAST_ROUGHNESS = 0.05
 """Least roughness: a narrower lobe falls between the lights of any rig."""
 
+OPEN = 1.0e6
+"""Variance of a normal that the readings leave open, squared radians per unit of noise."""
 HELD = WEIGHT_ROWS + 2
 """Values that scratch memory holds for each light: its weights, h·v and Schlick's rise."""
 
@@ -46,6 +48,7 @@ class Refinement(NamedTuple):
     normal: np.ndarray  # [n, 3] float32, unit
     roughness: np.ndarray  # [n] float32
     cost: np.ndarray  # [n] float32, per light, as of the material fit
+    openness: np.ndarray  # [n] float32, variance of the normal per unit of noise, both tilts together, squared radians
 
 
 def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape: Diffuse) -> Refinement:
@@ -58,13 +61,13 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
         roughness: [n] of the material fit at these normals.
     """
     device, lanes, packs = samples.device, samples.lanes, samples.packs
-    refined = wp.empty((5, packs), dtype=pack_type(lanes, wp.float32), device=device)
+    refined = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
     start = np.concatenate([normal, roughness[:, None]], axis=1)
     scratch = scratch_memory(samples, HELD)
     devices.launch(_refine_kernel(lanes), packs,
                    [samples.arrays, per_pixel(samples, start), criteria(None, shape)], [scratch, refined], device=device)
     values = to_host(samples, refined)
-    return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count)
+    return Refinement(values[:, :3], values[:, 3], values[:, 4] / samples.light_count, values[:, 5])
 
 
 @wp.func
@@ -90,6 +93,15 @@ def solve_symmetric(m00: float, m01: float, m02: float, m11: float, m12: float, 
     return wp.where(sound, x / wp.max(bottom, 1.0e-30), wp.vec3())
 
 
+@wp.func
+def tilt_variance(m00: float, m01: float, m02: float, m11: float, m12: float, m22: float):
+    """Return the sum of the first two diagonal elements of the inverse of a symmetric 3 × 3 matrix; OPEN where it has none."""
+    c00 = m11 * m22 - m12 * m12
+    bottom = m00 * c00 + m01 * (m02 * m12 - m01 * m22) + m02 * (m01 * m12 - m02 * m11)
+    sound = m00 > 0.0 and m11 > 0.0 and m22 > 0.0 and bottom > 1.0e-6 * m00 * m11 * m22
+    return wp.where(sound, (c00 + m00 * m22 - m02 * m02) / wp.max(bottom, 1.0e-30), OPEN)
+
+
 @once
 def _refine_kernel(lanes: int) -> Any:
     write_weights = plain_weights(lanes)
@@ -105,7 +117,7 @@ def _refine_kernel(lanes: int) -> Any:
                       criteria: Criteria,
                       # outputs
                       scratch: scratch_struct,  # HELD values a light
-                      refined: wp.array2d(dtype=lane_type)):  # [5, P] normal, roughness, cost
+                      refined: wp.array2d(dtype=lane_type)):  # [6, P] normal, roughness, cost, openness
         p = first + wp.tid()
         vx = samples.view[0, p]
         vy = samples.view[1, p]
@@ -137,7 +149,7 @@ def _refine_kernel(lanes: int) -> Any:
             at = base + light * light_step
             values[at + WEIGHT_ROWS * step] = hv
             values[at + wp.static(WEIGHT_ROWS + 1) * step] = rise
-        best, damping, again = lane_type(1.0e30), lane_type(DAMPING), lane_type()
+        best, damping, again, openness = lane_type(1.0e30), lane_type(DAMPING), lane_type(), lane_type(OPEN)
         best_x, best_y, best_z, best_rough = lane_type(), lane_type(), lane_type(), lane_type()
         rho, f0, best_rho, best_f0 = channels(), channels(), channels(), channels()
         for turn in range(wp.static(LINEAR_TURNS + STEPS + 1)):
@@ -290,6 +302,7 @@ def _refine_kernel(lanes: int) -> Any:
                         m22 -= inverse * e[2] * e[2] + further * h[2] * h[2]
                         right += wp.vec3(jy[3 * c, k], jy[3 * c + 1, k], jy[3 * c + 2, k])
                         right -= (inverse * rd[c, k]) * e + (further * (rs[c, k] - inverse * ds[k] * rd[c, k])) * h
+                    openness[k] = tilt_variance(m00, m01, m02, m11, m12, m22)
                     heavier = 1.0 + damping[k]
                     move = solve_symmetric(heavier * m00, m01, m02, heavier * m11, m12, heavier * m22, right)
                     move = wp.where(turn < LINEAR_TURNS, wp.vec3(), move)
@@ -319,5 +332,9 @@ def _refine_kernel(lanes: int) -> Any:
         refined[2, p] = best_z
         refined[3, p] = best_rough
         refined[4, p] = best
+        unit = samples.level[p]
+        for k in range(lanes):
+            openness[k] *= 3.0 * unit[k] * unit[k]  # weights are relative to the level, and those of the mean of three channels
+        refined[5, p] = openness
 
     return refine_kernel

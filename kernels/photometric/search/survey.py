@@ -14,7 +14,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import pack_type
-from kernels.photometric.model.samples import Samples, choose, samples_type, to_host
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import Samples, samples_type, to_host
 from kernels.photometric.search.descent import Descent, Schedule, descend
 from kernels.photometric.search.hypotheses import Diffuse, Prior, RingOptions, SearchOptions, search_normals
 
@@ -42,7 +43,12 @@ def evidence(samples: Samples, cost: np.ndarray, weights: np.ndarray) -> Evidenc
     unknowns = DIRECTION + (weights > USED).sum(axis=1)
     total = cost.astype(np.float64) * samples.light_count
     surplus = np.maximum(_informative(samples) - unknowns, 0)
-    return Evidence(total, surplus, (total + EXPECTED_COST * PSEUDO_READINGS) / (surplus + PSEUDO_READINGS))
+    return Evidence(total, surplus, noise_of(total, surplus))
+
+
+def noise_of(total: np.ndarray, surplus: np.ndarray) -> np.ndarray:
+    """Return the cost of a reading beyond the unknowns, [n], where all cost [n] and so many could have contradicted the fit, [n]."""
+    return np.asarray((total + EXPECTED_COST * PSEUDO_READINGS) / (surplus + PSEUDO_READINGS))
 
 
 def _informative(samples: Samples) -> np.ndarray:

@@ -37,14 +37,14 @@ def bounce_albedo(samples: Samples, normal: np.ndarray, tinted: Material, *, sha
     return np.where(metal[:, None], tinted.diffuse_albedo, matt)
 
 
-def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray, shares: np.ndarray, albedo: np.ndarray,
+def subtract_bounce(samples: Samples, arriving: "np.ndarray | wp.array", corners: np.ndarray, shares: np.ndarray, albedo: np.ndarray,
                     grey_weights: np.ndarray, field: NearField | None = None) -> None:
     """Subtract albedo · arriving light from the readings; a reading does not fall below zero.
 
     Args:
         samples: changed in place.
         arriving: [patches, 3, lights] float32: what a surface of albedo 1 at each patch sends on, per irradiance of a distant or extended
-            light, or intensity of a near one.
+            light, or intensity of a near one; on the device of the samples or on the host.
         corners: [n, 4] int, the patches about each pixel.
         shares: [n, 4] float32, their interpolation weights.
         albedo: [n, 3] diffuse albedo of each pixel.
@@ -67,9 +67,10 @@ def subtract_bounce(samples: Samples, arriving: np.ndarray, corners: np.ndarray,
         near = (nowhere, nowhere, wp.empty((3, 0), dtype=pack_type(samples.lanes, wp.float32), device=device))
     else:
         near = (*(wp.array(values, dtype=wp.vec4, device=device) for values in field.places), per_pixel(samples, field.points.T))
+    light = arriving if isinstance(arriving, wp.array) else wp.array(arriving, dtype=wp.float32, device=device)
     devices.launch(_bounce_kernel(samples.lanes, field is not None), samples.packs,
-                   [wp.array(arriving, dtype=wp.float32, device=device), per_pixel(samples, corners), per_pixel(samples, shares),
-                    per_pixel(samples, albedo), *near, wp.vec3(*(float(w) for w in grey_weights))], [samples.arrays], device=device)
+                   [light, per_pixel(samples, corners), per_pixel(samples, shares), per_pixel(samples, albedo), *near,
+                    wp.vec3(*(float(w) for w in grey_weights))], [samples.arrays], device=device)
 
 
 @once

@@ -21,6 +21,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, zeros
 
 TILE = 4
@@ -197,7 +198,7 @@ def gram_kernel(pack: int) -> Any:
 
     A product of two half values is exact in float.
     """
-    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    half_pack, float_pack, load = pack_type(pack, wp.float16), pack_type(pack, wp.float32), pack_load(pack, wp.float16)
     side = wp.types.matrix(shape=(TILE, pack), dtype=wp.float32)
     sums = wp.types.matrix(shape=(TILE, TILE), dtype=wp.float64)
 
@@ -222,11 +223,11 @@ def gram_kernel(pack: int) -> Any:
             counts = keep[p]
             down, across = side(), side()
             for i in range(TILE):
-                upper = values[row + i, p]
+                upper = load(values, row + i, p)
                 for k in range(pack):
                     down[i, k] = float(upper[k]) * counts[k]
             for j in range(TILE):
-                lower = values[column + j, p]
+                lower = load(values, column + j, p)
                 for k in range(pack):
                     across[j, k] = float(lower[k])
             for i in range(TILE):
@@ -243,7 +244,7 @@ def gram_kernel(pack: int) -> Any:
 @cache
 def residual_kernel(pack: int) -> Any:
     """Return the kernel: one thread for a pack of one channel."""
-    half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    half_pack, float_pack, load = pack_type(pack, wp.float16), pack_type(pack, wp.float32), pack_load(pack, wp.float16)
 
     @wp.kernel(enable_backward=False, module="unique")
     def residual(first: int,
@@ -264,7 +265,7 @@ def residual_kernel(pack: int) -> Any:
             rebuilt = float_pack()
             for t in range(functions.shape[2]):
                 rebuilt += functions[channel, light, t] * coefficients[t, channel, p]
-            value = values[channel * gains.shape[1] + light, p]
+            value = load(values, channel * gains.shape[1] + light, p)
             gain = gains[channel, light]
             for k in range(pack):
                 difference = wp.clamp(rebuilt[k], low, high) - gain * float(value[k])

@@ -19,6 +19,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, as_packs, pack_type, zeros
 
 PTM_TERMS = 6
@@ -167,7 +168,7 @@ def srgb(linear: float) -> float:
 @cache
 def encode_kernel(pack: int) -> Any:
     """Return the kernel: one thread for a pack of one light, all three channels."""
-    half_pack = pack_type(pack, wp.float16)
+    half_pack, load, store = pack_type(pack, wp.float16), pack_load(pack, wp.float16), pack_store(pack, wp.float16)
 
     @wp.kernel(enable_backward=False, module="unique")
     def encode_display(first: int,
@@ -182,9 +183,9 @@ def encode_kernel(pack: int) -> Any:
         p = thread % packs
         lights = gains.shape[1]
         gain = wp.vec3(gains[0, light], gains[1, light], gains[2, light])
-        red = values[light, p]
-        green = values[lights + light, p]
-        blue = values[2 * lights + light, p]
+        red = load(values, light, p)
+        green = load(values, lights + light, p)
+        blue = load(values, 2 * lights + light, p)
         r, g, b = half_pack(), half_pack(), half_pack()
         for k in range(pack):
             scene = wp.cw_mul(gain, wp.vec3(float(red[k]), float(green[k]), float(blue[k])))
@@ -192,8 +193,8 @@ def encode_kernel(pack: int) -> Any:
             r[k] = wp.float16(srgb(shown[0]))
             g[k] = wp.float16(srgb(shown[1]))
             b[k] = wp.float16(srgb(shown[2]))
-        encoded[light, p] = r
-        encoded[lights + light, p] = g
-        encoded[2 * lights + light, p] = b
+        store(encoded, light, p, r)
+        store(encoded, lights + light, p, g)
+        store(encoded, 2 * lights + light, p, b)
 
     return encode_display

@@ -20,6 +20,7 @@ import warp as wp
 
 from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, as_packs, new_array, pack_type, zeros
 from kernels.relight.frames import cublas
 
@@ -175,6 +176,7 @@ def frame_chunk_kernel(pack: int) -> Any:
 def frame_register_kernel(pack: int) -> Any:
     """Return the CUDA kernel: one thread for a pack, its sum in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
+    load, store = pack_load(pack, wp.float16), pack_store(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
     def combine_register(first: int,
@@ -188,11 +190,11 @@ def frame_register_kernel(pack: int) -> Any:
         p = thread % packs
         total = float_pack()
         for light in range(weights.shape[1]):
-            value = values[channel * weights.shape[1] + light, p]
+            value = load(values, channel * weights.shape[1] + light, p)
             w = weights[channel, light]
             for k in range(pack):
                 total[k] += float(value[k]) * w
-        frame[channel, p] = total
+        store(frame, channel, p, total)
 
     return combine_register
 
@@ -236,7 +238,9 @@ def batch_chunk_kernel(pack: int) -> Any:
 @cache
 def batch_register_kernel(pack: int, half: bool = True) -> Any:
     """Return the CUDA kernel for half or float32 rows: one thread for a pack and eight frames, their sums in registers."""
-    row_pack, float_pack = pack_type(pack, wp.float16 if half else wp.float32), pack_type(pack, wp.float32)
+    scalar = wp.float16 if half else wp.float32
+    row_pack, float_pack = pack_type(pack, scalar), pack_type(pack, wp.float32)
+    load, store = pack_load(pack, scalar), pack_store(pack, wp.float32, 3)
     sums = wp.types.matrix(shape=(REGISTER_FRAMES, pack), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -252,7 +256,7 @@ def batch_register_kernel(pack: int, half: bool = True) -> Any:
         f = thread / packs / weights.shape[1] * REGISTER_FRAMES
         total = sums()
         for light in range(weights.shape[2]):
-            value = values[channel * weights.shape[2] + light, p]
+            value = load(values, channel * weights.shape[2] + light, p)
             for g in range(REGISTER_FRAMES):
                 w = weights[f + g, channel, light]
                 for k in range(pack):
@@ -261,6 +265,6 @@ def batch_register_kernel(pack: int, half: bool = True) -> Any:
             out = float_pack()
             for k in range(pack):
                 out[k] = total[g, k]
-            frames[f + g, channel, p] = out
+            store(frames, f + g, channel, p, out)
 
     return batch_register

@@ -17,6 +17,7 @@ import warp as wp
 
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
+from kernels.pack_access import pack_load
 from kernels.packs import bit_of, channels_type, pack_type
 from kernels.relight.model.beyond import spacing
 from kernels.relight.model.captured import Captured, images_type
@@ -80,6 +81,7 @@ def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> n
 @cache
 def _compare_kernel(pack: int) -> Any:
     lane_type, images_struct, channels, evaluate = pack_type(pack, wp.float32), images_type(pack), channels_type(pack), lobes(pack)
+    load, load_half, load_byte = (pack_load(pack, kind) for kind in (wp.float32, wp.float16, wp.uint8))
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def compare_kernel(first: int,
@@ -100,12 +102,14 @@ def _compare_kernel(pack: int) -> Any:
                     at = wp.where(corner == 0, near[0], wp.where(corner == 1, near[1], wp.where(corner == 2, near[2], light)))
                     part = wp.where(corner == 0, parts[0], wp.where(corner == 1, parts[1], wp.where(corner == 2, parts[2], -1.0)))
                     facing, gloss, _, _ = evaluate(images.surface, p, images.places[at], wp.vec4())
-                    lit = images.visible[at, p]
-                    bits = images.clipped[at / 8, p]
+                    lit = load_byte(images.visible, at, p)
+                    bits = load_byte(images.clipped, at / 8, p)
                     for k in range(pack):
                         counts[k] = wp.where(bit_of(bits[k], at) == 1, 0.0, counts[k])
                     for c in range(3):
-                        albedo, stored, factor = images.surface[3 + c, p], images.stored[c * images.padded + at, p], images.factors[at][c]
+                        albedo = load(images.surface, 3 + c, p)
+                        stored = load_half(images.stored, c * images.padded + at, p)
+                        factor = images.factors[at][c]
                         for k in range(pack):
                             seen = float(lit[k]) * wp.static(1.0 / 255.0)
                             reading = factor * float(stored[k])

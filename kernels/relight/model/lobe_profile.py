@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from kernels.microfacet import INVERSE_PI
+from kernels.pack_access import pack_load
 from kernels.packs import bit_of, pack_type
 from kernels.relight.model.captured import Captured, images_type
 from kernels.relight.model.guide import pooled
@@ -87,6 +88,7 @@ def fit_profile(moments: np.ndarray, pixels: np.ndarray, shape: tuple[int, int])
 @cache
 def _moments_kernel(pack: int) -> Any:
     lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
+    load, load_half, load_byte = (pack_load(pack, kind) for kind in (wp.float32, wp.float16, wp.uint8))
     sums_type = wp.types.matrix(shape=(MOMENTS, pack), dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
@@ -95,18 +97,18 @@ def _moments_kernel(pack: int) -> Any:
                        # outputs
                        moments: wp.array2d(dtype=lane_type)):  # [MOMENTS, P]
         p = first + wp.tid()
-        albedo_r = images.surface[3, p]
-        albedo_g = images.surface[4, p]
-        albedo_b = images.surface[5, p]
+        albedo_r = load(images.surface, 3, p)
+        albedo_g = load(images.surface, 4, p)
+        albedo_b = load(images.surface, 5, p)
         sums = sums_type()
         for light in range(images.places.shape[0]):
             facing, gloss, _, peak = evaluate(images.surface, p, images.places[light], wp.vec4())
             factor = images.factors[light]
-            red = images.stored[light, p]
-            green = images.stored[images.padded + light, p]
-            blue = images.stored[2 * images.padded + light, p]
-            bits = images.clipped[light / 8, p]
-            lit = images.visible[light, p]
+            red = load_half(images.stored, light, p)
+            green = load_half(images.stored, images.padded + light, p)
+            blue = load_half(images.stored, 2 * images.padded + light, p)
+            bits = load_byte(images.clipped, light / 8, p)
+            lit = load_byte(images.visible, light, p)
             for k in range(pack):
                 seen = float(lit[k]) * wp.static(1.0 / (3.0 * 255.0))
                 shine = seen * (gloss[0, k] + gloss[1, k] + gloss[2, k])

@@ -16,6 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
+from kernels.pack_access import pack_load
 from kernels.packs import as_packs, channels_type, pack_type
 from kernels.relight.model.sources import Sources
 
@@ -134,7 +135,7 @@ def _shade(surface: Surface, sources: SourcesOnDevice, visible: wp.array, *, far
 @cache
 def lobes(pack: int) -> Any:
     """Return the Warp function that evaluates the lobes of every pixel of a pack under a sample at one place."""
-    lane_type, channels = pack_type(pack, wp.float32), channels_type(pack)
+    lane_type, channels, load = pack_type(pack, wp.float32), channels_type(pack), pack_load(pack, wp.float32)
 
     @wp.func
     def evaluate(values: wp.array2d(dtype=lane_type), p: int, place: wp.vec4, axis: wp.vec4):
@@ -143,17 +144,17 @@ def lobes(pack: int) -> Any:
         t = 1 / (1 + (tan θ_h / α)²), with α of the first material, is 1 at the peak of its lobe and falls to 0.
         """
         facing, gloss, arriving, peak = lane_type(), channels(), lane_type(), lane_type()
-        nx = values[0, p]
-        ny = values[1, p]
-        nz = values[2, p]
-        vx = values[9, p]
-        vy = values[10, p]
-        vz = values[11, p]
+        nx = load(values, 0, p)
+        ny = load(values, 1, p)
+        nz = load(values, 2, p)
+        vx = load(values, 9, p)
+        vy = load(values, 10, p)
+        vz = load(values, 11, p)
         tx, ty, tz = lane_type(), lane_type(), lane_type()
         if place[3] > 0.0:
-            px = values[12, p]
-            py = values[13, p]
-            pz = values[14, p]
+            px = load(values, 12, p)
+            py = load(values, 13, p)
+            pz = load(values, 14, p)
             for k in range(pack):
                 lx = place[0] - px[k]
                 ly = place[1] - py[k]
@@ -185,10 +186,10 @@ def lobes(pack: int) -> Any:
             nv[k] = wp.max(nx[k] * vx[k] + ny[k] * vy[k] + nz[k] * vz[k], LEAST_FACING)
             u = wp.max(1.0 - hv, 0.0)
             rise[k] = u * u * u * u * u
-        rough = values[15, p]
-        whole = values[21, p]
-        middle = values[22, p]
-        narrow = values[23, p]
+        rough = load(values, 15, p)
+        whole = load(values, 21, p)
+        middle = load(values, 22, p)
+        narrow = load(values, 23, p)
         steady, raised, factor = lane_type(), lane_type(), lane_type()
         for k in range(pack):
             a2 = _alpha_squared(rough[k])
@@ -205,15 +206,15 @@ def lobes(pack: int) -> Any:
             raised[k] = shine * rise[k]
             steady[k] = shine - raised[k]
         for c in range(3):
-            f0 = values[6 + c, p]
+            f0 = load(values, 6 + c, p)
             for k in range(pack):
                 gloss[c, k] = f0[k] * steady[k] + raised[k]
-        share = values[20, p]
+        share = load(values, 20, p)
         most = float(0.0)
         for k in range(pack):
             most = wp.max(most, share[k])
         if most > 0.0:
-            other = values[19, p]
+            other = load(values, 19, p)
             for k in range(pack):
                 a2 = _alpha_squared(other[k])
                 spread = nh[k] * nh[k] * (a2 - 1.0) + 1.0
@@ -222,7 +223,7 @@ def lobes(pack: int) -> Any:
                 raised[k] = shine * rise[k]
                 steady[k] = shine - raised[k]
             for c in range(3):
-                f0 = values[16 + c, p]
+                f0 = load(values, 16 + c, p)
                 for k in range(pack):
                     gloss[c, k] = (1.0 - share[k]) * gloss[c, k] + f0[k] * steady[k] + raised[k]
         return facing, gloss, arriving, peak
@@ -252,7 +253,7 @@ def modelled(lit: float, albedo: float, facing: float, gloss: float) -> float:
 @cache
 def visibility(pack: int) -> Any:
     """Return the Warp function that interpolates the visibility of a sample between the occluders around it."""
-    lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
+    lane_type, byte_pack, load_byte = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), pack_load(pack, wp.uint8)
 
     @wp.func
     def seen(visible: wp.array2d(dtype=byte_pack), p: int, rows: wp.vec3i, parts: wp.vec3):
@@ -260,7 +261,7 @@ def visibility(pack: int) -> Any:
         whole = lane_type()
         for corner in range(3):
             if rows[corner] >= 0:
-                v = visible[rows[corner], p]
+                v = load_byte(visible, rows[corner], p)
                 part = parts[corner] * wp.static(1.0 / 255.0)
                 for k in range(pack):
                     whole[k] += part * float(v[k])
@@ -275,7 +276,7 @@ def visibility(pack: int) -> Any:
 @cache
 def _shade_kernel(pack: int, far: bool) -> Any:
     lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
-    evaluate, seen = lobes(pack), visibility(pack)
+    evaluate, seen, load = lobes(pack), visibility(pack), pack_load(pack, wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 0})
     def shade_kernel(first: int,
@@ -309,7 +310,7 @@ def _shade_kernel(pack: int, far: bool) -> Any:
                     matt[c, k] += e * (lit[k] * facing[k])
                     glossy[c, k] += e * (lit[k] * gloss[c, k])
         for c in range(3):
-            albedo = values[3 + c, p]
+            albedo = load(values, 3 + c, p)
             for k in range(pack):
                 matt[c, k] = albedo[k] * INVERSE_PI * matt[c, k]
             out[f, c, p] = matt[c]

@@ -33,10 +33,9 @@ def _inspect(path: Path, contents: GlbContents) -> Inspection:
     info = {"generator": document.asset.generator, "glTF": document.asset.version, **(document.asset.extras or {})}
     facts = {"asset_info": {key: str(value) for key, value in info.items() if value}, "extensions": list(document.extensionsUsed or ())}
     provenance = {key: str(value) for root in roots for key, value in (root.extras or {}).items()}
-    lenses = [(camera.name or "camera", camera.orthographic, camera.perspective) for camera in document.cameras]
     parts = [*_primitives(document), *_materials(path, contents), *(
-        Part("camera", name, "", {"orthographic_m": [2 * flat.xmag, 2 * flat.ymag]} if flat else {"degrees_high": math.degrees(lens.yfov)})
-        for name, flat, lens in lenses)]
+        Part("camera", camera.name or "camera", "", {"orthographic_m": [2 * flat.xmag, 2 * flat.ymag]}
+             if (flat := camera.orthographic) else {"degrees_high": math.degrees(camera.perspective.yfov)}) for camera in document.cameras)]
     beside = [path.parent / unquote(each.uri) for each in (*document.buffers, *document.images)
               if each.uri and not each.uri.startswith("data:")]
     warnings = [f"the asset needs {file}, which lies outside of it" for file in beside]

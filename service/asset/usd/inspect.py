@@ -20,19 +20,14 @@ from service.asset.usd.layers import PURPOSES
 from service.errors import AssetError
 from stage.errors import storage
 
-SUFFIXES = (".usda", ".usdc", ".usd", ".usdz")
 FIRST = Usd.TimeCode.EarliestTime()
 """The time at which an asset with time samples is inspected."""
 HINT_TOLERANCE = 1e-4
 """The largest deviation of extentsHint from the geometry, as a part of its size: more than float32 rounds."""
-BINARY = b"PXR-USDC"
-"""The first bytes of a binary layer."""
 
 
-def inspect_asset(path: Path) -> Inspection:
+def inspect_usd(path: Path) -> Inspection:
     """Open an asset, look at each of its variants, and run every validator on them."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise AssetError(f"{path}: relit inspect reads {', '.join(SUFFIXES)} and .glb")
     warnings = _check_package(path) if path.suffix.lower() == ".usdz" else []
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what USD would print about missing files is among the findings
     try:
@@ -48,8 +43,8 @@ def inspect_asset(path: Path) -> Inspection:
         for part in _parts(usd_stage, variant):
             parts.setdefault(repr((part.kind, part.name, part.facts)), part)
         for found in UsdValidation.ValidationContext(validators).Validate(usd_stage):
-            sentences = errors if found.GetType() == UsdValidation.ValidationErrorType.Error else warnings
-            sentences.append(f"{found.GetName()}: {' '.join(found.GetMessage().split())}")
+            wrong = found.GetType() == UsdValidation.ValidationErrorType.Error
+            (errors if wrong else warnings).append(f"{found.GetName()}: {' '.join(found.GetMessage().split())}")
         errors += _hint_findings(usd_stage.GetDefaultPrim())
     layers, files, _ = UsdUtils.ComputeAllDependencies(str(path))  # of every variant
     beside = {Path(Ar.SplitPackageRelativePathOuter(str(file))[0]).resolve() for file in [*(layer.realPath for layer in layers), *files]}
@@ -67,7 +62,7 @@ def _check_package(path: Path) -> list[str]:
     with storage("read", path):
         try:
             with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as layer:
-                damaged, binary = archive.testzip(), layer.read(len(BINARY)) == BINARY
+                damaged, binary = archive.testzip(), layer.read(8) == b"PXR-USDC"
         except (zipfile.BadZipFile, NotImplementedError, EOFError, IndexError) as error:
             raise AssetError(f"{path} is no USDZ package, or only a part of one: {str(error).lower()}") from error
     if damaged is not None:
@@ -159,10 +154,8 @@ def _file_of(entry: UsdShade.Input, seen: set[Sdf.Path]) -> UsdShade.Input | Non
         if not shader or producer.GetPath() == entry.GetAttr().GetPath() or shader.GetPath() in seen:
             continue
         seen.add(shader.GetPath())
-        if file := shader.GetInput("file"):
+        if file := shader.GetInput("file") or next(filter(None, (_file_of(inner, seen) for inner in shader.GetInputs())), None):
             return file
-        if found := next(filter(None, (_file_of(inner, seen) for inner in shader.GetInputs())), None):
-            return found
     return None
 
 

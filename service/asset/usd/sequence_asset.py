@@ -20,8 +20,8 @@ from service.asset.usd.layers import CAMERA_FRAME, Description, define_root, des
 from service.asset.usd.materials import define_display_color_material
 from service.asset.usd.scene import distinct
 from service.errors import AssetError
+from service.requests.export import TIME_SAMPLED
 
-SUFFIXES = (".usdc", ".usdz")
 TIME_DIGITS = 6
 """Decimals of a time code."""
 
@@ -66,7 +66,7 @@ def write_sequence_asset(moments: Iterator[Moment], target: Path, description: D
         AssetError: another suffix, no step, or a step without a vertex.
         StorageError: the disk refuses; what was there before is left as it was.
     """
-    if target.suffix.lower() not in SUFFIXES:
+    if target.suffix.lower().removeprefix(".") not in TIME_SAMPLED:
         raise AssetError(f"{target} cannot hold a sequence: its suffix must be .usdc or .usdz, which take one step after another")
     sizes: list[SequenceSizes] = []
 

@@ -5,7 +5,10 @@ averages out, the errors that neighbours share do not. With M tests on a board, 
 bound; windows overlap, so that the probability of any false alarm on a board is below P, Gaussian errors given).
 
 Windows are squares of the smallest defect's side, twice that, and so on, at every place (a multi-scale scan statistic: Glaz, Naus,
-Wallenstein, "Scan Statistics", 2001). A deviation counts at most CLIP σ beyond the tolerance, so that a spike of one pixel is no defect.
+Wallenstein, "Scan Statistics", 2001). A deviation counts at most CLIP σ beyond the tolerance, so that a spike of one pixel is no
+defect. Noise that neighbours share, and a form of the board that stays, widen the spread of the windows' means beyond what σ says: each
+size is tested against the spread and middle that its own windows have (the empirical null distribution: Efron, "Large-scale simultaneous
+hypothesis testing", JASA 2004).
 """
 
 from collections.abc import Sequence
@@ -13,10 +16,14 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from service.boards.stitching.comparison import Deviation
+from service.boards.stitching.grid import robust_sigma
 
 CLIP = 6.0
+ENOUGH_WINDOWS = 100
+"""The least number of windows whose spread says what their errors are."""
 LEAST_MEASURED = 0.5
 """The least part of a window that must be measured."""
 DOUBLINGS = 5
@@ -39,14 +46,16 @@ class Scan(NamedTuple):
     """Result of the tests of all windows."""
 
     significant: np.ndarray  # [rows, cols] bool: pixels of significant windows
-    mean: np.ndarray  # [rows, cols] deviation in the smallest window around each pixel, metres; NaN where too little is measured
-    mean_sigma: np.ndarray  # [rows, cols] its standard deviation, metres
+    side: np.ndarray  # [rows, cols] int: side of the smallest significant window over a pixel, negative where its mean is; 0 without one
+    mean_sigma: np.ndarray  # [rows, cols] σ of the mean of the smallest window around each pixel, metres; NaN with too few measured
     findable: np.ndarray  # [rows, cols] deviation that is found in that window with a probability of 95 %, metres
     score: np.ndarray  # [rows, cols] the largest |mean| less tolerance over σ of the windows around a pixel
     sides_px: tuple[int, ...]
     tests: int
     threshold: float
     """σ from which on a window is significant."""
+    spread: dict[int, float]
+    """By the side of windows, the factor by which their means scatter more than σ says."""
     detectable_m: dict[int, float]
     """By the side of windows in pixels, the deviation that is found with a probability of 95 % in the median window."""
 
@@ -61,8 +70,8 @@ def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))
 
 
-def mean_of(deviation: Deviation, pixels: np.ndarray) -> Mean | None:
-    """Return the weighted mean over pixels, [rows, cols] bool; None where none is known."""
+def mean_of(deviation: Deviation, pixels: np.ndarray, *, spread: float = 1.0) -> Mean | None:
+    """Return the weighted mean over pixels, [rows, cols] bool, whose noise is `spread` times what is stated; None where none is known."""
     used = pixels & deviation.known
     count = int(used.sum())
     if count == 0:
@@ -70,8 +79,8 @@ def mean_of(deviation: Deviation, pixels: np.ndarray) -> Mean | None:
     variance, systematic = deviation.variance[used], deviation.systematic[used]
     weight = 1 / (variance + systematic**2)
     total = float(weight.sum())
-    spread = float((weight**2 * variance).sum()) + float((weight * systematic).sum()) ** 2
-    return Mean(float((weight * deviation.height[used]).sum()) / total, float(np.sqrt(spread)) / total, count)
+    square = spread**2 * float((weight**2 * variance).sum()) + float((weight * systematic).sum()) ** 2
+    return Mean(float((weight * deviation.height[used]).sum()) / total, float(np.sqrt(square)) / total, count)
 
 
 def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
@@ -82,52 +91,83 @@ def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false
         false_alarm: the probability of any false alarm on a board without defects.
         smallest_px: side of the smallest window.
     """
-    known = deviation.known.copy()
-    shape = known.shape
+    shape = deviation.known.shape
+    tolerance = np.broadcast_to(np.asarray(tolerance_m, dtype=np.float64), shape)
+    known = deviation.known
     sides = tuple(side for side in (smallest_px << k for k in range(DOUBLINGS)) if side <= min(shape))
     tests = sum(int((_sums(known, side) >= LEAST_MEASURED * side * side).sum()) for side in sides)
     limit = threshold(false_alarm, tests)
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(known, 1 / (deviation.variance + deviation.systematic**2), 0)
-    tolerance = np.broadcast_to(np.asarray(tolerance_m, dtype=np.float64), shape)
     reach = tolerance + CLIP * deviation.sigma
     clipped = np.where(known, np.clip(deviation.height, -reach, reach), 0)
     noise, shared = np.where(known, deviation.variance, 0), np.where(known, deviation.systematic, 0)
-    significant, score = np.zeros(shape, dtype=bool), np.zeros(shape)
-    mean, mean_sigma, findable = (np.full(shape, np.nan) for _ in range(3))
+    found, score = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+    mean_sigma, findable = (np.full(shape, np.nan) for _ in range(2))
     detectable: dict[int, float] = {}
+    spread: dict[int, float] = {}
     for side in sides:
-        weight = np.where(significant, 0, weight)
-        usable = _sums(known & ~significant, side) >= LEAST_MEASURED * side * side
+        weight = np.where(found != 0, 0, weight)
+        usable = _sums(known & (found == 0), side) >= LEAST_MEASURED * side * side
         total = _sums(weight, side)
         with np.errstate(divide="ignore", invalid="ignore"):
             value = np.where(usable, _sums(weight * clipped, side) / total, np.nan)
-            spread = np.maximum(_sums(weight**2 * noise, side), 0) + _sums(weight * shared, side) ** 2
-            sigma = np.where(usable, np.sqrt(spread) / total, np.nan)
+            own = np.sqrt(np.maximum(_sums(weight**2 * noise, side), 0)) / total
+            both = _sums(weight * shared, side) / total
+            sigma = np.where(usable, np.hypot(own, both), np.nan)
             allowed = np.where(usable, _sums(weight * tolerance, side) / total, 0)
-            beyond = np.where(usable, (np.abs(value) - allowed) / sigma, 0)
+            middle, spread[side] = _scatter(value / sigma, usable & (own > sigma / 2), usable)
+            wide = np.where(usable, np.hypot(spread[side] * own, both), np.nan)  # what neighbours share is no noise, and scatters no more
+            beyond = np.where(usable, np.minimum((np.abs(value) - allowed) / sigma, np.abs(value - middle * own) / wide), 0)
         if usable.any():
-            detectable[side] = float(np.median(allowed[usable] + (limit + POWER) * sigma[usable]))
+            detectable[side] = float(np.median(allowed[usable] + (limit + POWER) * wide[usable]))
         if side == sides[0]:
-            mean, mean_sigma = _centred(value, side, shape), _centred(sigma, side, shape)
-            findable = _centred(allowed + (limit + POWER) * sigma, side, shape)
+            mean_sigma = _centred(sigma, side, shape)
+            findable = _centred(allowed + (limit + POWER) * wide, side, shape)
         score = np.fmax(score, _centred(beyond, side, shape))
-        significant |= _covered(beyond >= limit, side, shape)
-    return Scan(significant, mean, mean_sigma, findable, score, sides, tests, limit, detectable)
+        for sign in (1, -1):
+            found[_covered((beyond >= limit) & (sign * value > 0), side, shape) & (found == 0)] = sign * side
+    return Scan(found != 0, found, mean_sigma, findable, score, sides, tests, limit, spread, detectable)
 
 
-def core_of(scan: Scan, pixels: np.ndarray) -> np.ndarray:
-    """Return the pixels of a connected significant area, [rows, cols] bool, whose mean deviation is at least half the largest there."""
-    values = np.where(pixels & np.isfinite(scan.mean), scan.mean, 0)
-    peak = values.flat[np.abs(values).argmax()]
-    return pixels & (values * np.sign(peak) >= abs(peak) / 2) if peak else pixels
+def _scatter(values: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
+    """Return the middle of the means of windows over their σ, and their robust standard deviation, 1 at the least: of those with more noise
+    than shared error, if there are enough of them."""
+    taken = values[quiet] if quiet.sum() >= ENOUGH_WINDOWS else values[usable]
+    if taken.size < ENOUGH_WINDOWS:
+        return 0.0, 1.0
+    return float(np.median(taken)), max(robust_sigma(taken), 1.0)
+
+
+def region_of(deviation: Deviation, scan: Scan, part: np.ndarray) -> np.ndarray:
+    """Return the whole connected area, [rows, cols] bool, that deviates by at least half as much as a significant part of it does at most.
+
+    Deviations count as their means over the smallest significant window about each pixel, weighted by their variance and not clipped.
+    """
+    sign = 1 if scan.side[part].sum() > 0 else -1
+    side = int(np.abs(scan.side[part]).min())
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(deviation.known, 1 / (deviation.variance + deviation.systematic**2), 0)
+        mean = sign * _around(weight * np.where(deviation.known, deviation.height, 0), side) / _around(weight, side)
+    seed = part & deviation.known
+    values = mean[seed][np.isfinite(mean[seed])]
+    if values.size == 0 or values.max() <= 0:
+        return seed
+    high = deviation.known & (np.nan_to_num(mean) >= values.max() / 2)
+    labels, _ = label(high)
+    own = np.unique(labels[seed & high])
+    return np.asarray(np.isin(labels, own[own > 0]))
+
+
+def _around(values: np.ndarray, side: int) -> np.ndarray:
+    """Return the sums over the square of a side about each pixel, [rows, cols]."""
+    before = side // 2
+    return _sums(np.pad(values, ((before, side - 1 - before),) * 2), side)
 
 
 def grown(pixels: np.ndarray, side: int) -> np.ndarray:
     """Return the pixels whose square of a side, about them, holds one of some pixels; both [rows, cols] bool."""
-    before = side // 2
-    padded = np.pad(pixels, ((before, side - 1 - before),) * 2)
-    return _sums(padded, side) > 0.5
+    return _around(pixels, side) > 0.5
 
 
 def weighted_centre(values: np.ndarray, rows: np.ndarray, cols: np.ndarray) -> tuple[float, float]:

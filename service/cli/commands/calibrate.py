@@ -20,6 +20,7 @@ from service.requests.calibrate import (
     MirrorBallRequest,
     ProcamRequest,
     ResponseRequest,
+    RigCalibrationRequest,
     SaturationRequest,
     StereoRequest,
     TofCalibrationRequest,
@@ -41,7 +42,7 @@ def register(app: typer.Typer) -> None:
     kinds = make_group("calibrate",
                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
     for function in (_mirror_ball, _light_positions, _grey_ball, _intensity, _dark, _flat_field, _saturation, _white_balance, _procam,
-                     _stereo, _laser_planes, _response, _tof):
+                     _stereo, _laser_planes, _response, _tof, _rig):
         local_command(kinds, function.__name__[1:].replace("_", "-"), function)
     app.add_typer(kinds)
 
@@ -148,6 +149,18 @@ def _tof(request: TofCalibrationRequest) -> None:
     found += [] if drift is None else [f"drift {1000 * drift.metres_per_c:.3f} mm a degree"]
     print(f"found    {', '.join(found)}")
     print(f"error    {1000 * result.before_m:.2f} mm before, {1000 * result.after_m:.2f} mm after, RMS over {result.steps} steps")
+
+
+def _rig(request: RigCalibrationRequest) -> None:
+    from service.calibrate.rig import calibrate_rig
+
+    result = with_bar(calibrate_rig, request)
+    print(f"rig      {result.rig_path}")
+    print(f"report   {result.report_path}")
+    print(f"lamps    {result.summary}")
+    print_table([result.headings, *result.rows[:LIGHT_ROWS]])
+    if len(result.rows) > LIGHT_ROWS:
+        print(f"… and {len(result.rows) - LIGHT_ROWS} that are surer")
 
 
 def _print_files(manifest_paths: Iterable[Path], report_path: Path) -> None:

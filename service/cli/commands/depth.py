@@ -9,9 +9,8 @@ from service.cli.printing import check_single, counted, print_sequence, print_wa
 from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import Given, local_command
 from service.errors import RequestError
-from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest
+from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest, SimulateCwRequest, SimulatePulsedRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
-from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest
 
 PlanOption = Annotated[bool, typer.Option("--plan", help="Print images, time and precision of every code.")]
 
@@ -51,7 +50,7 @@ def _depth(request: DepthRequest) -> None:
         print(f"method   {result.method}, {result.points} points")
     print(f"pixels   {counted(result.counts)}")
     print_warnings(result.warnings)
-    if not result.maps.mask.any():
+    if not result.counts.get("ok"):
         raise typer.Exit(1)
 
 

@@ -1,4 +1,9 @@
-"""relit export, basis and join: assets of results, coefficient images of a capture, and maps joined with a depth."""
+"""relit export, inspect, basis and join: assets and what they hold, coefficient images of a capture, and maps joined with a depth."""
+
+import json
+from collections.abc import Iterator
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -6,13 +11,20 @@ from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
-from service.requests.export import ExportRequest
+from service.requests.export import ExportRequest, InspectRequest
 from service.requests.solve import JoinRequest
+
+if TYPE_CHECKING:
+    from service.asset.content.inspection import Inspection, Part
+
+LONGEST_TEXT = 100
+"""Characters of a text of the provenance that relit inspect prints; --json has all."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "export", _export)
+    local_command(app, "inspect", _inspect)
     local_command(app, "basis", _basis)
     local_command(app, "join", _join)
 
@@ -27,6 +39,56 @@ def _export(request: ExportRequest) -> None:
     for name, (vertices, faces) in exported.sizes.items():
         print(f"{name:<8} {vertices} vertices, {faces} faces")
     print_warnings(exported.warnings)
+
+
+def _inspect(request: InspectRequest) -> None:
+    from service.errors import AssetError
+    from service.export.writers import INSPECTED
+
+    path = request.asset
+    if not path.is_file():
+        raise AssetError(f"{path} is {'a folder' if path.is_dir() else 'not there'}: give the asset, a file")
+    inspect = INSPECTED.get(path.suffix.lower())
+    if inspect is None:
+        raise AssetError(f"{path}: relit inspect reads {', '.join(INSPECTED)}")
+    found = inspect(path)
+    if request.as_json:
+        plain = found._asdict() | {"parts": [part._asdict() for part in found.parts]}
+        print(json.dumps(plain, ensure_ascii=False, indent=2, default=str))
+    else:
+        for name, value in _lines(found):
+            print(f"{name:<12} {value}")
+    if found.errors:
+        others = f" (and {len(found.errors) - 1} more)" if len(found.errors) > 1 else ""
+        raise AssetError(f"{path}: {found.errors[0]}{others}")
+
+
+def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
+    """Yield what is printed, as names and values."""
+    size = found.size_bytes
+    yield "asset", f"{found.file}, {f'{size / 1e6:.3g} MB' if size >= 1e6 else f'{size / 1e3:.3g} kB'}"
+    for name, value in found.facts.items():
+        yield name, _text(value)
+    for _, alike in groupby(found.parts, key=lambda part: (part.kind, part.variant, part.facts if part.kind == "light" else part.name)):
+        parts: list[Part] = list(alike)
+        names = parts[0].name if len(parts) == 1 else f"{parts[0].name} and {len(parts) - 1} more"
+        yield parts[0].kind, f"{names}{f' [{parts[0].variant}]' if parts[0].variant else ''}: {_text(parts[0].facts)}"
+    for key, text in found.provenance.items():
+        yield "provenance", f"{key} {text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT] + ' …'}"
+    for sentence in found.warnings:
+        yield "warning", sentence
+    for sentence in found.errors:
+        yield "wrong", sentence
+    yield "found", f"{len(found.errors)} errors, {len(found.warnings)} warnings"
+
+
+def _text(value: Any) -> str:
+    """Return a fact in a line."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(each)}" for name, each in value.items()) or "none"
+    if isinstance(value, list):
+        return f"({', '.join(map(_text, value))})"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _join(request: JoinRequest) -> None:

@@ -27,6 +27,7 @@ from service.requests.imports import (
     RelightlabImport,
     RigOptions,
     ScannerImport,
+    ScansImport,
     Sense,
     WaveOrigin,
 )
@@ -35,35 +36,74 @@ from service.requests.patterns import PatternAxis
 
 if TYPE_CHECKING:
     from stage.importers.camera_options import Selection, View
+    from stage.importers.folder import Guess
     from stage.importers.layout import Imported
     from stage.importers.patterns import PatternImages
     from stage.importers.raw_arrays import ArrayFiles
 
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of the data.", show_default=False)]
+DestinationArgument = Annotated[Path | None, typer.Argument(metavar="DST", show_default=False, help=(
+    "Folder for the capture, which gets links to the files; without it capture.json is written beside them."))]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/captures.md shows each layout.")
+    layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/importing.md shows each.")
     for function in (_diligent, _lp, _relightlab, _olat, _photos, _near_lights, _opencv_gray, _gray, _phase, _scanner, _tof, _histogram,
-                     _kinect, _laser):
+                     _kinect, _laser, _scans):
         local_command(layouts, function.__name__[1:].replace("_", "-"), function)
     layouts.command("guess")(_guess)
+
+    @layouts.command("auto")
+    def auto(folder: FolderArgument, destination: DestinationArgument = None) -> None:
+        """Import a folder as guess proposes, where the files say all that the command needs; else name the commands to choose from."""
+        _auto(folder, destination, layouts)
+
     app.add_typer(layouts)
 
 
 def _guess(folder: FolderArgument) -> None:
-    """Look at a folder: what it seems to be, why, and the command that imports it."""
-    from stage.importers.guess import guess
+    """Look at a folder: what it seems to be, why, how sure that is, and the command that imports it."""
+    from stage.importers.guess import guess_each
 
-    found = guess(folder)
+    for found in guess_each(folder):
+        _print_guess(found)
+        print(f"run      {found.command}")
+        print(f"then     {found.then}")
+
+
+def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> None:
+    """Run the import of a folder, or of each folder in it, and record in its capture.json what the guess assumed."""
+    from stage.capture.manifest import FILE_NAME, read_manifest, write_manifest
+    from stage.errors import ManifestError
+    from stage.importers.guess import guess_each
+
+    guesses = guess_each(folder)
+    unsure = [found for found in guesses if not found.sure]
+    if unsure:
+        assumed = "; ".join(unsure[0].assumed)
+        raise ManifestError(f"{folder}: looks like {unsure[0].layout}, and the files do not say all that its import needs ({assumed}): "
+                            + "; ".join(found.command for found in unsure))
+    command = typer.main.get_command(layouts)
+    for found in guesses:
+        target = destination if destination is None or len(guesses) == 1 else destination / found.source.name
+        layout, source, *options = found.arguments
+        _print_guess(found)
+        command.main([layout, source, *([] if target is None else [str(target)]), *options], standalone_mode=False)
+        path = (target or found.source) / FILE_NAME
+        manifest = read_manifest(path)
+        more = tuple(sentence for sentence in found.assumed if sentence not in manifest.assumed)
+        write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), path)
+        print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")
+
+
+def _print_guess(found: "Guess") -> None:
     print(f"looks    like {found.layout}")
     print(f"because  {found.reason}")
     for sentence in found.assumed:
         print(f"assumed  {sentence}")
-    print(f"run      {found.command}")
-    print(f"then     {found.then}")
+    print(f"sure     {'yes' if found.sure else 'no: the assumptions, or words in capitals, are yours to check'}")
 
 
 def _diligent(request: DiligentImport) -> None:
@@ -72,10 +112,16 @@ def _diligent(request: DiligentImport) -> None:
     _print_path(diligent.import_folder(request.source, request.folder))
 
 
+def _scans(request: ScansImport) -> None:
+    from service.scans.importing import import_scans
+
+    _print(import_scans(request), "set")
+
+
 def _lp(request: LpImport) -> None:
     from stage.importers import lp
 
-    _print_path(lp.import_folder(request.source, request.folder))
+    _print_path(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space))
 
 
 def _opencv_gray(request: OpencvGrayImport) -> None:
@@ -112,12 +158,12 @@ def _near_lights(request: NearLightsImport) -> None:
 def _relightlab(request: RelightlabImport) -> None:
     from stage.importers import relightlab
 
-    _print(relightlab.import_folder(request.source, request.destination))
+    _print(relightlab.import_folder(request.source, request.destination, color_space=request.color_space))
 
 
 def _gray(request: GrayImport) -> None:
+    from stage.importers.pattern_order import GrayStack
     from stage.importers.patterns import import_gray
-    from stage.importers.sequences import GrayStack
 
     gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
                      row_bits=request.row_bits)
@@ -126,8 +172,8 @@ def _gray(request: GrayImport) -> None:
 
 
 def _phase(request: PhaseImport) -> None:
+    from stage.importers.pattern_order import GrayStack, PhaseStack
     from stage.importers.patterns import import_phase
-    from stage.importers.sequences import GrayStack, PhaseStack
 
     phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
                        order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
@@ -223,8 +269,8 @@ def _print_path(path: Path) -> None:
     print(f"capture  {path}")
 
 
-def _print(imported: "Imported") -> None:
-    """Print where the capture is, and how the files were understood."""
-    _print_path(imported.path)
+def _print(imported: "Imported", made: str = "capture") -> None:
+    """Print where the capture, or what else was made, is, and how the files were understood."""
+    print(f"{made:<8} {imported.path}")
     for name, sentence in imported.facts:
         print(f"{name:<8} {sentence}")

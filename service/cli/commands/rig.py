@@ -7,7 +7,14 @@ from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.drive import DriveRequest
-from service.requests.rig import RigCheckRequest, RigFromCaptureRequest, RigFromCsvRequest, RigFromMvrRequest, RigPlanRequest
+from service.requests.rig import (
+    RigCheckRequest,
+    RigFromCaptureRequest,
+    RigFromCsvRequest,
+    RigFromMvrRequest,
+    RigPlanRequest,
+    RigSweepRequest,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -17,6 +24,7 @@ def register(app: typer.Typer) -> None:
     local_command(rig, "from-capture", _from_capture)
     local_command(rig, "from-csv", _from_csv)
     local_command(rig, "from-mvr", _from_mvr)
+    local_command(rig, "sweep", _sweep)
     local_command(rig, "plan", _plan)
     app.add_typer(rig)
     local_command(app, "drive", _drive)
@@ -71,6 +79,14 @@ def _from_mvr(request: RigFromMvrRequest) -> None:
     made = rig_from_mvr(request)
     print(f"rig      {request.out}: {len(made.rig.lights)} lamps")
     print_warnings(made.warnings)
+
+
+def _sweep(request: RigSweepRequest) -> None:
+    from service.rigs.sweep import sweep_rig
+
+    made = sweep_rig(request)
+    print(f"cues     {made.cues}: {made.frames} frames, the first is dark")
+    print(f"table    {made.table}")
 
 
 def _plan(request: RigPlanRequest) -> None:

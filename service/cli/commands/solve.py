@@ -33,5 +33,5 @@ def _solve(request: SolveRequest) -> None:
         worst = ", ".join(f"{suspect.image} by {100 * suspect.misfit:.0f} %" for suspect in result.suspects[:5])
         more = f" and {len(result.suspects) - 5} more" if len(result.suspects) > 5 else ""
         print(f"suspect  lights that disagree with the others: {worst}{more}; check their direction and irradiance")
-    if not result.maps.mask.any():
+    if not result.counts.get("ok"):
         raise typer.Exit(1)

@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels.status import Status
+from service.depth.base.solution import HALF_SURE, DepthSolution
+from service.depth.base.triangulation_check import check_perspective
 from service.depth.laser.spot import find_spot, nearest_points
 from service.depth.laser.stripe_curves import WHOLE
-from service.depth.laser.stripe_map import StripeSamples, contradicted, stripe_map
+from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
 from service.depth.laser.stripes import Sweep, along_of, measure_stripe, stripe_signal
-from service.depth.patterns.triangulation_check import check_perspective
-from service.depth.results.solution import HALF_SURE, DepthSolution
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
@@ -33,6 +33,8 @@ DOUBLED = 0.1
 """Part of the lines of a frame with two stripes of comparable brightness, from which the frame is named."""
 CURVES_OF_A_FRAME = 1_000_000
 """More curves than the stripes of one frame can be, so that numbers of different frames differ."""
+AGAINST = -0.3
+"""Concordance of stripes and planes below which the planes are taken for declared in reverse."""
 SECOND_PLANE = 0.3
 """Part of the frames with two such stripes, from which a second plane is taken to move with the first: then no frame is trusted."""
 LEAST_PART, OF_PERCENTILE = 0.03, 95.0
@@ -86,6 +88,8 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
                 doubled.append(frame.image)
         timings.advance(number + 1)
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
+    for along, part in kept.items():
+        _check_order(capture, part, [len(one.line) for one in samples[along]], along)
     _refuse_faint(kept)
     for along, part in kept.items():
         part.status[contradicted(part, np.concatenate(curves[along]), camera, doubled=bool(doubled))] = Status.MULTIPATH
@@ -105,6 +109,15 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
     if doubled:
         solution.warnings.append(_second_stripes(doubled, len(frames)))
     return solution
+
+
+def _check_order(capture: Capture, samples: StripeSamples, counts: list[int], along: str) -> None:
+    """Refuse planes whose stripes move the other way, as those of a sweep that is declared in reverse order do."""
+    planes = [frame.laser for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane) and along_of(frame.laser) == along]
+    found = concordance(samples, np.repeat(np.arange(len(counts)), counts), planes, capture.camera, along=along)
+    if found < AGAINST:
+        raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].laser: {50 * (1 - found):.0f} % of the stripes move against the order "
+                            "of their planes: the planes look declared in reverse order; check point_m and normal, or image, of the frames")
 
 
 def _second_stripes(doubled: list[str], frames: int) -> str:

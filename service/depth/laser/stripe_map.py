@@ -18,10 +18,13 @@ import numpy as np
 from kernels.status import Status
 from service.depth.laser.stripe_curves import RIVAL, WHOLE
 from stage.capture.camera import Camera
+from stage.capture.ranging import LaserPlane
 from stage.results.depth_breaks import same_surface
 
 SLOPE_PX = 32.0
 """Distance up to which a neighbour determines the slope."""
+ENOUGH = 100
+"""Number of comparisons of stripes below which their order tells nothing."""
 JOIN_PX = 2.0
 """Distance of two samples up to which the pixels between them are filled."""
 
@@ -145,3 +148,36 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
         if doubted.sum() >= WHOLE * mine.sum() and (doubled or np.median(ratio.min(axis=0)[doubted]) < RIVAL):
             found[order[mine]] = True
     return found
+
+
+def concordance(samples: StripeSamples, frame: np.ndarray, planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> float:
+    """Return how far stripes move as their planes do, from 1 (all) to -1 (all move the other way); NaN if too few lines tell.
+
+    Compared are the places of stripes on one line, a third of the sweep apart, with those at which their planes cut it at the median depth.
+    The relief of the scene shifts stripes by less than that, as a rule.
+
+    Args:
+        samples: of all frames whose stripes cross the same lines; those that were found are compared.
+        frame: [n] int, the frame of each sample.
+        planes: of each frame.
+    """
+    seen = np.flatnonzero(np.isin(samples.status, (Status.OK, Status.MULTIPATH, Status.OUT_OF_RANGE)) & np.isfinite(samples.place))
+    deep = samples.depth[seen][samples.depth[seen] > 0]
+    middle = float(np.median(deep)) if deep.size else 1.0
+    line, place, number = samples.line[seen], samples.place[seen], frame[seen]
+    x, y = camera.plane_at(*((place, line + 0.5) if along == "row" else (line + 0.5, place)))
+    normal, distance = np.array([plane.normal for plane in planes]), np.array([np.dot(plane.point_m, plane.normal) for plane in planes])
+    own, other, across = (0, 1, y) if along == "row" else (1, 0, x)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = (distance[number] / middle + normal[number, 2] - normal[number, other] * across) / normal[number, own]
+    cut = cut if along == "row" else -cut  # v runs down
+    signs = []
+    for one in np.unique(line):
+        here = np.flatnonzero((line == one) & np.isfinite(cut))
+        lag = len(here) // 3
+        if lag > 0:
+            sorted_ = here[np.argsort(cut[here], kind="stable")]
+            apart = cut[sorted_[lag:]] > cut[sorted_[:-lag]]
+            signs.append(np.sign(place[sorted_[lag:]] - place[sorted_[:-lag]])[apart])
+    found = np.concatenate(signs) if signs else np.zeros(0)
+    return float(found.mean()) if found.size >= ENOUGH else float("nan")

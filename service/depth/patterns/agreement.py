@@ -4,8 +4,8 @@ import numpy as np
 
 from kernels.status import SOLVED, Status
 from kernels.structured.opaque_surface import check_surface
+from service.depth.base.solution import DepthSolution
 from service.depth.patterns.coordinates import DecodedSolution, stands_alone
-from service.depth.results.solution import DepthSolution
 from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
 from stage.capture.projector import Projector

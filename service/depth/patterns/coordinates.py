@@ -12,7 +12,7 @@ import numpy as np
 
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
-from service.depth.results.solution import PixelSolution, statistics
+from service.depth.base.solution import PixelSolution, statistics
 from stage.capture.camera import Camera
 from stage.model import Resolution
 from stage.results.depth_maps import CoordinateMaps

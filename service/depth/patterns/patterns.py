@@ -11,14 +11,15 @@ from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded, cropped
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.triangulate import ProjectorModel, triangulate
+from service.depth.base.solution import DepthSolution
+from service.depth.base.triangulation_check import check_projector, missing_calibration
 from service.depth.patterns.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
+from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
-from service.depth.patterns.triangulation_check import check_projector, missing_calibration
-from service.depth.results.solution import DepthSolution
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -157,6 +158,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
+    wrong = wrong or check_codes(sample, codes.collected, shown, noise)
     if wrong is not None:
         return [wrong], codes
     if shown.response is None:

@@ -14,11 +14,11 @@ from kernels.packs import padded_count
 from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.structured.decoded import Decoded
 from kernels.structured.triangulate import triangulate
+from service.depth.base.solution import DepthSolution, statistics
+from service.depth.base.triangulation_check import check_perspective, check_projector
 from service.depth.patterns.agreement import conclude, doubt_pixels
 from service.depth.patterns.coordinates import DecodedSolution
 from service.depth.patterns.patterns import projector_model, solve_patterns
-from service.depth.patterns.triangulation_check import check_perspective, check_projector
-from service.depth.results.solution import DepthSolution, statistics
 from service.depth.stereo.same_place import CodedImage, find_places
 from service.errors import RequestError
 from service.reporting.progress import Timings

@@ -17,7 +17,7 @@ from kernels.tof.continuous.modulation import common_range_m, require_span
 from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
-from service.depth.results.solution import RangeImage
+from service.depth.base.solution import RangeImage
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -212,7 +212,8 @@ def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[str, ...]:
     advice = ("check that the calibration is of this camera" if calibrated
               else "measure the wiggling with relit calibrate tof and give --tof-calibration")
     return (f"frames[].tof: the phases of the frequencies disagree by {size:.0f} mrad more than noise at {100 * part:.0f} % of the pixels, "
-            f"by wiggling or by light that comes over several ways: {advice}; the standard deviations cover it",)
+            f"by wiggling or by light that comes over several ways: {advice}, and modulation_hz; the standard "
+            "deviations hold what the frequencies disagree by, not an error that they share",)
 
 
 def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:

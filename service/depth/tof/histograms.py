@@ -14,7 +14,7 @@ from kernels.tof.histogram.pulse_width import PulseShape, estimate_pulse
 from kernels.tof.histogram.returns import Returns, find_returns
 from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
-from service.depth.results.solution import RangeImage
+from service.depth.base.solution import RangeImage
 from service.depth.tof.count_scale import CountScale, estimate_count_scale
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
@@ -113,6 +113,26 @@ def interlaced(position: np.ndarray, there: np.ndarray, width: float) -> np.ndar
     return found if found[there].size and found[there].mean() > LEAST_PART else np.zeros_like(found)
 
 
+LEAST_CEILING, FLAT_TOPS, HEAPED = 50, 10, 5.0
+"""The least count that can be a counter's ceiling; the number of pixels whose fullest bins reach it side by side, or, where it is the
+largest number of some bits, of twice as many that reach it at all, and their number over that of the counts below it."""
+
+
+def full_count(counts: np.ndarray) -> float | None:
+    """Return the count at which a counter of histograms [pixel, bin] was full; None if it shows none.
+
+    Photon noise gives the largest count of all to one bin, and hardly to two beside each other.
+    """
+    top = float(counts.max(initial=0))
+    if top < LEAST_CEILING or top != round(top):
+        return None
+    full = counts == top
+    heaped, below = int(full.any(axis=1).sum()), int(((counts >= 0.9 * top) & ~full).sum()) / (0.1 * top)
+    flat = int((full[:, 1:] & full[:, :-1]).any(axis=1).sum())
+    bits = math.log2(top + 1).is_integer() and heaped >= 2 * FLAT_TOPS
+    return top if (flat >= FLAT_TOPS or bits) and heaped > HEAPED * below else None
+
+
 MOST_RETURNS = 3
 """Returns that are looked for in a histogram."""
 LEAST_CONFIDENCE = 0.95
@@ -147,6 +167,10 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     usable = usable.reshape(-1)
     pattern = pattern_bins(frames.counts[usable])
     photons_of, scale_facts, warnings = _photons(frames, usable, pattern)
+    if limit is None and (full := full_count(frames.counts[usable])) is not None:
+        limit = full
+        warnings.append(f"saturation: is not given, and the counts of {(frames.counts[usable] >= full).any(axis=1).sum()} pixels stop at "
+                        f"{full:g}, as those of a full counter: these are taken for saturated")
     first_bin, last_bin = max((nearest - start_m) / bin_m, 0.0), min((farthest - start_m) / bin_m, float(frames.counts.shape[1]))
     if pattern[int(first_bin) :].any():
         warnings.append(f"frames[].tof: nearly all pixels show the same pulse at {start_m + bin_m * (np.argmax(pattern) + 0.5):.3g} to "
@@ -186,8 +210,8 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     bent = (solved & (dispersion > 1))[usable].mean() if usable.any() else 0.0
     if bent > MISFIT_PIXELS:
         warnings.append(f"frames[].tof: the pulse does not describe the returns of {100 * bent:.0f} % of the pixels, which differ from "
-                        "it by more than photon noise: measure the pulse and give it in --tof-calibration; the standard deviations cover "
-                        "it")
+                        "it by more than photon noise: measure the pulse and give it in --tof-calibration; the standard deviations hold "
+                        "the scatter that this makes, not a shift that all of them share, as by fog")
     several = (found.photons.numpy() > 0).sum(axis=0)
     facts: dict[str, Any] = {
         "bins": frames.counts.shape[1],
@@ -295,7 +319,8 @@ def _zero_of(shape: PulseShape, frames: Histograms, calibration: TofCalibration,
     late_m = range_of_delay_m(shape.pulse.mean * frames.bin_s)
     warnings.append(f"frames[].tof: the pulse has a tail ({100 * shape.part:.0f} % of its photons come {shape.tail * frames.bin_s:.2g} s "
                     "later on average), and ranges are those of its highest power: whether the camera's zero is there or up to "
-                    f"{late_m:.2g} m beside it is not known: give pulse or offset_m in --tof-calibration; the standard deviations cover it")
+                    f"{late_m:.2g} m beside it is not known: give pulse or offset_m in --tof-calibration; the standard deviations cover "
+                    "this zero alone")
     return shape.pulse, facts, shape.pulse.mean / math.sqrt(3)
 
 

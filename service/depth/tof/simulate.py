@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from service.depth.tof.tof import z_per_range
-from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest, SimulateRequest
+from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest, SimulateRequest
 from stage.capture.camera import Camera
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.results.depth_normals import depth_normals

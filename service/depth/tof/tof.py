@@ -17,7 +17,7 @@ from kernels.tof.continuous.bilateral import smooth
 from kernels.tof.continuous.flying import mark_flying
 from kernels.tof.continuous.modulation import common_range_m, require_span
 from kernels.tof.continuous.unwrap import END_SIGMAS
-from service.depth.results.solution import DepthSolution, RangeImage
+from service.depth.base.solution import DepthSolution, RangeImage
 from service.depth.tof.continuous_wave import solve_correlations
 from service.depth.tof.histograms import solve_histograms
 from service.reporting.progress import Timings

@@ -23,7 +23,7 @@ from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, plac
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
 from service.scans.fusion.range_images import WIDTHS, PreparedScan
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
-from service.solve.sharing.sharing import digest, kind_of_worker
+from service.sharing.sharing import digest, kind_of_worker
 from stage.formats.npy import packed, unpacked
 from stage.sets.scan_set import read_scan_set
 

@@ -3,7 +3,7 @@
 (1) Where the normals of the surface and the photometric ones differ in the same way over a wide part, the latter have drifted: a light that
 stands elsewhere bends them all. The difference is averaged at lengths that double, and each band between two of them corrects the normals
 by the share S / (S + N) of it, S being the variance of the drift, N that of the noise of the depth in this band (Wiener 1949).
-Vertices at which the two contradict each other (`service.scans.fusion.contradictions`) count little or nothing in both variances.
+Vertices at which the two contradict each other (`compared`) count little or nothing in both variances.
 (2) Vertices move along the corrected normals until the edges of the mesh are perpendicular to the normals at their ends, held by the depth:
 least squares weighted by the variances of both. No band of the motions is larger than the noise of the depth in it.
 Edges at vertices that contradict, before or after, do not count at first. Then each edge counts by how well the last solution agrees with
@@ -24,7 +24,6 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import cg
 
 from service.scans.fusion.bands import Bands
-from service.scans.fusion.contradictions import compared, unlike_noise
 
 BOUND_SIGMAS = 4.0
 """A vertex moves no farther than this many standard deviations of its depth: where normals ask for more, the depth decides."""
@@ -33,7 +32,7 @@ ROUNDS = 4
 RETURNS = 4
 """Further solutions, in which edges count by how well the one before agrees with the photometric normals."""
 DISAGREE = float(np.radians(10.0))
-"""Angle between the solution and the photometric normals, radians, at which an edge counts a quarter: as in `contradictions.DRIFT`."""
+"""Angle between the solution and the photometric normals, radians, at which an edge counts a quarter: as DRIFT."""
 LEAST_COTANGENT, MOST_COTANGENT = 0.05, 1e3
 """Bounds of the weights of edges, which thin triangles would make negative or very large."""
 BENT = 0.25
@@ -190,7 +189,7 @@ def _moves(points: np.ndarray, faces: np.ndarray, mesh: _Mesh, weights: _Weights
         limited: returns the motions without what drift has left in them.
         unlike: returns which motions noise does not explain.
 
-    Source: the weights of edges are those of Geman and McClure (`service.scans.fusion.contradictions`), found again after each solution.
+    Source: the weights of edges are those of Geman and McClure (`compared`), found again after each solution.
     """
     one, other, count = mesh.one, mesh.other, len(points)
     middle = normals[one] + normals[other]
@@ -231,3 +230,55 @@ def _solved(mesh: _Mesh, diagonal: np.ndarray, between: np.ndarray, right: np.nd
     found, _ = cg((eye_array(count) + beside + beside.T).tocsr(), right * root, first / root, rtol=TOLERANCE, atol=0.0,
                   maxiter=MOST_ITERATIONS)
     return np.asarray(found * root)
+
+
+# Range images close the mouth of a narrow gap, and make a wall or a ramp of a step between two parts that stand one before the other. The
+# photographs show the normals of both parts there and no wall. A surface that was made to have these normals would be drawn from one part
+# to the other, and so would what lies beside. Averaged over one to four pixels the two differ there by far more than the noise of the depth
+# and the drift of normals.
+
+LENGTHS_PX = (1.0, 2.0, 4.0)
+"""Lengths over which normals are compared, pixels: a wall over a step is one or two pixels wide, and longer means have less noise."""
+NOISE_PX = 32.0
+"""Length over which the variance of the noise is averaged, pixels."""
+SIGMAS = 3.0
+"""Difference of normals that the noise of the depth explains, in its standard deviations."""
+DRIFT = float(np.radians(10.0))
+"""Difference, radians, that drift and chords of a bent surface explain: twice the error of lights that `relit join` allows for."""
+MOTION_PX = 4.0
+"""Length over which motions are compared with the noise, pixels: some 16 of them, so that the mean square of noise is 1 ± .35."""
+MOTION = 2.0
+"""Largest mean square of motions over that length, in variances of the depth, that noise explains."""
+
+
+class Trust(NamedTuple):
+    """The trust in the normals of the vertices."""
+
+    agree: np.ndarray  # [V] bool, where the normals and the surface do not contradict each other
+    counts: np.ndarray  # [V] 0…1, by how much each vertex counts where the drift of the normals is measured
+
+
+def compared(bands: Bands, difference: np.ndarray, noise: np.ndarray, pixel_m: float) -> Trust:
+    """Compare photometric normals with those of the surface, over several lengths.
+
+    Args:
+        difference: [V, 3] normals of the mesh without the photometric ones.
+        noise: [V, 3] an example of the noise of the former.
+        pixel_m: distance of neighbouring pixels on the surface.
+
+    Source: the weights are those of Geman and McClure, "Statistical methods for tomographic image reconstruction", 1987.
+    """
+    means = [bands.averaged(np.concatenate([difference, noise], axis=1), length * pixel_m) for length in LENGTHS_PX]
+    found, example = (np.stack([(mean[:, part] ** 2).sum(axis=1) for mean in means], axis=1) for part in (slice(3), slice(3, 6)))
+    ratio = found / (SIGMAS**2 * bands.averaged(example, NOISE_PX * pixel_m) + DRIFT**2)
+    return Trust(np.asarray((ratio <= 1).all(axis=1)), np.prod(1 / (1 + ratio) ** 2, axis=1))
+
+
+def unlike_noise(bands: Bands, move: np.ndarray, sigma: np.ndarray, agree: np.ndarray, pixel_m: float) -> np.ndarray:
+    """Return [V] bool, where the motions of the vertices around are larger than the noise of the depth explains.
+
+    Args:
+        move, sigma: [V] metres; sigma is the standard deviation of the depth.
+        agree: [V] bool, the vertices that moved.
+    """
+    return np.asarray(agree & (bands.averaged((move / sigma)[:, None] ** 2, MOTION_PX * pixel_m, agree)[:, 0] > MOTION))

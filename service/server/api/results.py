@@ -21,6 +21,7 @@ from fastapi.responses import StreamingResponse
 
 from service.requests.answers import ResultPage
 from service.requests.base.identifiers import EnvironmentId
+from service.requests.export import FORMATS
 from service.requests.states import READY
 from service.server.api.context import Reader, ServiceDep
 from service.server.api.intakes import row_of
@@ -38,8 +39,8 @@ environments = APIRouter(prefix="/v1/environments", tags=["environments"], respo
 MAX_PAGE = 1000
 PIECE_BYTES = 1 << 20
 """Bytes that are read and sent at once."""
-MEDIA_TYPES = {".exr": "image/x-exr", ".usdz": "model/vnd.usdz+zip", ".usda": "model/vnd.usda", ".glb": "model/gltf-binary",
-               ".json": "application/json", ".png": "image/png", ".jpg": "image/jpeg"}
+MEDIA_TYPES = {".exr": "image/x-exr", ".json": "application/json", ".png": "image/png", ".jpg": "image/jpeg",
+               **{f".{name}": facts.media_type for name, facts in FORMATS.items() if facts.media_type is not None}}
 BYTES = "application/octet-stream"
 CONTENT: dict[str, Any] = {kind: {"schema": {} if kind == "application/json" else {"type": "string", "format": "binary"}}
                            for kind in (*sorted(MEDIA_TYPES.values()), BYTES)}

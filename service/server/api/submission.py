@@ -9,7 +9,7 @@ from service.requests import states
 from service.requests.base.base import JobRequest, SequenceOptions
 from service.requests.calibration_jobs import TofCalibrationJob
 from service.requests.drive import RigDocument
-from service.requests.export import AssetFormat
+from service.requests.export import TIME_SAMPLED, AssetFormat
 from service.requests.light.frame_range import frame_numbers
 from service.requests.relight import RelightOptions
 from service.server.api.context import Service
@@ -25,8 +25,6 @@ SOLVES = ("solve", "pipeline")
 OF_SEQUENCES = (asked.SolveJob, asked.DepthJob, asked.PipelineJob, asked.RelightJob, asked.ViewJob, TofCalibrationJob)
 """Jobs whose capture may be a sequence of captures."""
 KINDS_OF_SEQUENCES = [kind for kind, job in asked.JOBS.items() if issubclass(job, OF_SEQUENCES)]
-TIME_SAMPLED: tuple[AssetFormat, ...] = ("usdz", "usdc")
-"""Formats of the asset of a sequence."""
 
 
 def submit(service: Service, caller: Caller, request: JobRequest, connection: sa.Connection, inputs: list[str]) -> str:
@@ -53,7 +51,7 @@ def inputs_of(service: Service, project: str, request: JobRequest) -> list[str]:
     read = []
     for field in ("capture", "captures", "environment", "reference_ball", "beside", "rig", "apply_to"):
         value = getattr(request, field, None)
-        if isinstance(value, RigDocument):
+        if isinstance(value, RigDocument):  # which comes with the request; the rig of an asset is the identifier of a capture
             continue
         for identifier in value if isinstance(value, tuple) else () if value is None else (value,):
             steps = intakes.time_steps(_require_ready(service, project, field, identifier))

@@ -12,7 +12,7 @@ attempt again. A job that loses more than `max_lost` workers without progress fa
 it, or making a new frame.
 
 What is done again. The next worker begins the workflow, skips the steps that the row names as finished, and does the step that was under
-way again (runner). A solve reads the pieces of its passes that are done (pieces, service.solve.sharing.sharing). A relight keeps each frame
+way again (runner). A solve reads the pieces of its passes that are done (pieces, service.sharing.sharing). A relight keeps each frame
 that exists with the hash of the same request, and makes the others in small groups first. What another version of relit has done is not
 kept: the job begins anew, so that its files are all those of one version. With `storage_url`, a worker on another machine finds only the
 frames of finished steps, because files are sent at the end of a step.

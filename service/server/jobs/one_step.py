@@ -21,8 +21,9 @@ from stage.files import write_text
 
 BASIS = "basis"
 """Name of the file of a basis, without its suffix."""
-RIG_FILE, KEYS_FILE = "rig.json", "keys.json"
+RIG_FILE, KEYS_FILE, CHART_FILE = "rig.json", "keys.json", "chart.json"
 """Names of the files with the rig and the light keys of a job, which lie beside what was made of them."""
+MEASURED_FILE = "measured.json"
 REGIONS_FILE = "regions.json"
 """Name of the file with the regions of a job, which lies beside what they were judged in."""
 STUDY_FILE = "study.json"
@@ -112,9 +113,11 @@ def _drive(request: jobs.DriveJob, files: StepFiles) -> None:
     from service.drive.drive import drive
     from service.requests.drive import DriveRequest
 
-    rig = files.out / RIG_FILE
-    write_text(rig, request.rig.model_dump_json(by_alias=True) + "\n")
-    drive(files.request(DriveRequest, request, rig=rig, keys=write_keys(request.keys, files), out=files.out), files.progress)
+    given: dict[str, Path | None] = {"rig": files.out / RIG_FILE, "chart": None if request.chart is None else files.out / CHART_FILE}
+    for path, document in zip(given.values(), (request.rig, request.chart), strict=True):
+        if path is not None and document is not None:
+            write_text(path, document.model_dump_json(by_alias=True) + "\n")
+    drive(files.request(DriveRequest, request, **given, keys=write_keys(request.keys, files), out=files.out), files.progress)
 
 
 def write_keys(keys: LightKeys | None, files: StepFiles) -> Path | None:
@@ -172,6 +175,18 @@ def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.Stereo
         laser_planes.laser_planes(files.request(calibrate.LaserPlanesRequest, request), files.progress, manifest_paths=paths)
 
 
+def _calibrate_lamps(request: calibration_jobs.RigCalibrationJob, files: StepFiles) -> None:
+    from service.calibrate.rig import calibrate_rig
+
+    rig = files.out / RIG_FILE
+    write_text(rig, request.rig.model_dump_json(by_alias=True) + "\n")
+    folder = files.intake(request.capture)
+    table = file_within(folder, request.table, "table")
+    reflectances = None if request.reflectances is None else file_within(folder, request.reflectances, "reflectances")
+    calibrate_rig(files.request(calibrate.RigCalibrationRequest, request, rig=rig, table=table, reflectances=reflectances,
+                                out=files.out / MEASURED_FILE, capture=folder), files.progress)
+
+
 def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles) -> None:
     from service.calibrate.tof import calibrate_tof
     from service.relight.time_steps import time_steps
@@ -187,6 +202,7 @@ RIGS = (calibration_jobs.ProcamJob, calibration_jobs.StereoCalibrationJob, calib
 ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] = {
     **dict.fromkeys(get_args(calibration_jobs.AnyCalibration), (MEASURE, _calibrate)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
+    calibration_jobs.RigCalibrationJob: (MEASURE, _calibrate_lamps),
     jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _join), jobs.ShadeJob: ("shade", _shade), jobs.ViewJob: ("view", _view),
     jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _drive),
     jobs.BasisJob: (MEASURE, _basis), jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan),

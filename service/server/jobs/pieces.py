@@ -1,6 +1,6 @@
 """The pieces of a running job that its worker and those that help it share, as files of the storage.
 
-Any worker does any piece: the bands and batches of a solve (service.solve.sharing.sharing) and the chunks of frames of a relight. A claim
+Any worker does any piece: the bands and batches of a solve (service.sharing.sharing) and the chunks of frames of a relight. A claim
 is a file with the name of the worker that does the piece. It holds as long as that worker is at work on the job, as DBOS has recorded it,
 and was seen lately; so pieces of a worker that dies, drains or fails are done by another. Two workers that claim a piece at the same moment
 both do it, and store the same. The files are deleted when the job ends, and what a worker stores after that it deletes again.
@@ -93,7 +93,7 @@ class JobPieces:
             raise DivergedError("device or versions are not those of the worker that has the job")
 
     def _kind(self) -> bytes:
-        from service.solve.sharing.sharing import kind_of_worker
+        from service.sharing.sharing import kind_of_worker
 
         return kind_of_worker(self._context.device).encode()
 

@@ -11,11 +11,10 @@ from kernels.photometric.lambertian.near import NearField, NearLights, see_near
 from kernels.photometric.lambertian.readings import Lights, Readings, grey_factors, grey_readings
 from kernels.photometric.model.samples import Samples, gather
 from kernels.status import Status
+from service.sharing.sharing import Results, deal
 from service.solve.base.solution import SolveInput
-from service.solve.sharing.sharing import Results, deal
 from stage.capture.camera import Camera
 from stage.colour.colour import GREY_WEIGHTS
-from stage.stack.stack import PIXEL_PAD, Stack
 
 READING_BYTES = 4
 """A grey reading, per light and pixel, beside the stack's band."""
@@ -60,7 +59,7 @@ def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int,
         work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
     """
     inside, total = given.mask.reshape(-1), given.stack.shape[2]
-    spans = [(start, stop) for start, stop in given.stack.bands(bytes_per_pixel) if inside[start:stop].any()]
+    spans = [(start, stop) for start, stop in given.images[given.device].spans(bytes_per_pixel) if inside[start:stop].any()]
     _deal(given, spans, lambda span, device: work(*span, device), results, size=lambda span: span[1] - span[0],
           done=total - sum(stop - start for start, stop in spans),
           pixels_of=lambda span: slice(span[0], min(span[1], given.stack.pixel_count)))
@@ -75,11 +74,14 @@ def _deal(given: SolveInput, pieces: Sequence[Piece], work: Callable[[Piece, str
         given.timings.advance(done)
 
     tell(0)
+    names = [device for device in given.devices for _ in range(devices.pieces_at_once(device))]
     if given.sharing is None:
-        deal(given.devices, pieces, work, lambda piece: tell(size(piece)))
+        deal(names, pieces, work, lambda piece: tell(size(piece)))
     else:
-        given.sharing.deal(given.devices, pieces, work, lambda piece: tell(size(piece)), waiting=lambda: tell(0), pixels_of=pixels_of,
+        given.sharing.deal(names, pieces, work, lambda piece: tell(size(piece)), waiting=lambda: tell(0), pixels_of=pixels_of,
                            results=results)
+    for device in set(given.devices):
+        given.images[device].finish()
 
 
 def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None], results: Results) -> None:
@@ -93,7 +95,7 @@ def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: 
 
     def read(start: int, stop: int, device: str) -> None:
         span = slice(start, min(stop, stack.pixel_count))
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        band = given.images[device].band(start, stop)
         readings = grey_readings(band, factors)
         near = None if field is None else see_near(band, readings, field.at(np.arange(start, stop)))
         work(ReadBand(span, inside[span], band, readings, near))
@@ -117,20 +119,18 @@ def each_batch(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray
 
     def read(piece: slice, device: str) -> None:
         chosen = pixels[piece]
-        start = int(chosen[0]) // PIXEL_PAD * PIXEL_PAD
-        stop = (int(chosen[-1]) // PIXEL_PAD + 1) * PIXEL_PAD
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
-        work(Batch(chosen, gather(band, chosen - start, view(chosen), lights, factors, stack.light_count,
+        band, places = given.images[device].around(chosen)
+        work(Batch(chosen, gather(band, places, view(chosen), lights, factors, stack.light_count,
                                   None if field is None else field.at(chosen))))
 
-    _deal(given, _cut(stack, pixels, size), read, results._replace(follows_from=(lights, field, pixels, results.follows_from)),
+    _deal(given, _cut(given, pixels, size), read, results._replace(follows_from=(lights, field, pixels, results.follows_from)),
           size=lambda piece: piece.stop - piece.start, done=done, pixels_of=lambda piece: pixels[piece])
 
 
-def _cut(stack: Stack, pixels: np.ndarray, size: int) -> list[slice]:
-    """Cut ascending positions into batches of at most `size`, each inside one band of the stack."""
-    found = []
-    for start, stop in stack.bands(READING_BYTES * stack.shape[1]):
+def _cut(given: SolveInput, pixels: np.ndarray, size: int) -> list[slice]:
+    """Cut ascending positions into batches of at most `size`; on the CPU, where a batch is a view, each inside one band of the stack."""
+    found, stack = [], given.stack
+    for start, stop in stack.bands(READING_BYTES * stack.shape[1]) if given.device == "cpu" else [(0, stack.pixel_count)]:
         first, last = (int(place) for place in np.searchsorted(pixels, (start, stop)))
         found += [slice(begin, min(begin + size, last)) for begin in range(first, last, size)]
     return found
@@ -138,7 +138,7 @@ def _cut(stack: Stack, pixels: np.ndarray, size: int) -> list[slice]:
 
 def pick_pixels(given: SolveInput, lights: Lights, view: View, pixels: np.ndarray, field: NearField | None = None) -> Samples:
     """Return the readings of a few pixels, [n] positions, wherever they lie in the image."""
-    band = packs.upload(*given.stack.pick(pixels), device=given.device)
+    band = given.images[given.device].pick(pixels)
     return gather(band, np.arange(len(pixels)), view(pixels), lights, grey_factors(lights, GREY_WEIGHTS), given.stack.light_count,
                   None if field is None else field.at(pixels))
 

@@ -1,26 +1,27 @@
 """The input and the solution of every solver, and the judgement of a solution: pixels in doubt, lights that do not fit."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from kernels.images import ImagesOnDevice
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.readings import Lights, channel_weights
-from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import evenly
-from kernels.status import Status, refuse_unsure
+from kernels.status import ESTIMATED, Status, refuse_unsure
 from kernels.surface.integrate import Integration
 from service.light_estimation.suspects import LEAST_PIXELS, suspects
 from service.reporting.progress import Timings
-from service.solve.sharing.sharing import SharedSolve
+from service.sharing.sharing import SharedSolve
 from stage.capture.camera import Camera
 from stage.colour.colour import GREY_WEIGHTS
 from stage.stack.stack import Stack
 
-LOOSE_CONFIDENCE = 1.0 / (1.0 + 5.0)
-"""Confidence of a normal whose standard error is five degrees."""
+AMBIGUOUS_DEGREES = 5.0
+"""Standard error of a normal above which it is ambiguous."""
 PIXELS_AT_ONCE = 1 << 16
 """Number of pixels that are looked at in one piece: it bounds the memory."""
 SUSPECT_PIXELS = 512
@@ -63,6 +64,11 @@ class SolveInput:
         """The first device."""
         return self.devices[0]
 
+    @cached_property
+    def images(self) -> dict[str, ImagesOnDevice[Stack]]:
+        """The images on each device."""
+        return {device: ImagesOnDevice(self.stack, device) for device in set(self.devices)}
+
 
 class SuspectLight(NamedTuple):
     """A light that disagrees with the others."""
@@ -78,7 +84,7 @@ class Solution:
 
     normal: np.ndarray  # [3, pixels] float32
     albedo: np.ndarray  # [3, pixels] float16
-    confidence: np.ndarray  # [pixels] float16
+    sigma: np.ndarray  # [pixels] float16, standard error of the normal: the RMS angle to the true one, degrees
     residual: np.ndarray  # [pixels] float16
     status: np.ndarray  # [pixels] uint8
     specular: np.ndarray | None = None  # [3, pixels] float16, F0
@@ -87,12 +93,11 @@ class Solution:
     pair: np.ndarray | None = None  # [pixels] uint8, which pair these are
     pairs: np.ndarray | None = None  # [pairs, 2, 4] float32, F0 and roughness of both materials; None: no pixel has two
     specular_normal: np.ndarray | None = None  # [3, pixels] float32
-    regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.reference.sampling.Regime
+    regime: np.ndarray | None = None  # [pixels] uint8, codes of kernels.photometric.posterior.sampling.Regime
     height: np.ndarray | None = None  # [rows, cols] float32, camera-frame z, 0 where not solved; None: not integrated yet
     integration: Integration | None = None
     """The last integration of the normals, from which the height came."""
     suspects: list[SuspectLight] = field(default_factory=list)
-    sigma: np.ndarray | None = None  # [pixels] float16, standard error of the normal in degrees; None: that of the confidence
     judged_by_surface: bool = False
     """True if confidence falls where the normals are not those of a surface."""
     warnings: list[str] = field(default_factory=list)
@@ -103,13 +108,13 @@ class Solution:
     """Content hash of each capture that was read beside the images, by the name of its option."""
 
     def standard_error(self) -> np.ndarray:
-        """Return the standard error of the normals in degrees, [pixels] float32.
+        """Return the standard error of the normals in degrees, [pixels] float32."""
+        return self.sigma.astype(np.float32)
 
-        Without one of its own a solver's confidence is 1 / (1 + standard error / 1°).
-        """
-        if self.sigma is not None:
-            return self.sigma.astype(np.float32)
-        return np.minimum(1 / np.maximum(self.confidence.astype(np.float32), 1e-6) - 1, LARGEST_ERROR)
+    @property
+    def confidence(self) -> np.ndarray:
+        """Return 1 / (1 + standard error / 1°), [pixels] float16; 0 where nothing is estimated."""
+        return np.where(np.isin(self.status, ESTIMATED), 1 / (1 + self.standard_error()), 0).astype(np.float16)
 
     @classmethod
     def empty(cls, pixels: int) -> "Solution":
@@ -139,11 +144,18 @@ def mark_not_facing(camera: Camera, solution: Solution) -> None:
         status[(status == Status.OK) & (toward <= 0)] = Status.NOT_FACING
 
 
+def raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
+    """Add an independent error, of all normals or [pixels] of each, to their standard error."""
+    before = solution.standard_error()
+    solution.sigma = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before).astype(np.float16)
+
+
 def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_confidence: float) -> None:
     """Say why pixels have too few lights, and which normals are uncertain, by the status of these pixels.
 
-    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED. Solved pixels with a confidence
-    under 1/6 become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values. `max_sigma` is in degrees.
+    Pixels with too few lights become SATURATED where one reading or more saturates, else SHADOWED. Solved pixels with a
+    standard error above five degrees become AMBIGUOUS, and those that are less sure than was asked for UNSURE; both keep their values.
+    `max_sigma` is in degrees.
     """
     few = np.flatnonzero(solution.status == Status.TOO_FEW_LIGHTS)
     for first in range(0, len(few), PIXELS_AT_ONCE):
@@ -151,8 +163,7 @@ def refine_status(solution: Solution, stack: Stack, *, max_sigma: float, least_c
         bits = stack.pick_saturated(part)
         saturated = np.unpackbits(bits, axis=0, bitorder="little")[: stack.light_count].sum(axis=0)
         solution.status[part] = np.where(saturated >= 1, int(Status.SATURATED), int(Status.SHADOWED))
-    loose = (solution.status == Status.OK) & (solution.confidence.astype(np.float32) < LOOSE_CONFIDENCE)
-    solution.status[loose] = Status.AMBIGUOUS
+    solution.status[(solution.status == Status.OK) & (solution.sigma > AMBIGUOUS_DEGREES)] = Status.AMBIGUOUS
     refuse_unsure(solution.status, solution.standard_error(), solution.confidence, max_sigma=max_sigma, least_confidence=least_confidence)
 
 
@@ -161,8 +172,8 @@ def suspect_lights(solution: Solution, stack: Stack, lights: Lights) -> list[Sus
     solved = np.flatnonzero(solution.status == Status.OK)
     if len(solved) < 2 * LEAST_PIXELS:
         return []
-    confidence = solution.confidence[solved].astype(np.float32)
-    sure = solved[confidence >= np.median(confidence)]
+    sigma = solution.sigma[solved]
+    sure = solved[sigma <= np.median(sigma)]
     chosen = sure[evenly(len(sure), SUSPECT_PIXELS)]
     values, _ = stack.pick(chosen)
     count = stack.light_count

@@ -50,11 +50,14 @@ class DirectLight(NamedTuple):
         return self.solved, self.height, self.shadows, self.arriving, self.albedo, self.albedo_scale
 
     def on(self, device: str) -> "DirectLight":
-        """Return the same for readings on another device."""
+        """Return the same for readings on a device, to which it is uploaded once."""
+        arriving = self.arriving
+        if arriving is not None:
+            arriving = arriving._replace(light=wp.array(arriving.light, dtype=wp.float32, device=device))
         if device == self.given.device:
-            return self
+            return self._replace(arriving=arriving)
         solved, height = (wp.array(plane.numpy(), dtype=plane.dtype, device=device) for plane in (self.solved, self.height))
-        return self._replace(solved=solved, height=height)
+        return self._replace(solved=solved, height=height, arriving=arriving)
 
     def keep(self, pixels: np.ndarray, samples: Samples) -> None:
         """Change readings in place: mark those in cast shadow as none, and subtract the light that the object threw on itself from the

@@ -10,7 +10,6 @@ Source: the dependence of photometric stereo under near lights on the mean dista
 "LED-based photometric stereo: modeling, calibration and numerical solution", J. Math. Imaging Vis. 60, 2018, section 2.
 """
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,7 +79,7 @@ class Distance(NamedTuple):
     """Standard error of the normals for that of the depth."""
 
 
-class _Lamps(NamedTuple):
+class Lamps(NamedTuple):
     """Lights as `stage.capture.point_lights.PlacedLights` has them, of one strength for all channels."""
 
     place: np.ndarray  # [lights, 4] metres and 1, or unit direction and 0
@@ -88,7 +87,7 @@ class _Lamps(NamedTuple):
     lobe: np.ndarray  # [lights, 4] axis and exponent
 
 
-class _Fit(NamedTuple):
+class NearFit(NamedTuple):
     """The normals of pixels, and what they leave."""
 
     normal: np.ndarray  # [3, pixels] float64, unit
@@ -104,7 +103,7 @@ class _Sample(NamedTuple):
     y: np.ndarray
     readings: np.ndarray  # [lights, pixels of the mask]
     usable: np.ndarray
-    lamps: _Lamps
+    lamps: Lamps
     perspective: bool
     top: float
     """The z from which depths count: 0, or that of the light nearest to an orthographic camera."""
@@ -189,16 +188,11 @@ def _found(capture: Capture, stack: Stack, device: str) -> Distance:
     here, off = (_surface(sample, depth * factor, device).normal for factor in (1.0, 1.0 + sigma))
     turned = float(np.degrees(np.median(np.arccos(np.clip((here * off).sum(axis=0), -1, 1)))))
     z = sample.top - depth
-    camera = capture.camera.model_copy(update={"surface_z_m": z})
-    whole = capture.whole
-    if whole is not None:
-        whole = replace(whole, manifest=whole.manifest.model_copy(update={"camera": whole.camera.model_copy(update={"surface_z_m": z})}))
-    found = replace(capture, manifest=capture.manifest.model_copy(update={"camera": camera}), whole=whole)
     facts = {"surface_z_m": float(f"{z:.6g}"), "sigma_m": float(f"{sigma_m:.3g}"),
              "sigma_of_normals_degrees": round(turned, 3)}
-    return Distance(found, {"distance": facts}, (
+    return Distance(capture.at_distance(z), {"distance": facts}, (
         f"camera.surface_z_m: is missing, and was taken as {z:.4g} m ± {sigma_m:.2g} m, which explains the images best: heights "
-        "and albedo have this error in common; write it into capture.json, or a measured one, to relight"), turned)
+        "and albedo have this error in common; write a measured one into capture.json where there is one"), turned)
 
 
 def _span(capture: Capture) -> float:
@@ -220,7 +214,7 @@ def _sample(capture: Capture, stack: Stack) -> _Sample:
     placed = light_places(capture)
     perspective = camera.projection == "perspective"
     top = 0.0 if perspective else float(placed.place[placed.place[:, 3] == 1, 2].max())
-    return _Sample(inside, x, y, readings, usable, _Lamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe),
+    return _Sample(inside, x, y, readings, usable, Lamps(placed.place, placed.strength @ np.asarray(GREY_WEIGHTS), placed.lobe),
                    perspective, top)
 
 
@@ -232,10 +226,10 @@ def _cost(sample: _Sample, depth: float, device: str) -> np.ndarray:
     return np.where(lit >= LEAST_LIT, cost, np.log1p(1 / NOISE**2))
 
 
-def _surface(sample: _Sample, depth: float, device: str) -> _Fit:
+def _surface(sample: _Sample, depth: float, device: str) -> NearFit:
     """Return the normals of a surface with this mean depth, and what they leave."""
     mask, z, sight = sample.mask, sample.top - depth, sample.sight()
-    fit = _fit_near(sample.readings, sample.usable, sample.lamps, sample.points(np.full(mask.shape, z))[mask])
+    fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(np.full(mask.shape, z))[mask])
     for _ in range(ROUNDS - 1):
         normal = np.zeros((3, *mask.shape), np.float32)
         normal[:, mask] = fit.normal
@@ -246,7 +240,7 @@ def _surface(sample: _Sample, depth: float, device: str) -> _Fit:
                                   perspective=sample.perspective, mean_z=z, options=INTEGRATION,
                                   device=device).height.numpy()
         height = np.where(solved & np.isfinite(found) & (found < sample.top), found, z)
-        fit = _fit_near(sample.readings, sample.usable, sample.lamps, sample.points(height)[mask])
+        fit = fit_near(sample.readings, sample.usable, sample.lamps, sample.points(height)[mask])
     return fit
 
 
@@ -258,7 +252,7 @@ def _spread_by_lights(sample: _Sample, best: float, device: str) -> float:
     found = []
     for group in np.unique(groups):
         kept = groups != group
-        lamps = _Lamps(*(values[kept] for values in sample.lamps))
+        lamps = Lamps(*(values[kept] for values in sample.lamps))
         part = sample._replace(readings=sample.readings[kept], usable=sample.usable[kept], lamps=lamps)
         found.append(_lowest(depths, np.array([_cost(part, depth, device).mean() for depth in depths])))
     return float((len(found) - 1) / len(found) * ((np.array(found) - np.mean(found)) ** 2).sum())
@@ -278,7 +272,7 @@ def _lowest(depths: np.ndarray, cost: np.ndarray) -> float:
     return float(x[1] + (np.clip(-b / (2 * a), x[0] - x[1], x[2] - x[1]) if a > 0 else 0.0))
 
 
-def _fit_near(readings: np.ndarray, usable: np.ndarray, lamps: _Lamps, points: np.ndarray) -> _Fit:
+def fit_near(readings: np.ndarray, usable: np.ndarray, lamps: Lamps, points: np.ndarray) -> NearFit:
     """Fit E b·l robustly to the readings of each pixel, where E is the irradiance that each light has at its point [pixels, 3].
 
     What the fit leaves is relative to the bright readings of the pixel, which do not depend on where the point is thought to be, so that
@@ -303,4 +297,4 @@ def _fit_near(readings: np.ndarray, usable: np.ndarray, lamps: _Lamps, points: n
         residual = np.where(lit, np.clip(relative - np.einsum("lpa,pa->lp", lit_by, vector), -LARGEST_RESIDUAL, LARGEST_RESIDUAL), 0)
         spread = MAD_TO_SIGMA * median_of(np.abs(residual), lit) + LEAST_SPREAD
         weight = lit / (1 + (residual / (CAUCHY * spread)) ** 2)
-    return _Fit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)).T, residual, lit)
+    return NearFit((vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300)).T, residual, lit)

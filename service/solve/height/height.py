@@ -16,6 +16,8 @@ GUESSED_SIGMA = 30.0
 """Standard error, in degrees, of a normal above which its slope is a guess."""
 GUESSED_PART = 0.1
 """Part of the surface that may rest on such normals before it is said."""
+LEAST_THIN = 20
+"""Pixels on thin parts of the mask from which they are said: a mask that was drawn by hand has some at its rim."""
 RINGS = 8
 """Unsolved pixels this near to solved ones are filled from their neighbours; farther ones, which few solves have, by blocks."""
 
@@ -48,13 +50,21 @@ def guessed_part(sigma: np.ndarray, estimated: np.ndarray) -> float:
     return float((sigma.reshape(estimated.shape)[estimated] > GUESSED_SIGMA).mean()) if estimated.any() else 0.0
 
 
-def height_warnings(guessed: float, method: Method) -> list[str]:
-    """Return a sentence where much of the height is a guess, by the part that guessed_part returns."""
+def height_warnings(guessed: float, method: Method, mask: np.ndarray) -> list[str]:
+    """Return a sentence for wires and hair, parts of a mask under three pixels wide, and one where much of the height is a guess, by the
+    part that guessed_part returns."""
+    found = []
+    if mask.any() and not mask.all():
+        wide = ndimage.binary_dilation(ndimage.binary_opening(mask, np.ones((3, 3))), np.ones((5, 5)))  # with its corners and rims
+        thin = int((mask & ~wide).sum())
+        if thin >= LEAST_THIN:
+            found.append(f"height: {thin} pixels lie on parts of the object under three pixels wide, such as wires: their normals and "
+                         "heights are mixed with what lies behind them; photograph them larger")
     if guessed <= GUESSED_PART:
-        return []
+        return found
     cure = "try --method svbrdf, which knows highlights and metals" if method in (Method.LAMBERT, Method.ROBUST) else "try more lights"
-    return [f"height: {guessed:.0%} of the surface rests on normals with a standard error above {GUESSED_SIGMA:g} degrees, so its shape "
-            f"is a guess there: {cure}"]
+    return [*found, f"height: {guessed:.0%} of the surface rests on normals with a standard error above {GUESSED_SIGMA:g} degrees, so its "
+            f"shape is a guess there: {cure}"]
 
 
 def mean_height(camera: Camera) -> float:

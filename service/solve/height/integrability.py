@@ -4,7 +4,7 @@ Normals that were solved pixel by pixel are those of a surface only where they a
 gradient of any height. So the normals of the integrated height differ from the solved ones by that part of the error which no surface has,
 whatever caused it: interreflection, another reflectance than the model's, lights that are off, or modes that tear the surface. Errors that
 bend the whole surface alike leave no trace here, and where the surface turns by many degrees from pixel to pixel, or hides a part of
-itself, right normals differ too. So the misfit says how probable a normal is, not how far off.
+itself, right normals differ too: so a large misfit counts less than it is.
 
 Source: integrability as a constraint on normals, Frankot and Chellappa, "A method for enforcing integrability in shape from shading
 algorithms", TPAMI 1988; as a measure of their error it is ours.
@@ -20,29 +20,31 @@ REACHES = 3
 """Standard deviations at which the window ends."""
 BAND_PIXELS = 1 << 20
 """Number of pixels that are looked at in one piece: it bounds the memory."""
-ROOT_OF_MEAN = 1.6
-"""Standard deviation of errors without preferred direction over the mean misfit: the mean of a Rayleigh distribution is 0.886 of its root
-mean square, and half of the variance of the errors is of a gradient and unseen."""
+ROOT_OF_MEAN = 1.9
+"""Standard deviation of errors over the mean misfit: 1.6 for those without preferred direction, because the mean of a Rayleigh distribution
+is 0.886 of its root mean square, and half of the variance of the errors is of a gradient and unseen; errors that neighbours share are more
+of a gradient than that."""
 LEAST_COUNT = 1e-4
 """Least weight of all pixels around one at which their misfit is looked at."""
 STEEP = np.radians(3.0)
 """Change of the normal from pixel to pixel at which a pixel counts half: where it is larger, differences of heights hardly show normals."""
 
 
-def doubt(sigma: np.ndarray, normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the factor on the confidence of normals that their misfit to a surface calls for.
+LARGEST_TRACE = 5.0
+"""Standard deviation, in degrees, that the misfit tends to where it is large: there it is of a texture of many degrees from pixel to pixel
+more than of errors."""
+
+
+def doubt(normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the standard deviation of normals, in degrees, that their misfit to a surface shows, [rows, cols] float32.
 
     Args:
-        sigma: [rows, cols] standard deviation of the normals in degrees, as their readings show it.
         normal: [rows, cols, 3] unit.
         height: [rows, cols] camera-frame z, integrated from them.
         solved: [rows, cols] bool: where there are both.
-
-    Returns:
-        [rows, cols] 0…1: 1 where the normals around a pixel are those of a surface to within sigma; below that, so that the confidence is
-        that of a standard deviation as large as the misfit.
     """
-    return (1 + sigma) / (1 + np.maximum(sigma, misfit(normal, height, solved, camera)))
+    found = misfit(normal, height, solved, camera)
+    return found / np.hypot(1, found / LARGEST_TRACE)
 
 
 def misfit(normal: np.ndarray, height: np.ndarray, solved: np.ndarray, camera: Camera) -> np.ndarray:

@@ -34,7 +34,7 @@ LEAST_FACING = 0.15
 class ArrivingLight(NamedTuple):
     """The light that arrives at each patch of the image, to interpolate between patches."""
 
-    light: np.ndarray  # [patches, 3, lights] float32: radiance that albedo 1 sends on / irradiance of the light
+    light: "np.ndarray | wp.array"  # [patches, 3, lights] float32: radiance that albedo 1 sends on / irradiance of the light
     numbers: np.ndarray  # [rows, cols] int: the number of each patch; -1 where there is none
     side: int
     """Pixels along a side of a patch."""

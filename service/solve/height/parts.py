@@ -43,8 +43,9 @@ BLUR_PIXELS = 0.7
 """Standard deviation, in pixels of the thinned picture, of the place of a shadow's edge."""
 TURNED_AWAY = 0.6
 """Cosine to the viewer below which the outermost pixels of a part are taken to turn away from the viewer."""
-LEAST_SIGMA_PIXELS = 0.5
-"""Least σ of an offset, in pixels of the thinned picture: rays are followed pixel by pixel."""
+LEAST_SIGMA_PIXELS = 0.7
+"""Least σ of an offset, in pixels of the thinned picture: rays are followed pixel by pixel, and shapes err along outlines, which all lights
+see alike. Errors of path-traced balls and rings are up to 0.8 pixels."""
 LARGE_SHARE = 0.05
 """Part of the surface from which a part of unknown step is warned of."""
 
@@ -71,12 +72,16 @@ class PlacedPart(NamedTuple):
     """The distance that it moved towards the viewer, in the unit of height; None: it is the part against which the others move, or the
     shadows leave its step open."""
     largest: bool
+    contradiction: float | None = None
+    """Range of the offsets that shadows leave open by contradicting each other, in parts of the object's size; None: the step is known, or
+    no shadow tells it."""
 
     def facts(self) -> dict[str, Any]:
         """Return what the report says about the part."""
         status = "reference" if self.largest else "unknown" if self.offset is None else "known"
         measured = {} if self.offset is None else {"offset": self.offset.offset, "sigma": self.offset.sigma}
-        return {"pixels": self.pixels, "centre_px": list(self.centre), "status": status, **measured}
+        contradicted = {} if self.contradiction is None else {"contradiction": self.contradiction}
+        return {"pixels": self.pixels, "centre_px": list(self.centre), "status": status, **measured, **contradicted}
 
 
 class Placement(NamedTuple):
@@ -90,11 +95,16 @@ class Placement(NamedTuple):
         """Return a sentence where a large part may lie anywhere in depth."""
         whole = sum(part.pixels for part in self.parts)
         unknown = [part for part in self.parts if part.offset is None and not part.largest and part.pixels > LARGE_SHARE * whole]
-        if not unknown:
-            return []
-        where = ", ".join(f"({part.centre[0]}, {part.centre[1]})" for part in unknown)
-        return [f"height: the step to {len(unknown)} large part{'s' * (len(unknown) > 1)} of the object is unknown (around the pixel "
-                f"{where}, row and column): normals do not tell it, and no shadow falls across the break; capture lights from the side"]
+        found = []
+        for contradicted in (False, True):
+            some = [part for part in unknown if (part.contradiction is not None) == contradicted]
+            if some:
+                where = ", ".join(f"({part.centre[0]}, {part.centre[1]})" for part in some)
+                why = (f"shadows of different lights contradict each other by {max(part.contradiction or 0 for part in some):.0%} of the "
+                       "object's size" if contradicted else "no shadow falls across the break")
+                found.append(f"height: the step to {len(some)} large part{'s' * (len(some) > 1)} of the object is unknown (around the "
+                             f"pixel {where}, row and column): normals do not tell it, and {why}; capture lights from the side")
+        return found
 
 
 class Material(NamedTuple):
@@ -129,16 +139,19 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
         return Placement(height, [])
     scene = _Scene(given, lights, normal, material, height, part)
     found: dict[int, Offset] = {}
+    contradiction: dict[int, float | None] = {}
     for _ in range(SWEEPS):
         restless = False
         for number in (int(one) for one in moved):
             step = scene.step_of(number, against=[int(order[0]), *(other for other in found if other != number)])
             before = found.pop(number, NOWHERE)
-            if step is None:
+            if not scene.is_known(step.low, step.high):
                 scene.move(number, -before.offset)
+                told = scene.is_known(step.agreed_low, step.agreed_high)
+                contradiction[number] = (step.high - step.low) / scene.size if told else None
                 continue
             scene.move(number, step.offset)
-            found[number] = Offset(step.offset + before.offset, step.sigma, step.low + before.offset, step.high + before.offset)
+            found[number] = step._replace(offset=step.offset + before.offset, low=step.low + before.offset, high=step.high + before.offset)
             restless |= before is NOWHERE or abs(step.offset) > SETTLED * step.sigma
         if not restless or len(moved) == 1:
             break
@@ -146,7 +159,8 @@ def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material:
     for number in (int(one) for one in order[: 1 + len(moved)]):
         row, col = (round(float(axis.mean())) for axis in np.nonzero(part == number))
         offset = scene.in_heights(number, found[number]) if number in found else None
-        placed.append(PlacedPart(int(size[number]), (row, col), offset, number == int(order[0])))
+        doubt = None if offset is not None else contradiction.get(number)
+        placed.append(PlacedPart(int(size[number]), (row, col), offset, number == int(order[0]), doubt))
     return Placement(scene.whole_height(), placed)
 
 
@@ -160,7 +174,7 @@ def place_solution(given: SolveInput, lights: DistantLights, solution: Solution)
     return place_parts(given, padded, solution.normal, material, solution.height, solution.integration.part)
 
 
-NOWHERE = Offset(0.0, math.inf, 0.0, 0.0)
+NOWHERE = Offset(0.0, math.inf, 0.0, 0.0, 0.0, 0.0)
 """The offset of a part that has not been moved."""
 
 
@@ -177,7 +191,9 @@ class _Scene:
         centre = wp.vec2(*((float(whole.centre[i]) - 0.5 - step // 2) / step + 0.5 for i in (0, 1)))
         self._projection = Projection(self._perspective, whole.scale / float(step), centre)
         pixel = 1.0 / (0.5 * (self._projection.scale[0] + self._projection.scale[1]))  # in log depth, or in the unit of height
-        self._blur, self._size, self._pixel = BLUR_PIXELS * pixel, self._extent() * pixel / step, pixel
+        self._blur, self._pixel = BLUR_PIXELS * pixel, pixel
+        self.size = self._extent() * pixel / step
+        """Longer side of the object, in the unit of offsets."""
 
         self._thin_part = np.ascontiguousarray(part[self._thin]).astype(np.int32)
         inside: np.ndarray = np.argwhere(self._thin_part >= 0)
@@ -199,18 +215,20 @@ class _Scene:
         """Return the positions in the image of [n, 2] rows and columns of the thinned picture."""
         return (inside * self._step + self._step // 2) @ np.array([self._part.shape[1], 1])
 
-    def step_of(self, number: int, *, against: list[int]) -> Offset | None:
-        """Return how far a part should move against some others, or None where the shadows leave that open; the rest is not there."""
+    def step_of(self, number: int, *, against: list[int]) -> Offset:
+        """Return how far a part should move against some others; the rest is not there."""
         there = [number, *against]
         parts = wp.array(np.where(np.isin(self._thin_part, there), self._thin_part, -1), dtype=wp.int32, device=self._device)
         odds = np.where(np.isin(self._on, there)[:, None], self._odds, 0)
         height = wp.array(np.ascontiguousarray(self._height[self._thin], dtype=np.float32), dtype=float, device=self._device)
         thickness = wp.array(self._thickness.astype(np.float32), dtype=float, device=self._device)
         shadows = march_part(self._pixels, self._toward, height, parts, thickness, number, self._projection)
-        evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self._size, blur=self._blur)
-        step = choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
-        bounded = -self._size < step.low and step.high < self._size
-        return step if bounded and step.high - step.low < 2 * OPEN * self._size else None
+        evidence = weigh_offsets(shadows, odds, self._on == number, self._group, reach=self.size, blur=self._blur)
+        return choose_offset(evidence, least_sigma=LEAST_SIGMA_PIXELS * self._blur / BLUR_PIXELS)
+
+    def is_known(self, low: float, high: float) -> bool:
+        """Return whether offsets between these bounds place a part."""
+        return -self.size < low and high < self.size and high - low < 2 * OPEN * self.size
 
     def _guess_thickness(self, normal: np.ndarray, view: View) -> np.ndarray:
         """Return the distance from front to back of parts that are mirrored in their outlines, on the thinned picture.
@@ -245,7 +263,7 @@ class _Scene:
         if not self._perspective:
             return offset
         distance = -float(self._height[self._part == number].mean())
-        return Offset(*(distance * math.expm1(value) if i != 1 else distance * value for i, value in enumerate(offset)))
+        return offset._replace(offset=distance * math.expm1(offset.offset), sigma=distance * offset.sigma)
 
     def whole_height(self) -> np.ndarray:
         """Return the height of the surface, its mean that of the camera."""

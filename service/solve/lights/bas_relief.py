@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from service.light_estimation.lambertian import SHADOW, bright_readings
+from stage.errors import CalibrationError
 
 SLOPES = (-0.8, -0.4, 0.0, 0.4, 0.8)
 """μ and ν that are tried first, in units of the middle slope of the surface."""
@@ -36,6 +37,8 @@ CLIP = 0.995
 """The quantile of the residuals above which they count as this large: single mirrored lights must not decide."""
 LEAST_TOLD = 0.2
 """Least part of the variance of the residuals that the angle must explain for highlights to be believed: noise leaves less than 0.03."""
+LEAST_COMPARED = 100
+"""Least count of lit readings that are compared."""
 ALBEDO_SCALE = 0.1
 """Difference of logarithms of albedo from which a pixel counts as one of another material."""
 
@@ -60,11 +63,16 @@ def resolve_relief(readings: np.ndarray, usable: np.ndarray, lights: np.ndarray,
         lights: [lights, 3] direction × irradiance up to the ambiguity.
         b: [3, pixels] albedo × normal up to the ambiguity.
         near: a choice that is known to be near, to be refined by the same means; None: search all.
+
+    Raises:
+        CalibrationError: too few readings are lit.
     """
     base = _centred(b)
     lights, b = lights @ np.linalg.inv(base), base @ b
     model = lights @ b
     compared = usable & (model > SHADOW * bright_readings(readings, usable))
+    if compared.sum() < LEAST_COMPARED or not np.isfinite(model).all():
+        raise CalibrationError("hardly a reading is lit under the lights that explain the images: they show shadow, saturation or noise")
     pixels = _Pixels(readings - model, compared, lights, b)
     costs: dict[str, Callable[[_Pixels, np.ndarray], float]] = {"highlights": _untold_by_highlights, "albedo": _spread_of_albedo}
     if near is not None:

@@ -10,10 +10,10 @@ import numpy as np
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
-from kernels.status import ESTIMATED
 from service.light_estimation.explanations import PIXELS, Cause, Sample, better_explanation, explanation_sentence, fit_manifest
-from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, suspect_lights
+from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, raise_error, suspect_lights
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
+from service.solve.lights.other_lights import find_other_lights
 from stage.capture.capture import Capture
 from stage.capture.extended_lights import ExtendedLights
 from stage.capture.gradients import GradientFrames
@@ -50,6 +50,10 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
                 raise_error(solution, found.degrees)
             if found.cause in UNORDERED:
                 return
+        other = find_other_lights(given, lights) if found is None or found.cause is Cause.IRRADIANCE else None
+        if other is not None:
+            solution.warnings.append(other.sentence)
+            raise_error(solution, other.degrees)
         if estimated:
             fit = fit_manifest(sample._replace(irradiance=lights.irradiance))
     axes = find_axes(given, solution, lights if isinstance(lights, DistantLights) else None, fit)
@@ -71,15 +75,6 @@ def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sampl
     times = {frame.image: frame.exposure_s or 1.0 for frame in capture.sources()}
     exposure = np.array([times[image] for image in stack.frames])
     return Sample(radiance, usable, lights.direction, lights.irradiance, exposure, capture.manifest.color_space)
-
-
-def raise_error(solution: Solution, degrees: np.ndarray | float) -> None:
-    """Add an independent error, of all normals or [pixels] of each, to their standard error; the confidence falls as
-    1 / (1 + standard error / 1°)."""
-    before = solution.standard_error()
-    after = np.where(np.isin(solution.status, ESTIMATED), np.hypot(before, degrees), before)
-    solution.confidence = (solution.confidence.astype(np.float32) * (1 + before) / (1 + after)).astype(np.float16)
-    solution.sigma = after.astype(np.float16)
 
 
 def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:

@@ -137,9 +137,10 @@ class LightsOverTime:
     """The intensities of the first step, for those after it."""
 
     def __init__(self, *, shared: bool) -> None:
-        """Args: shared: whether intensities are chosen at all; else every step has those of its manifest."""
+        """Share intensities if they are chosen at all; else every step has those of its manifest."""
         self._shared = shared
         self._first: dict[str, Any] | None = None
+        self._albedo_scale: float | None = None
 
     def choose(self, given: SolveInput, lights: DistantLights) -> ChosenIntensities:
         """Return the lights of a step with the shared intensities, or its own where its images contradict them."""
@@ -159,18 +160,25 @@ class LightsOverTime:
             return _said(own, "its own: the images contradict those of the first step")
         return ChosenIntensities(common, {"light_intensities": {"used": "those of the first step"}})
 
+    def share_albedo_scale(self, own: float) -> float:
+        """Return the factor of the albedo of the first step, which is a step's own where it is the first."""
+        self._albedo_scale = own if self._albedo_scale is None else self._albedo_scale
+        return self._albedo_scale
+
     def left(self) -> dict[str, Any]:
         """Return what a step leaves for those after it."""
-        return {"lights": self._first}
+        return {"lights": self._first, "albedo_scale": self._albedo_scale}
 
     def take(self, left: dict[str, Any]) -> None:
         """Take what a step has left, which was perhaps done before."""
         if self._first is None and isinstance(left.get("lights"), dict):
             self._first = left["lights"]
+        if self._albedo_scale is None and isinstance(left.get("albedo_scale"), float):
+            self._albedo_scale = left["albedo_scale"]
 
     def plain(self) -> Any:
         """Return what a step follows from beside its capture, as plain data."""
-        return self._first
+        return self._first if self._albedo_scale is None else {"lights": self._first, "albedo_scale": self._albedo_scale}
 
 
 def _said(own: ChosenIntensities, why: str) -> ChosenIntensities:

@@ -42,6 +42,8 @@ def outline(normal: np.ndarray, mask: np.ndarray) -> Outline:
         mask: [rows, cols] bool.
     """
     width = max(1, round(np.sqrt(np.count_nonzero(mask)) / EDGE))
+    if min(mask.shape) <= 6 * width:  # the border is all of the image
+        return Outline(0.0, 0.0, 0)
     blurred = uniform_filter(uniform_filter(mask.astype(np.float64), 2 * width + 1, mode="nearest"), 2 * width + 1, mode="nearest")
     down, right = np.gradient(blurred)
     length = np.hypot(down, right)

@@ -77,6 +77,10 @@ def find_lights(given: SolveInput) -> UnknownLights:
         b = fit_surface(readings, usable, factors.lights)
         left, right, above, below = (fit_surface(*_read(given, places + offset), factors.lights)
                                      for offset in (-step, step, -step * given.camera.width, step * given.camera.width))
+        told = np.isfinite([b, left, right, above, below]).all(axis=(0, 1)) & (np.linalg.norm(b, axis=0) > 0)
+        if not told.all():  # shadow and saturation alone fit no surface
+            places, readings, usable = places[told], readings[:, told], usable[:, told]
+            b, left, right, above, below = (each[:, told] for each in (b, left, right, above, below))
 
         def choose(which: np.ndarray, near: Relief | None = None) -> tuple[Relief, np.ndarray]:
             matrix = integrable(b[:, which], (right - left)[:, which], (above - below)[:, which])
@@ -95,6 +99,9 @@ def find_lights(given: SolveInput) -> UnknownLights:
         others = [choose(quarter != number, relief)[1] for number in range(QUARTERS)]
     except CalibrationError as error:
         raise CalibrationError(f"--lights unknown: {error}") from error
+    except np.linalg.LinAlgError as error:  # equations of shadow and saturation alone
+        raise CalibrationError("--lights unknown: the images do not determine the lights: too much of the object is dark, saturated or "
+                               "flat; photograph a chrome ball, or give directions") from error
     outward = _outward(given, factors.lights, matrix)
     if outward < 0:
         matrix, others = INVERSE @ matrix, [INVERSE @ other for other in others]

@@ -4,17 +4,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from kernels import packs
 from kernels.photometric.lambertian.albedo import fit_albedo
 from kernels.photometric.lambertian.lambert import NormalFit
 from kernels.photometric.lambertian.near import NearField, see_near
 from kernels.photometric.lambertian.readings import Lights, grey_factors, grey_readings
-from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit, uncertainty_of
+from kernels.photometric.model.misfit import Misfit, PairFits, measure_misfit, standard_error
 from kernels.photometric.model.samples import evenly
 from kernels.status import Status
+from service.sharing.sharing import Results
 from service.solve.base.batches import ReadBand, each_band
 from service.solve.base.solution import Solution, SolveInput
-from service.solve.sharing.sharing import Results
 from stage.colour.colour import GREY_WEIGHTS
 
 PAIRS = 1024
@@ -31,9 +30,7 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
     """
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
-    result.sigma = np.zeros(given.stack.pixel_count, np.float16)
     misfit = _object_misfit(given, lights, field, fit_normals=fit_normals)
-    sigma = result.sigma
 
     def solve(read: ReadBand) -> None:
         span, inside, band, readings, near = read
@@ -41,13 +38,12 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
         result.place(span, inside, fit)
         solved = inside & (result.status[span] == Status.OK)
         evidence = (array.numpy()[: len(inside)] for array in (fit.across, fit.squares, fit.freedom, fit.agreeing))
-        sure = uncertainty_of(*evidence, misfit)
-        sigma[span], result.confidence[span] = np.where(solved, sure.sigma, 0), np.where(solved, sure.confidence, 0)
+        result.sigma[span] = np.where(solved, standard_error(*evidence, misfit), 0)
         albedo = fit_albedo(band, readings, fit, lights, near).numpy()[:, : len(inside)]
         result.albedo[:, span] = np.where(inside, albedo, 0)
 
     each_band(given, lights, field, solve,
-              Results((result.normal, result.albedo, result.confidence, result.residual, result.status, sigma), misfit))
+              Results((result.normal, result.albedo, result.sigma, result.residual, result.status), misfit))
     return result
 
 
@@ -64,7 +60,7 @@ def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = 
         return Misfit()
     start = start[evenly(len(start), PAIRS)]
     pixels = np.concatenate([start, start + APART])
-    band = packs.upload(*given.stack.pick(pixels), device=given.device)
+    band = given.images[given.device].pick(pixels)
     readings = grey_readings(band, grey_factors(lights, GREY_WEIGHTS))
     near = None if field is None else see_near(band, readings, field.at(pixels))
     values = readings.on_host(readings.values, len(pixels))

@@ -14,14 +14,14 @@ import numpy as np
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.response_table import SEARCH_LOBES, SEARCH_WIDTHS, response_table
-from kernels.photometric.reference.modes import GRID_FLOATS, angle_degrees
-from kernels.photometric.reference.sampling import Found, Regime, SamplingTables, sampling_tables, search_sampling, solve_sampling
+from kernels.photometric.posterior.modes import GRID_FLOATS, angle_degrees
+from kernels.photometric.posterior.sampling import Found, Regime, SamplingTables, sampling_tables, search_sampling, solve_sampling
 from kernels.status import Status
 from service.requests.solve import MAX_SIGMA
+from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, View, each_batch, readable, view_directions
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.open_sources import OpenSources, open_sources
-from service.solve.sharing.sharing import Results
 from stage.capture.camera import Camera
 from stage.capture.extended_lights import ExtendedLights
 
@@ -52,7 +52,7 @@ def solve_extended(given: SolveInput, lights: ExtendedLights) -> Solution:
     walk.refine()
     walk.judge()
     result = walk.result
-    assert result.regime is not None and result.sigma is not None
+    assert result.regime is not None
     codes = np.bincount(result.regime[given.mask.reshape(-1)], minlength=len(Regime))
     result.facts |= {"light_samples": len(lights.share), "views": walk.views,
                      "regimes": {regime.name.lower(): int(codes[regime]) for regime in Regime if regime is not Regime.UNSOLVED}}
@@ -87,7 +87,7 @@ class _Walk:
         self._light: OpenSources | None = None
         self._doubt = np.zeros(count, np.float16)
         result = self.result = Solution.empty(count)
-        result.regime, result.sigma = np.zeros(count, np.uint8), np.zeros(count, np.float16)
+        result.regime = np.zeros(count, np.uint8)
         result.specular, result.roughness = np.zeros((3, count), np.float16), np.zeros(count, np.float16)
         self._found = Found(result.normal.T, np.zeros((count, 3), np.float16), np.zeros(count, bool),
                             np.zeros((count, 2 + len(SEARCH_WIDTHS)), np.float16), np.zeros(count, np.float32), result.albedo.T,
@@ -160,7 +160,7 @@ class _Walk:
 
         def judge(part: _Part, batch: Batch) -> None:
             pixels, samples = batch
-            assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
+            assert result.specular is not None and result.roughness is not None and result.regime is not None
             if self._light is not None:
                 self._light.keep(pixels, samples)
             turned = Found(*(values[pixels].astype(np.float32) if values.dtype == np.float16 else values[pixels] for values in all_found))
@@ -173,14 +173,13 @@ class _Walk:
             result.specular[:, pixels] = fit.specular.T
             result.roughness[pixels] = fit.roughness
             result.regime[pixels] = fit.regime
-            result.confidence[pixels] = fit.confidence * (1 + fit.sigma) / (1 + sigma)
             result.sigma[pixels] = np.minimum(sigma, LARGEST_ERROR)
             result.residual[pixels] = fit.residual
 
-        assert result.specular is not None and result.roughness is not None and result.regime is not None and result.sigma is not None
+        assert result.specular is not None and result.roughness is not None and result.regime is not None
         self._batches("posterior", np.flatnonzero(result.status == Status.OK), judge, Results(
-            (result.normal, result.albedo, result.specular, result.roughness, result.regime, result.confidence, result.sigma,
-             result.residual), (None if self._light is None else self._light.found, self._doubt)))
+            (result.normal, result.albedo, result.specular, result.roughness, result.regime, result.sigma, result.residual),
+            (None if self._light is None else self._light.found, self._doubt)))
 
     def _place(self, part: _Part, pixels: np.ndarray, found: Found, kept: np.ndarray) -> None:
         """Store what a search found at the pixels that are kept, [n] bool."""

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from kernels import packs
+from kernels.packs import Band
 from kernels.photometric.gradient.gradient import diffuse_normals
 from kernels.photometric.gradient.highlight import fit_highlights, specular_normals
 from kernels.photometric.gradient.moments import Moments, fit_moments
 from kernels.photometric.gradient.separation import separate_by_colour, separate_polarised
+from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.status import Status
+from service.sharing.sharing import Results
 from service.solve.base.batches import each_span, view_directions
 from service.solve.base.solution import Solution, SolveInput
-from service.solve.sharing.sharing import Results
 from stage.capture.camera import Camera
 from stage.capture.gradients import GradientFrames
 from stage.colour.colour import GREY_WEIGHTS
@@ -29,8 +30,8 @@ CROSSED_GAIN = 2.0
 """A crossed analyser passes half of the diffuse light, which has lost its polarisation (Malus)."""
 MIN_DIFFUSE = 0.01
 """Ratio of diffuse to specular light below which a pixel is metal: what is left of the diffuse is noise, and its direction too."""
-METAL_CONFIDENCE = 0.2
-"""Confidence of a normal that only a highlight tells: a standard error of four degrees, since no second reading checks the lobe."""
+METAL_SIGMA = 4.0
+"""Standard error, in degrees, of a normal that only a highlight tells: no second reading checks the lobe."""
 
 
 def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
@@ -51,7 +52,7 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
     def solve(start: int, stop: int, device: str) -> None:
         here = slice(start, min(stop, pixels))
         kept = inside[here]
-        band = packs.upload(stack.band(start, stop), stack.saturated(start, stop), device=device)
+        band = given.images[device].band(start, stop)
         toward = view if view.shape[1] == 1 else view[:, start:stop]
         diffuse = _moments(band, frames.diffuse, stack)
         if not frames.polarised:
@@ -70,7 +71,7 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
         fit = diffuse_normals(diffuse, GREY_WEIGHTS, gain=gain, pixel_count=band.pixel_count, device=device)
         _store(result.normal, here, kept, fit.normal)
         _store(result.albedo, here, kept, fit.albedo)
-        _store(result.confidence, here, kept, fit.confidence)
+        _store(result.sigma, here, kept, fit.sigma)
         _store(result.residual, here, kept, diffuse.residual)
         _store(result.status, here, kept, fit.status)
         _store(length, here, kept, fit.length)
@@ -80,13 +81,13 @@ def solve_gradients(given: SolveInput, frames: GradientFrames) -> Solution:
             result.residual[here] = np.where(metal[here], parallel.residual.numpy()[: len(kept)], result.residual[here])
         separated[here] = kept & (diffuse.tilt.numpy()[: len(kept)] == 0)
 
-    found = (result.normal, result.albedo, result.confidence, result.residual, result.status, result.specular_normal, result.specular,
+    found = (result.normal, result.albedo, result.sigma, result.residual, result.status, result.specular_normal, result.specular,
              result.roughness, bent, length, separated, metal)
     each_span(given, BYTES_PER_PIXEL, solve, Results([array for array in found if array is not None]))
     neighbours = neighbours_doubt(bent.reshape(given.mask.shape), given.mask).reshape(-1)
     estimated = (result.status == Status.OK) & ~metal
     doubted = np.sqrt(np.maximum(result.standard_error() ** 2 - bent**2 + neighbours**2, 0))
-    result.confidence[estimated] = 1 / (1 + doubted[estimated])
+    result.sigma[estimated] = np.minimum(doubted[estimated], LARGEST_ERROR)
     result.facts = _facts(frames, result, length, separated, metal)
     if result.specular_normal is not None and not result.specular_normal.any():
         result.specular_normal = None  # a layer that holds nothing is absent
@@ -124,7 +125,7 @@ def _take_highlight(result: Solution, here: slice, specular: np.ndarray) -> np.n
     normal = result.specular_normal[:, here]
     metal = normal.any(axis=0) & (result.albedo[:, here].astype(np.float32).sum(axis=0) <= MIN_DIFFUSE * specular.sum(axis=0))
     result.normal[:, here][:, metal] = normal[:, metal]
-    result.confidence[here][metal] = METAL_CONFIDENCE
+    result.sigma[here][metal] = METAL_SIGMA
     result.status[here][metal] = int(Status.OK)
     return metal
 
@@ -135,7 +136,7 @@ def _store(target: np.ndarray | None, here: slice, kept: np.ndarray, found: Any)
     target[..., here] = np.where(kept, found.numpy()[..., : len(kept)], 0)
 
 
-def _moments(band: packs.Band, rows: np.ndarray, stack: Stack) -> Moments:
+def _moments(band: Band, rows: np.ndarray, stack: Stack) -> Moments:
     padded = np.zeros((band.frame_count, 4))
     padded[: len(rows)] = rows
     return fit_moments(band, padded, stack.scale, GREY_WEIGHTS)

@@ -27,13 +27,13 @@ from kernels.photometric.search.survey import QUICK
 from kernels.photometric.shadows.bounce import bounce_albedo
 from kernels.photometric.svbrdf import solve_svbrdf
 from kernels.status import ESTIMATED, Status
+from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, ReadBand, each_band, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.height.direct_light import DirectLight, direct_light
 from service.solve.height.parts import Material
 from service.solve.methods.settling import settle
 from service.solve.methods.support import FEW_LIGHTS, supports_lobes
-from service.solve.sharing.sharing import Results
 from stage.colour.colour import GREY_WEIGHTS
 
 SPREAD_PIXELS = 384
@@ -235,7 +235,8 @@ class _Walk:
         """Fit normal and material of every pixel to its direct light."""
         result = self.result
         count = self._given.stack.pixel_count
-        sigma = np.full(count, LARGEST_ERROR, np.float16)
+        sigma = self.result.sigma
+        sigma[:] = LARGEST_ERROR
         abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
         light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
 
@@ -252,13 +253,12 @@ class _Walk:
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
             abundance[pixels], pair[pixels] = found.mixture
-            sigma[pixels], result.confidence[pixels] = found.sigma, found.confidence
-            result.residual[pixels] = found.residual
+            sigma[pixels], result.residual[pixels] = found.sigma, found.residual
 
         self._batches("normals", fit, Results(
-            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.confidence, result.residual),
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual),
             (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
-        result.sigma, result.judged_by_surface = sigma, True
+        result.judged_by_surface = True
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
             result.facts["mixed_pixels"] = int(mixed.sum())

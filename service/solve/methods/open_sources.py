@@ -16,7 +16,7 @@ import warp as wp
 
 from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import Samples
-from kernels.photometric.reference.sampling import SHARP, Found
+from kernels.photometric.posterior.sampling import SHARP, Found
 from kernels.photometric.shadows.bounce import subtract_bounce
 from kernels.photometric.shadows.shadowing import LEAST_PART, divide_by_visible
 from kernels.relight.shadows.occlusion import see_lights

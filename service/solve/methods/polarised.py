@@ -21,10 +21,10 @@ from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.samples import evenly
 from kernels.photometric.search.hypotheses import Diffuse
 from kernels.status import ESTIMATED
+from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, pick_pixels, view_directions
 from service.solve.base.solution import SeparatedPairs, Solution, SolveInput
 from service.solve.methods.pairs import PairFindings, examine_pairs
-from service.solve.sharing.sharing import Results
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.manifest import FILE_NAME
@@ -99,7 +99,6 @@ def doubt_metals(given: SolveInput, solution: Solution) -> None:
     solution.facts["polarisation"] = given.pairs.facts | {"pixels_without_diffuse_light": int(metal.sum())}
     sigma = solution.standard_error()
     solution.sigma = np.where(metal & np.isin(solution.status, ESTIMATED), LARGEST_ERROR, sigma).astype(np.float16)
-    solution.confidence[metal] = 0
     if metal.any():
         solution.warnings.append(f"{int(metal.sum())} pixels have hardly any diffuse light, as metals: --method svbrdf solves them from "
                                  "their highlights, which keep polarisation")
@@ -120,7 +119,7 @@ def _solve_metals(given: SolveInput, lights: Lights, field: NearField | None, di
     assert given.pairs is not None
     whole = replace(given, stack=given.pairs.whole, mask=metal.reshape(given.mask.shape), pairs=None)
     found = solver(whole, lights._replace(scale=given.pairs.whole.scale), field)
-    for name in ("normal", "specular", "roughness", "confidence", "residual", "status", "sigma"):
+    for name in ("normal", "specular", "roughness", "residual", "status", "sigma"):
         getattr(diffuse, name)[..., metal] = getattr(found, name)[..., metal]
     pixels = np.flatnonzero(metal & np.isin(diffuse.status, ESTIMATED))
     top, bottom = np.zeros((3, len(pixels))), np.full((3, len(pixels)), 1e-12)

@@ -18,15 +18,15 @@ from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.misfit import LARGEST_ERROR
 from kernels.photometric.model.response_table import SEARCH_LOBES, nodes
 from kernels.photometric.model.samples import Samples
-from kernels.photometric.reference.modes import GRID_FLOATS, find_modes, weigh
-from kernels.photometric.reference.posterior import Group, bounded, measure_noise, normal_posterior
-from kernels.photometric.reference.sampling import AROUND, AROUND_OPTIONS, FINE, OPTIONS
+from kernels.photometric.posterior.modes import GRID_FLOATS, find_modes, weigh
+from kernels.photometric.posterior.posterior import Group, bounded, measure_noise, normal_posterior
+from kernels.photometric.posterior.sampling import AROUND, AROUND_OPTIONS, FINE, OPTIONS
 from kernels.photometric.search.hypotheses import Diffuse, search_normals
 from kernels.status import Status
+from service.sharing.sharing import Results
 from service.solve.base.batches import Batch, each_batch, readable, view_directions
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.reference_ball import ReferenceBall
-from service.solve.sharing.sharing import Results
 from stage.colour.colour import GREY_WEIGHTS
 from stage.stack.ingest import open_stack
 from stage.stack.stack import Stack
@@ -36,7 +36,6 @@ class ReferenceFit(NamedTuple):
     """Normal of each sampled pixel, on the host."""
 
     normal: np.ndarray  # [n, 3] float32, unit
-    confidence: np.ndarray  # [n] float32: probability of the mode / (1 + its standard deviation / 1°)
     sigma: np.ndarray  # [n] float32: standard deviation of the normal over its modes, degrees
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
     excess: np.ndarray  # [n] float32: the square of what the ball leaves unexplained over the noise of the object's readings
@@ -58,8 +57,7 @@ def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> Refe
     noise = measure_noise([first])
     modes = weigh(normal_posterior(first, noise), normal_posterior(first._replace(normal=near[1]), noise))
     normal = np.where(modes.close_to(found.normal)[:, None], found.normal, modes.normal)
-    return ReferenceFit(normal, (modes.probability / (1 + modes.sigma)).astype(np.float32), modes.spread, np.sqrt(found.cost),
-                        modes.excess)
+    return ReferenceFit(normal, modes.spread, np.sqrt(found.cost), modes.excess)
 
 
 CACHE_FOLDER = "reference"
@@ -88,10 +86,8 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
     result.facts = {"reference": {"capture": str(ball.capture.folder), "content": ball_stack.key,
                                   "radius_px": round(ball.ball.radius_px, 2),
                                   "outline_error_px": round(ball.ball.outline_error_px, 4)}}
-    result.sigma = np.zeros(stack.pixel_count, np.float16)
     excess = np.zeros(stack.pixel_count, np.float32)
     timings.stage("normals", len(inside))
-    sigma = result.sigma
 
     def search(batch: Batch) -> None:
         pixels, samples = batch
@@ -101,12 +97,11 @@ def solve_by_reference(given: SolveInput, ball: ReferenceBall) -> Solution:
         kept = pixels[ok]
         result.status[pixels] = status
         result.normal[:, kept] = found.normal.T[:, ok]
-        result.confidence[kept] = found.confidence[ok]
-        sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
+        result.sigma[kept] = np.minimum(found.sigma[ok], LARGEST_ERROR)
         result.residual[kept] = found.residual[ok]
         excess[kept] = found.excess[ok]
 
-    results = Results((result.status, result.normal, result.confidence, sigma, result.residual, excess), readings)
+    results = Results((result.status, result.normal, result.sigma, result.residual, excess), readings)
     each_batch(given, padded, view, inside, search, results, lobes=SEARCH_LOBES + GRID_FLOATS // count)
     solved = result.status == Status.OK
     unexplained = float(np.sqrt(np.median(excess[solved]))) if solved.any() else 0.0

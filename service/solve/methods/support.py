@@ -15,7 +15,7 @@ from kernels.photometric.model.samples import Samples, device_values, host_value
 from kernels.photometric.search.hypotheses import Diffuse, SearchOptions, predict
 from kernels.photometric.search.normal_search import find_normals
 from kernels.photometric.search.survey import QUICK
-from service.solve.base.solution import Solution
+from service.solve.base.solution import Solution, raise_error
 
 PARTS = 12
 """Number of parts into which the lights are divided, each left out once; fewer lights are left out singly."""
@@ -100,3 +100,18 @@ def supports_lobes(result: Solution, samples: Samples, start: np.ndarray) -> boo
         result.warnings.append(f"method svbrdf: the images of left-out lights are predicted hardly better with specular lobes than without "
                                f"(misfit {left.general:.2g} against {left.lambert:.2g}): {fallback}.")
     return left.ratio <= SUPPORTED_RATIO
+
+
+UNDESCRIBED, DEGREES = 0.3, 30.0
+"""Least misfit of left-out readings at which neither Lambert's law nor lobes describe the material, and the error of the normals per
+misfit: of two shapes of velvet the misfits are 0.7 and 1.3, and the errors 20 and 43 degrees. Matt objects under wrong lights leave 0.1."""
+
+
+def raise_undescribed(solution: Solution) -> None:
+    """Make normals less sure, and say so, where the readings of left-out lights are predicted by no model."""
+    general, lambert = (solution.facts.get(name) for name in ("left_out_misfit", "left_out_misfit_lambert"))
+    if general is None or lambert is None or general <= SUPPORTED_RATIO * lambert or min(general, lambert) < UNDESCRIBED:
+        return
+    raise_error(solution, DEGREES * min(general, lambert))
+    solution.warnings.append("method svbrdf: the object reflects neither by Lambert's law nor with highlights, as velvet does not: the "
+                             "normals are only as sure as the layer sigma says; a ball of its material tells more (--reference-ball)")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from tests.kernels.surface import shapes
 from tests.kernels.surface.test_integrate import solve, worst
@@ -101,6 +102,27 @@ def test_an_outline_with_a_gap_parts_a_ball_from_a_wall(device):
     found = solve(shape._replace(normal=normal), device, discontinuities=True)
     assert len(parts_of(found)) == 2
     assert np.mean(found.part[ball] == np.median(found.part[ball])) > 0.99 and parts_of(found)[1] < 1.02 * ball.sum()
+
+
+def test_a_strip_along_an_outline_is_no_part(device):
+    """Two pixels on either side of the outline of a ball show both sides: the ring was a part of its own of 536 pixels."""
+    shape, ball = shapes.ball_before_wall(96)
+    strip = ndimage.binary_dilation(ball, iterations=2) & ~ndimage.binary_erosion(ball, iterations=2)
+    around = np.arctan2(*(np.indices(ball.shape) - 47.5))
+    normal = shape.normal.copy()
+    normal[:, strip] = (np.stack([0.6 * np.cos(around), -0.6 * np.sin(around), np.ones_like(around)]) / np.hypot(0.6, 1))[:, strip]
+    found = solve(shape._replace(normal=normal.astype(np.float32)), device, discontinuities=True)
+    assert len(parts_of(found)) == 2 and len(np.unique(found.part[ball & ~strip])) == 1
+
+
+def test_an_outline_that_meets_what_is_behind_along_one_half_is_that_of_a_part(device):
+    """A dome before two plates, one of which follows its outline at a constant step: the dome was joined to this one."""
+    x, y = shapes.plane_coordinates(96, 96, size=2.4)
+    dome, right = np.hypot(x, y) < 0.45, x >= 0
+    z = np.where(dome, 1.0 - 0.7 * (x**2 + y**2), np.where(right, 0.58 * y, 0))
+    slopes = np.where(dome, -1.4 * x, 0), np.where(dome, -1.4 * y, np.where(right, 0.58, 0))
+    found = solve(shapes.from_gradient(x, y, z, *slopes), device, discontinuities=True)
+    assert parts_of(found).tolist() == sorted((int((~dome & right).sum()), int((~dome & ~right).sum()), int(dome.sum())), reverse=True)
 
 
 @pytest.mark.parametrize("perspective", [False, True])

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import warp as wp
 
+from kernels import device as devices
 from kernels.errors import ArrayError
+from kernels.surface.conjugate import CHECK_EVERY
 from kernels.surface.integrate import IntegrationOptions, integrate_normals
 from tests.kernels.surface import shapes
+from tests.reference import surface as reference
 
 
 def solve(shape, device, *, perspective=False, mean_z=None, sigma=None, **options):
@@ -173,6 +176,21 @@ def test_result_says_when_it_gave_up(device):
     assert result.residual > 1e-6
 
 
+def test_graphs_of_launches_give_the_same(monkeypatch):
+    """Warp captures and replays launches on the CPU too, as long as one core makes them."""
+    shape, graphs = shapes.bumps(60, shapes.ragged_mask(60, 60)), []
+    plain = solve(shape, "cpu")
+    launch_graph = wp.capture_launch
+    monkeypatch.setattr(devices, "has_graphs", lambda device: True)
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: graphs.append(graph) or launch_graph(graph))
+    result = solve(shape, "cpu")
+    assert len(graphs) > len(set(graphs)) == 1  # one graph, launched several times
+    assert len(graphs) == -(-plain.iterations // CHECK_EVERY)
+    found, expected = result.height.numpy()[shape.mask], plain.height.numpy()[shape.mask]
+    # the last group goes on to the goal on the device, and no further
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_arrays_on_the_device_give_the_same(device):
     shape = shapes.bumps(50, shapes.ragged_mask(50, 50))
     there = [wp.array(a, device=device) for a in (shape.normal, shape.mask, shape.x, shape.y)]
@@ -209,3 +227,23 @@ def test_bad_calls_raise(change, message, device):
     } | change
     with pytest.raises(ArrayError, match=message):
         integrate_normals(**call, device=device)
+
+
+@pytest.mark.parametrize("size", [(61, 83), (64, 64), (97, 40)])
+@pytest.mark.parametrize("perspective", [False, True])
+def test_random_bumpy_normals(size, perspective, device):
+    """Normals that no surface has: the two must agree on the best fit."""
+    rng = np.random.default_rng(size[0])
+    normal = rng.normal(0, 0.4, (3, *size)) + np.array([0, 0, 1.5])[:, None, None]
+    normal = (normal / np.linalg.norm(normal, axis=0)).astype(np.float32)
+    normal[:, normal[2] < 0.35] = np.array([[0], [0], [1]], dtype=np.float32)
+    mask = shapes.ragged_mask(*size, seed=size[1])
+    x, y = (a.astype(np.float32) for a in shapes.plane_coordinates(*size, size=0.4))
+    how = {"perspective": perspective, "mean_z": -2.0}
+    result = integrate_normals(normal, mask, x, y, **how, device=device)
+    truth = reference.integrate(normal, mask, x, y, **how)
+    assert result.converged
+    height = result.height.numpy()
+    # float32 rounding of the result (1e-7 of z = −2) and the stopping tolerance
+    assert np.abs(height - truth).max() < 5e-7 + 1e-5 * np.ptp(truth[mask])
+    assert (height[~mask] == 0.0).all()

@@ -30,14 +30,14 @@ def lights(count=24):
     return toward / np.linalg.norm(toward, axis=1, keepdims=True)
 
 
-def march(height, part, device, perspective=False, far=0.0):
+def march(height, part, device, perspective=False, far=0.0, thick=THICK):
     pixels = np.argwhere(part >= 0)
     scale = far if perspective else 1.0
     projection = Projection(perspective, wp.vec2(scale, scale), wp.vec2(SIDE / 2, SIDE / 2))
     found = march_part(wp.array(pixels.astype(np.int32), dtype=wp.vec2i, device=device),
                        wp.array(lights().astype(np.float32), dtype=wp.vec3, device=device),
                        wp.array(height, dtype=float, device=device), wp.array(part, dtype=wp.int32, device=device),
-                       wp.array(np.full_like(height, THICK), dtype=float, device=device), 1, projection)
+                       wp.array(np.full_like(height, thick), dtype=float, device=device), 1, projection)
     return pixels, found
 
 
@@ -108,6 +108,39 @@ def test_contradicting_lights_leave_the_offset_open(device):
     mixed = near._replace(gain=np.where(np.arange(GROUPS)[:, None] % 2 == 0, near.gain, far.gain))
     offset = choose_offset(mixed, least_sigma=0.5)
     assert offset.low < -4 and offset.high > 4 and offset.sigma > 2
+
+
+@pytest.mark.parametrize("telling", [1, 2])
+def test_groups_of_unequal_evidence_confirm_each_other_and_one_alone_confirms_nothing(telling, device):
+    """Most of the evidence in two groups of lights, as where a body lies on one side of a part. It agrees, and was taken for contradiction.
+
+    Where a group has all of the evidence the step stays open, but it is told that shadows fall across.
+    """
+    share = np.where(np.arange(GROUPS) < telling, 1.0, 0.05 * (telling - 1))[:, None]
+    found = evidence(18.0, device)
+    offset = choose_offset(found._replace(gain=found.gain * share, expected=found.expected * share), least_sigma=0.5)
+    assert offset.agreed_high - offset.agreed_low < 4.0  # pixels
+    assert (offset.high - offset.low < 4.0) == (telling == 2)
+
+
+def test_gaps_are_neither_too_large_nor_too_small_in_the_mean(device):
+    """Rays from a floor under a steep plane, against the plane itself; the nearest pixels alone were wrong by 0.5 of a pixel in the mean.
+
+    Tolerance: a fifth of a pixel, because rays that cross less than three pixels of the plane miss what lies between these and its outline.
+    """
+    part = np.zeros((SIDE, SIDE), np.int32)
+    part[10:30, 10:30] = 1
+    row, col = np.indices(part.shape)
+    pixels, found = march(np.where(part == 1, 20 + 0.9 * row + 0.4 * col, 0).astype(np.float32), part, device, thick=0.0)
+    along, errors = np.arange(0.0, 60.0, 0.02), []
+    for light, way in enumerate(lights() / np.hypot(*lights()[:, :2].T)[:, None]):
+        for at in np.flatnonzero((part == 0)[tuple(pixels.T)])[::17]:
+            r, c = pixels[at][0] - along * way[1], pixels[at][1] + along * way[0]
+            on = (np.abs(r - 19.5) < 10) & (np.abs(c - 19.5) < 10)
+            if on.sum() * 0.02 > 5:
+                gap = (20 + 0.9 * r + 0.4 * c - along * way[2])[on]
+                errors.append((found.highest.numpy()[at, light] - gap.max(), found.lowest.numpy()[at, light] - gap.min()))
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.2
 
 
 def test_odds_speak_only_where_a_lit_reading_would_be_bright(device):

@@ -5,6 +5,7 @@ import shlex
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from stage.capture.capture import Capture
 from tests.scenes import near_lights
@@ -133,6 +134,98 @@ def test_stripes_without_planes_and_videos_are_told_by_their_names(relit, tmp_pa
     out = relit("import", "guess", tmp_path).well()
     assert f"relit import gray {tmp_path}/scan.mp4 {tmp_path}/scan-frames --projector" in out
     assert f"then     relit depth {tmp_path}/scan-frames" in out
+
+
+SURE = ("diligent", "lp", "relightlab", "near-lights", "olat", "scanner", "opencv-gray", "kinect")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_auto_imports_what_is_sure_and_nothing_else(relit, tmp_path, layout):
+    folder = tmp_path / "set"
+    folder.mkdir()
+    LAYOUTS[layout][0](folder)
+    if layout not in SURE:
+        assert f"relit import {layout} {folder}" in relit.refused("import", "auto", folder, tmp_path / "capture")
+        assert not (tmp_path / "capture").exists()
+        return
+    relit.done("import", "auto", folder, tmp_path / "capture")
+    assert Capture.open(tmp_path / "capture").manifest.frames and not (folder / "capture.json").exists()
+
+
+def blurred_stripes(sequence, *, inverses, fine_first, gray=1):
+    """Blurred stripes, with noise and gamma, on a surface of two albedos that the projector lights in part, 100 by 128 pixels."""
+    random, images, (v, u) = np.random.default_rng(8), [], np.mgrid[:100, :128]
+    albedo = np.where((u // 23 + v // 17) % 2, 0.9, 0.3) * ((u > 8) & (v < 92))
+    for part in sequence:
+        at, bits = {"columns": ((u + 6 * np.sin(v / 30)).astype(int) + 10, 8), "rows": (v + 5, 7)}.get(part, (None, 1))
+        order = range(bits) if fine_first else reversed(range(bits))
+        plain = [np.full(u.shape, part == "white") if at is None else ((at ^ at >> 1) if gray else at) >> bit & 1 > 0 for bit in order]
+        turned = {"none": [plain], "blocks": [plain, [~one for one in plain]], "pairs": [[k for one in plain for k in (one, ~one)]]}
+        shown = [one for group in turned[inverses] for one in group] if at is not None else plain
+        for one in shown:
+            light = albedo * (0.08 + 0.8 * gaussian_filter(one.astype(float), 0.6)) + random.normal(0, 0.004, u.shape)
+            images.append(np.clip(255 * np.maximum(light, 0) ** 0.6, 0, 255).astype(np.uint8))
+    return images
+
+
+@pytest.mark.parametrize(("sequence", "inverses", "fine_first"), [
+    ("white,black,columns", "none", False), ("rows,columns,black,white", "pairs", True), ("columns,rows", "blocks", False),
+    ("columns", "pairs", False)])
+def test_codes_are_told_from_the_images_alone(relit, tmp_path, sequence, inverses, fine_first):
+    """Names say nothing; the command has the order, the inverses and the bits that were shown."""
+    for number, image in enumerate(blurred_stripes(sequence.split(","), inverses=inverses, fine_first=fine_first)):
+        write_image(tmp_path / f"{number:03d}.png", image)
+    out = relit("import", "guess", tmp_path).well()
+    run = next(line for line in out.splitlines() if line.startswith("run"))
+    assert f"--sequence {sequence} --inverses {inverses}" in run and ("--fine-first" in run) == fine_first
+    assert "8 bits of columns" in out if "columns" in sequence else "bits of columns" not in out
+
+
+def binary(folder):
+    for number, image in enumerate(blurred_stripes(["columns", "rows"], inverses="pairs", fine_first=False, gray=0)):
+        write_image(folder / f"{number:03d}.png", image)
+
+
+@pytest.mark.parametrize(("write", "words"), [
+    (binary, "plain binary code, 8 bits of columns and 7 of rows"),
+    (lambda folder: [write_image(folder / f"{k}_{side}.png", np.full((6, 8), 9 * k, np.uint8)) for k in range(3) for side in "lr"],
+     "two cameras"),
+    (lambda folder: [write_image(folder / f"plane_{k}.png", np.full((6, 8), 9 * k, np.uint8)) for k in range(9)], "coefficient image"),
+    (lambda folder: write_image(folder / "sky.hdr", np.ones((8, 16, 3), np.float32)), "environment map"),
+    (lambda folder: [write_image(folder / f"m{k}.png", 255 * (np.arange(48).reshape(6, 8) > 9 * k).astype(np.uint8)) for k in range(5)],
+     "as masks have")], ids=["binary", "stereo", "planes", "sky", "masks"])
+def test_images_that_no_importer_takes_are_told_apart(relit, tmp_path, write, words):
+    write(tmp_path)
+    assert words in relit.refused("import", "guess", tmp_path)
+
+
+def test_folders_of_poses_and_images_of_two_sizes(relit, tmp_path):
+    for pose in ("a", "b"):
+        (tmp_path / "poses" / pose).mkdir(parents=True)
+        lp(tmp_path / "poses" / pose)
+    relit.done("import", "auto", tmp_path / "poses", tmp_path / "out")
+    assert {path.parent.name for path in (tmp_path / "out").glob("*/capture.json")} == {"a", "b"}
+    (tmp_path / "mixed").mkdir()
+    for k in range(6):
+        write_image(tmp_path / "mixed" / f"a{k}.png", np.tile(np.arange(30, dtype=np.uint8) * k, (20 + 10 * (k % 3 == 0), 1)))
+    assert "of another size" in relit("import", "guess", tmp_path / "mixed").well()
+
+
+def test_the_bright_side_of_the_object_tells_a_mirrored_table(relit, tmp_path):
+    """Directions with x to the left, as a camera's owner may have them."""
+    scene = make_scene(24, 9)
+    for number, image in enumerate(scene.images):
+        write_image(tmp_path / f"{number}.png", np.round(image / scene.images.max() * 60000).astype(np.uint16))
+    (tmp_path / "lights.txt").write_text(text(scene.directions * (-1, 1, 1)))
+    relit.done("import", "auto", tmp_path)
+    directions = [frame.light.direction for frame in Capture.open(tmp_path).manifest.frames]
+    assert np.allclose(directions, scene.directions, atol=1e-5)
+
+
+def test_correlations_with_more_words_in_their_names(relit, tmp_path):
+    for name, image in zip((0, 90, 180, 270), correlations([60e6], [0, 90, 180, 270]), strict=True):
+        np.save(tmp_path / f"phase{name}_avg.npy", image)
+    assert "--arrays 'phase*_avg.npy'" in relit("import", "guess", tmp_path).well()
 
 
 def test_what_is_no_layout_and_what_is_a_capture(relit, tmp_path):

@@ -116,7 +116,8 @@ def test_images_without_lights_are_solved_as_unknown_and_refused_as_known(relit,
     write_image(tmp_path / "mask.png", scene.mask.astype(np.uint8) * 255)
     assert "12 placeholders, IMG_0.exr to IMG_11.exr" in relit("import", "photos", tmp_path).well()
     relit("solve", tmp_path, "--out", tmp_path / "maps").refused("placeholder")
-    relit("solve", tmp_path, "--out", tmp_path / "maps", "--lights", "unknown", "--method", "robust").well()
+    outcome = relit("solve", tmp_path, "--out", tmp_path / "maps", "--lights", "unknown", "--method", "robust")
+    assert (outcome.code, outcome.err) == (1, "") and "no normal is sure" in outcome.out  # all are ambiguous: the object is matt
     (tmp_path / "few").mkdir()
     write_exr(tmp_path / "few" / "a.exr", scene.images[0])
     relit("import", "photos", tmp_path / "few").refused("few: has 1 images: normals need 3 or more")

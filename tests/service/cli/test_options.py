@@ -10,6 +10,7 @@ from typer.main import get_command
 
 from service.cli.main import program
 from service.requests import (
+    acquire,
     basis,
     calibrate,
     captures,
@@ -30,9 +31,9 @@ from service.requests import (
 )
 from service.requests.base.base import Choice, Options, Role
 from service.requests.base.options import build, help_text, options_of, typed, values_of
+from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
 from service.requests.imports_tof import HistogramImport, KinectImport, TofImport
 from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
-from service.requests.simulate import SimulateCwRequest, SimulatePulsedRequest
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
@@ -42,7 +43,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "gauge-board": [GaugeBoardRequest],
     "simulate cw": [SimulateCwRequest], "simulate pulsed": [SimulatePulsedRequest],
     "patterns": [patterns.PatternsRequest, patterns.PlanRequest], "relight": [relight.RelightRequest], "shade": [shade.ShadeRequest],
-    "play": [play.PlayRequest], "twin": [play.TwinRequest],
+    "play": [play.PlayRequest], "capture": [acquire.AcquireRequest], "twin": [play.TwinRequest],
     "basis": [basis.BasisRequest], "view": [captures.ViewRequest], "demo": [demo.DemoRequest],
     "bench": [demo.BenchRequest],
     "import diligent": [imports.DiligentImport], "import lp": [imports.LpImport], "import olat": [imports.OlatImport],
@@ -53,6 +54,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "import kinect": [KinectImport], "import laser": [imports.LaserImport],
     "drive": [drive.DriveRequest], "rig check": [rig.RigCheckRequest], "rig from-capture": [rig.RigFromCaptureRequest],
     "rig from-csv": [rig.RigFromCsvRequest], "rig from-mvr": [rig.RigFromMvrRequest], "rig plan": [rig.RigPlanRequest],
+    "rig sweep": [rig.RigSweepRequest],
     "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
@@ -61,7 +63,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate laser-planes": [calibrate.LaserPlanesRequest],
     "calibrate procam": [calibrate.ProcamRequest],
     "calibrate stereo": [calibrate.StereoRequest], "calibrate response": [calibrate.ResponseRequest],
-    "calibrate tof": [calibrate.TofCalibrationRequest],
+    "calibrate tof": [calibrate.TofCalibrationRequest], "calibrate rig": [calibrate.RigCalibrationRequest],
     **{f"submit {kind}": [model] for kind, model in jobs.JOBS.items()},
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
@@ -190,6 +192,7 @@ NO_JOBS = {
     "demo": "makes files of this machine from the shipped sample", "bench": "measures this machine",
     "farm": "writes job templates of other queues", "rig": "describes lamps",
     "import": "describes files before they are uploaded", "simulate": "makes raw frames, which are uploaded as any others",
+    "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
     "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",

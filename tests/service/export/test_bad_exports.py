@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd
 
 from service.asset.usd.asset import write_asset
-from service.asset.usd.inspect import inspect_asset
+from service.asset.usd.inspect import inspect_usd
 from tests.scenes.captures import write_exr
 from tests.scenes.surfaces import make_ball
 
@@ -114,7 +114,7 @@ def test_any_name_makes_an_asset(tmp_path, name):
     write_asset(make_ball(8), tmp_path / "here" / "a.usda", name=name)
     shutil.move(tmp_path / "here", tmp_path / "there")  # it may be moved with its folders
     asset = tmp_path / "there" / "a.usda"
-    assert inspect_asset(asset).errors == ()
+    assert inspect_usd(asset).errors == ()
     usd_stage = Usd.Stage.Open(str(asset))
     root = usd_stage.GetDefaultPrim()
     assert (root.GetDisplayName() or root.GetName()) == name and Usd.ModelAPI(root).GetAssetName() == name
@@ -126,7 +126,7 @@ def test_any_name_makes_an_asset(tmp_path, name):
 @pytest.mark.parametrize("suffix", [".usda", ".usdz"])
 def test_any_file_name_makes_an_asset_that_finds_its_files(tmp_path, suffix, stem):
     write_asset(make_ball(8), tmp_path / f"{stem}{suffix}", name=stem)
-    assert inspect_asset(tmp_path / f"{stem}{suffix}").errors == ()
+    assert inspect_usd(tmp_path / f"{stem}{suffix}").errors == ()
 
 
 def test_an_asset_that_is_grey_or_clipped_is_said_and_a_version_is_a_text(relit, tmp_path):

@@ -10,6 +10,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "drive.md"
 TEXT = PAGE.read_text(encoding="utf-8").partition("## Play and rehearse")[2].partition("\n## ")[0]
 ELSEWHERE = {"--cache"}
 """Options that all commands with images have."""
+CAMERA = {"--pictures", "--picture-format", "--faults", "--noise", "--seed"}
+"""Options of the twin's camera, which docs/set.md tells."""
 
 
 def test_the_page_names_the_options_that_there_are():
@@ -18,4 +20,5 @@ def test_the_page_names_the_options_that_there_are():
     known = {option.flag for option in options} | {option.off for option in options if option.kind is bool}
     assert named <= known
     wanted = {option.off if option.field.default is True else option.flag for option in options} - {"--device"} - ELSEWHERE
-    assert wanted <= named
+    assert wanted & set(re.findall(r"--[a-z][a-z-]+", (PAGE.parent / "set.md").read_text(encoding="utf-8"))) >= CAMERA
+    assert wanted - CAMERA <= named

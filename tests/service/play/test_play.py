@@ -145,9 +145,9 @@ def test_a_slow_show_keeps_its_source_alive(tmp_path, monkeypatch, protocol):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("protocol", ["sacn", "artnet"])
 @pytest.mark.long
-def test_a_signal_turns_the_lamps_dark(tmp_path, protocol, number):
+def test_a_signal_turns_the_lamps_and_their_dimmers_dark(tmp_path, protocol, number):
     host = loopback()
-    rig_path = write_rig_file(tmp_path / "rig.json", ring(6), host=host, universes=2, protocol=protocol)
+    rig_path = write_rig_file(tmp_path / "rig.json", ring(6), host=host, universes=2, protocol=protocol, dimmer=500)
     cues = write_cues_file(tmp_path / "cues.json", rig_path, np.full((3, 18), 255))
     with Listener([(protocol, 1), (protocol, 2)], host, keep=True) as listener:
         program = subprocess.Popen([sys.executable, "-m", "service.cli.main", "play", str(cues), str(rig_path), "--loop"], cwd=ROOT,
@@ -160,7 +160,7 @@ def test_a_signal_turns_the_lamps_dark(tmp_path, protocol, number):
         finally:
             program.kill()  # else it would go on to light the lamps of the next test
         assert program.returncode == 0 and "the lamps are dark" in out
-    assert not levels_of_universes(read_rig(rig_path), listener.last.values).any()
+    assert not any(values.any() for values in listener.last.values.values())
 
 
 def test_an_error_turns_the_lamps_dark(tmp_path, monkeypatch):

@@ -1,6 +1,8 @@
 """relit relight --keys: animated lights, environment, captured images and exposure, against sums in closed form."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -154,3 +156,22 @@ def test_spin_and_keys_do_not_both_turn(relit, tmp_path, cap):
     outcome = relit("relight", cap, "--keys", tmp_path / "keys.json", "--environment", sky, "--spin-degrees", "9",
                     "--out", tmp_path / "a.#.exr")
     assert outcome.code == 2 and "both turn the environment: give one" in outcome.err
+
+
+TEXT = (Path(__file__).parents[3] / "docs" / "relight.md").read_text(encoding="utf-8")
+
+
+def test_the_example_of_light_keys_runs(relit, tmp_path):
+    cap = write_capture(tmp_path / "cap", make_scene(size=4, lights=13))
+    sky = write_exr(tmp_path / "sky.exr", np.zeros((8, 16, 3)))
+    example = re.search(r"```json\n(.*?)```", TEXT, re.DOTALL)[1]
+    (tmp_path / "keys.json").write_text(example)
+    arguments = ["relight", cap, "--keys", tmp_path / "keys.json", "--environment", sky, "--frames", "1-24"]
+    relit.done(*arguments, "--out", tmp_path / "f" / "a.##.exr")
+    without = {key: value for key, value in json.loads(example).items() if key not in ("lights", "exposure")}
+    (tmp_path / "keys.json").write_text(json.dumps(without))
+    assert relit(*arguments, "--out", tmp_path / "g" / "a.##.exr").code == 0
+    levels = [exr.read(tmp_path / "g" / f"a.{n:02d}.exr")[0]["R"].astype(float).max() for n in range(1, 25)]
+    assert np.allclose(np.array(levels) / levels[0], [*np.linspace(1, 0, 12), *[0] * 7, *[0.5] * 5], rtol=2e-3, atol=1e-6)
+    both = exr.read(tmp_path / "f" / "a.24.exr")[0]["R"].astype(float)
+    assert both.max() > 2 * levels[-1]  # the light, and one stop

@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from stage.rig.patch import patch_faults
 from stage.rig.rig import read_rig
 
 IDENTITY = "{1,0,0}{0,1,0}{0,0,1}"
@@ -23,10 +24,11 @@ def zipped(files: dict[str, bytes | str]) -> bytes:
     return whole.getvalue()
 
 
-def channel(attribute: str, offset: str, geometry: str = "Body", emitter: str = "", dmx_break: str = "1") -> str:
+def channel(attribute: str, offset: str, geometry: str = "Body", emitter: str = "", dmx_break: str = "1", values: str = "",
+            default: str = "0/1") -> str:
     link = f'Emitter="{emitter}"' if emitter else ""
-    return (f'<DMXChannel DMXBreak="{dmx_break}" Offset="{offset}" Geometry="{geometry}"><LogicalChannel Attribute="{attribute}">'
-            f'<ChannelFunction Name="F" Attribute="{attribute}" DMXFrom="0/1" {link}/></LogicalChannel></DMXChannel>')
+    return (f'<DMXChannel DMXBreak="{dmx_break}" Offset="{offset}" Geometry="{geometry}" {values}><LogicalChannel Attribute="{attribute}">'
+            f'<ChannelFunction Name="F" Attribute="{attribute}" DMXFrom="0/1" Default="{default}" {link}/></LogicalChannel></DMXChannel>')
 
 
 def gdtf(mode: str, channels: str, *, emitters: str = "", geometries: str = '<Geometry Name="Body"/>') -> bytes:
@@ -85,7 +87,7 @@ def test_an_8_bit_lamp_without_emitters_has_the_colours_of_the_standard(relit, t
 
 
 def test_a_16_bit_lamp_has_the_colours_of_its_emitters(relit, tmp_path):
-    """Luminous shares are those of Y; green lies outside of Rec.709, which is said; the dimmer, which stays at 0, is named."""
+    """Luminous shares are those of Y; green lies outside of Rec.709, which is said; the dimmer is held at full, which is said too."""
     rig, printed = made(relit, tmp_path, mvr(fixture("A", "Wash", "RGBW 16 bit", "0,0,4000", 11), Wash=RGBW), "--protocol", "artnet",
                         "--universe", "0")
     lamp = rig.lights[0]
@@ -94,7 +96,8 @@ def test_a_16_bit_lamp_has_the_colours_of_its_emitters(relit, tmp_path):
     assert light[0, 1:].max() < 0.01 * light[0, 0] and light[1, 0] == 0 and light[3] == pytest.approx(light[3].mean(), rel=1e-3)
     assert lamp.bits == 16 and lamp.address is not None and (lamp.address.protocol, lamp.address.universe) == ("artnet", 0)
     assert lamp.address.channels == {"red": 11, "green": 13, "blue": 15, "white": 17}
-    assert "Wash.gdtf: green: the colour lies outside" in printed and "Dimmer" in printed
+    assert [(held.name, held.channel, held.value) for held in lamp.address.fixed] == [("Dimmer", 19, 255)]
+    assert "Wash.gdtf: green: the colour lies outside" in printed and "Wash.gdtf: Dimmer 255:" in printed
 
 
 def test_measured_intensities_are_the_luminous_shares(relit, tmp_path):
@@ -114,7 +117,7 @@ def test_a_lamp_without_colours_is_white_and_shared_channels_are_left_out(relit,
     rig, printed = made(relit, tmp_path, mvr(fixture("A", "Spot", "Basic", "0,0,4000", 1) + copy, Spot=spot))
     assert [lamp.name for lamp in rig.lights] == ["A"] and rig.lights[0].bits == 8
     assert [primary.name for primary in rig.lights[0].primaries] == ["white"]
-    assert "8 bits" in printed and "Copy: shares the channels" in printed and "Spot.gdtf: Pan:" in printed
+    assert "8 bits" in printed and "Copy: shares the channels" in printed and "Spot.gdtf: Pan 0:" in printed
 
 
 def test_pixels_of_a_bar_are_lamps_at_their_places(relit, tmp_path):
@@ -125,6 +128,22 @@ def test_pixels_of_a_bar_are_lamps_at_their_places(relit, tmp_path):
     assert [lamp.name for lamp in rig.lights] == ["Bar.Left", "Bar.Right"]
     assert rig.lights[0].position_m == pytest.approx((1, 1.9, 0.5)) and rig.lights[1].position_m == pytest.approx((1, 1.9, -0.5))
     assert [lamp.address.channels["red"] for lamp in rig.lights if lamp.address is not None] == [101, 104]
+
+
+def test_channels_of_no_primary_are_held_at_what_lets_the_lamp_shine(relit, tmp_path):
+    """A master dimmer of 16 bits, a shutter whose Highlight is open, a wheel at its default, ultraviolet, a pixel's dimmer."""
+    channels = "".join(channel(f"ColorAdd_{letter}", f"{at}", "Pixel", dmx_break="Overwrite") for at, letter in enumerate("RGB", 1))
+    channels += channel("Dimmer", "4", "Pixel", dmx_break="Overwrite") + channel("Dimmer", "11,12")
+    channels += channel("Shutter1", "13", values='Highlight="40/1"', default="9/1") + channel("Color1", "14", default="7/1")
+    channels += channel("ColorAdd_UV", "15", default="255/1") + channel("Pan", "16,17", default="128/1")
+    bar = gdtf("Two pixels", channels, geometries="""<Geometry Name="Body"><GeometryReference Name="Left" Geometry="Pixel">
+<Break DMXOffset="1" DMXBreak="1"/></GeometryReference><GeometryReference Name="Right" Geometry="Pixel"><Break DMXOffset="5" DMXBreak="1"/>
+</GeometryReference></Geometry><Geometry Name="Pixel"/>""")
+    rig, _ = made(relit, tmp_path, mvr(fixture("Bar", "Bar", "Two pixels", "0,0,2000", 101), Bar=bar))
+    shared = {111: 255, 112: 255, 113: 40, 114: 7, 115: 0, 116: 128, 117: 128}
+    for lamp, own in zip(rig.lights, (104, 108), strict=True):
+        assert lamp.address is not None and {held.channel: held.value for held in lamp.address.fixed} == {**shared, own: 255}
+    assert not list(patch_faults(rig))
 
 
 def test_fixtures_of_one_name_are_told_apart_and_hazers_left_out(relit, tmp_path):

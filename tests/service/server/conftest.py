@@ -8,7 +8,7 @@ import pytest
 from service.server.base.settings import Settings
 from service.server.database.engine import Database, connect
 from service.server.database.schema import upgrade
-from tests.service.server.house import DAYS, House
+from tests.service.server.process.house import DAYS, House
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

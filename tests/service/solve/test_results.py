@@ -56,7 +56,8 @@ def test_the_report_and_the_maps_say_where_they_come_from(relit, tmp_path):
     assert report["residual"]["meaning"] == METHODS[Method.LAMBERT].residual
     metadata = exr.read_header(tmp_path / "out" / "maps.exr").metadata
     assert metadata["relit:capture"] == "cap" and metadata["relit:inputs"] == report["inputs"]["content"]
-    assert json.loads(metadata["relit:options"]) == {"method": "lambert", "intensities": "chosen", "lights": "declared"}
+    assert json.loads(metadata["relit:options"]) == {"method": "lambert", "intensities": "chosen", "lights": "declared",
+                                                        "materials": "coherent"}
     assert metadata["colorInteropID"] == "lin_rec709_scene" and "chromaticities" in metadata
 
 

@@ -64,18 +64,15 @@ def test_the_picture_is_the_sum_of_images_at_the_levels_of_the_cues(tmp_path, pr
     assert np.abs(seen - truth).max() <= HALF_TOLERANCE * max(truth.max(), 1e-9)
 
 
-def test_a_held_frame_as_png(tmp_path):
+def test_cues_that_the_twin_plays_to_itself_as_png(tmp_path):
     scene = make_scene(lights=LAMPS)
     host = loopback()
     rig = write_rig_file(tmp_path / "rig.json", scene.directions, host=host)
     cues = write_cues_file(tmp_path / "cues.json", rig, np.full((1, 3 * LAMPS), 128))
-    stop = threading.Event()
     capture = write_capture(tmp_path / "capture", scene)
-    request = TwinRequest(rig=rig, capture=capture, interface=host, snapshot=tmp_path / "seen.png", after=1)
-    player = threading.Thread(target=play, args=[PlayRequest(cues=cues, rig=rig, hold=1), stop])
-    rehearse(open_twin(request), request, lambda page: player.start())
-    stop.set()
-    player.join()
+    request = TwinRequest(rig=rig, capture=capture, interface=host, snapshot=tmp_path / "seen.png", frames=3, play=cues)
+    assert rehearse(open_twin(request), request, lambda page: None).frames == 3
+    assert not any(thread.name.startswith("relit-play") for thread in threading.enumerate())
     seen = images.read_pixels(tmp_path / "seen.png")
     assert seen[scene.mask].mean() > 2 * seen[~scene.mask].mean()
 
@@ -134,6 +131,8 @@ def test_bad_input_is_one_sentence(tmp_path, relit):
     ]:
         outcome = relit("twin", rig, capture, *arguments)
         assert outcome.code == 2 and words in outcome.err and outcome.err.count("\n") == 1
+    cues = write_cues_file(tmp_path / "cues.json", write_rig_file(tmp_path / "other.json", ring(2), host=None), np.full((1, 6), 1))
+    assert "rig_digest" in relit.refused("twin", rig, capture, "--interface", host, "--play", cues)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind((host, 6454))
         outcome = relit("twin", rig, capture, "--interface", host, "--after", "1")

@@ -42,11 +42,6 @@ def test_the_tables_have_the_keys_of_the_files(written, title, of):
     assert keys and TABLES[title] == keys
 
 
-def test_every_option_is_described(relit):
-    options = set(re.findall(r"--[a-z-]+", relit("view", "--help").out)) - {"--help", "--out", "--no-align"}
-    assert len(options) > 4 and {option for option in options if f"`{option}" not in TEXT} == set()
-
-
 @pytest.mark.long
 def test_the_sizes_of_the_format_are_those_of_the_code(written):
     facts = written[0]

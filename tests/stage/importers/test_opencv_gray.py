@@ -9,8 +9,8 @@ import pytest
 from stage.capture.capture import Capture
 from stage.capture.projector import UncalibratedProjector
 from stage.errors import ManifestError
+from stage.importers.pattern_order import GrayStack
 from stage.importers.patterns import import_opencv_gray as import_folder
-from stage.importers.sequences import GrayStack
 from tests.scenes.captures import write_image
 
 K1, D1 = np.array([[800.0, 0, 319.5], [0, 810, 239.5], [0, 0, 1]]), np.array([-0.1, 0.02, 0.001, -0.002, 0.003])

@@ -49,6 +49,7 @@ def test_a_point_lamp_is_seen_from_the_subject(tmp_path, content):
     ({"address": {"protocol": "sacn", "universe": 0, "channels": {}}}, "universe"),
     ({"address": {"protocol": "sacn", "universe": 1, "channels": {"amber": 1}}}, "amber"),
     ({"address": {"protocol": "sacn", "universe": 1, "channels": {"red": 513}}}, "channels"),
+    ({"address": {"protocol": "manual", "fixed": [{"name": "Dimmer", "channel": 7, "value": 255}]}}, "fixed is for sacn and artnet"),
     ({"colour": 1}, "lights[1].colour"),
 ])
 def test_what_is_wrong_names_the_field(tmp_path, content, change, field):
@@ -82,6 +83,24 @@ def test_levels_return_from_their_dmx_values(tmp_path, bits):
         received = {(universe.protocol, universe.number): values[frame] for universe, values in universes.items()}
         assert levels_of_universes(rig, received) == pytest.approx(steps[frame] / (2**bits - 1))
     assert levels_of_universes(rig, {}).max() == 0
+
+
+def test_fixed_channels_are_sent_and_a_lamp_without_them_is_dark(tmp_path, content):
+    """A master dimmer that two lamps share, and a shutter that a lamp has where another has a colour."""
+    dimmer, shutter = {"name": "Dimmer", "channel": 500, "value": 255}, {"name": "Shutter", "channel": 501, "value": 40}
+    content["lights"][0]["address"]["fixed"] = [dimmer]
+    content["lights"][1]["address"]["fixed"] = [dimmer, shutter]
+    rig = read(tmp_path, content)
+    assert list(patch_faults(rig)) == []
+    (universe, (values,)), = universe_values(rig, np.full((1, 9), 255)).items()
+    assert values[[499, 500]].tolist() == [255, 40] and values.sum() == 9 * 255 + 295
+    received = {universe[:2]: values}
+    assert levels_of_universes(rig, received).tolist() == [1] * 9
+    values[500] = 41
+    assert levels_of_universes(rig, received).tolist() == [1] * 3 + [0] * 3 + [1] * 3
+    for change, words in ({"value": 254}, "already Dimmer at 255"), ({"channel": 1}, "is already red of L000"):
+        content["lights"][1]["address"]["fixed"] = [dimmer | change]
+        assert [words in fault for fault in patch_faults(read(tmp_path, content))] == [True]
 
 
 def test_a_response_is_undone(tmp_path, content):

@@ -88,7 +88,7 @@ def test_a_lambertian_surface_is_exact(device, name):
     assert (angle_degrees(fit.normal, normal) < rounding_bound(shading, frames) + 0.01).all()
     assert np.allclose(fit.albedo, albedo, rtol=4 * HALF_ROUNDING)  # M₀ of a fit to four readings takes up three of their errors
     assert np.allclose(fit.length, 1, atol=0.01)
-    assert (fit.confidence > 0.2).all()
+    assert (fit.sigma < 4).all()
 
 
 def test_the_fit_is_that_of_least_squares_in_float64(device):
@@ -107,14 +107,14 @@ def test_the_fit_is_that_of_least_squares_in_float64(device):
     assert np.allclose(got.variance.numpy()[:40], np.trace(covariance[1:, 1:]) / 3)
 
 
-def test_contradiction_and_occlusion_lower_the_confidence(device):
+def test_contradiction_and_occlusion_raise_the_standard_error(device):
     normal = np.tile(cap(1, 40), (3, 1))
     shading = lambert_shading(normal, PAIRS)
     shading[0, 1] *= 1.1  # one frame of a pair too bright
     shading[:, 2] = shading[:, 2] * 0.9 + 0.05  # a tenth of the light comes from neighbours, from every side alike
     band = upload(tinted(shading, np.full((3, 3), 0.5)), device)
     fit = diffuse(band, moments(band, PAIRS))
-    assert fit.confidence[0] > 0.4 and (fit.confidence[1:] < 0.6 * fit.confidence[0]).all()
+    assert fit.sigma[0] < 1.5 and (1 + fit.sigma[1:] > (1 + fit.sigma[0]) / 0.6).all()
     assert fit.length[2] == pytest.approx(0.9, abs=2e-3)
 
 
@@ -212,7 +212,7 @@ def test_grey_is_ambiguous_and_says_so(device):
     assert np.array_equal(parts.diffuse.values.numpy(), mixed.values.numpy())
     assert (parts.diffuse.tilt.numpy()[:10] == np.float32(HIDDEN_TILT)).all()
     assert not parts.specular.numpy().any() and not specular(band, parts).any()
-    assert (diffuse(band, parts.diffuse).confidence < 0.16).all()
+    assert (diffuse(band, parts.diffuse).sigma > 5.2).all()
 
 
 def test_pixels_that_cannot_be_solved_say_why(device):
@@ -234,7 +234,7 @@ def test_pixels_that_cannot_be_solved_say_why(device):
     for array in (*responses, *fit):
         values = array if isinstance(array, np.ndarray) else array.numpy()
         assert np.isfinite(values).all()
-    assert not fit.normal[unsolved].any() and not fit.albedo[unsolved].any() and not fit.confidence[unsolved].any()
+    assert not fit.normal[unsolved].any() and not fit.albedo[unsolved].any() and not fit.sigma[unsolved].any()
     # one saturated or missing frame of a pair costs nothing but certainty
     assert angle_degrees(fit.normal, normal)[[0, 4]].max() < 0.1
     parts = separate_polarised(responses, responses, GREY, pixel_count=7, device=device)

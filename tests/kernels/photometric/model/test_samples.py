@@ -3,7 +3,8 @@ import pytest
 
 from kernels import packs
 from kernels.photometric.lambertian.readings import grey_factors, grey_readings, pad_lights
-from kernels.photometric.model.samples import choose, device_values, gather, host_values, per_pixel, to_host
+from kernels.photometric.model.chosen_samples import choose
+from kernels.photometric.model.samples import device_values, gather, host_values, per_pixel, to_host
 from tests.kernels.scenes import GREY, cap, store
 
 LIGHTS, PIXELS = 5, 75

@@ -2,16 +2,15 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
-from kernels.relight.basis.basis import MAX_CHUNKS, gram, gram_kernel, principal, projection, residual_kernel, squared_residual
+from kernels.relight.basis.basis import MAX_CHUNKS, gram, principal, projection, squared_residual
+from kernels.relight.basis.rti import HSH_TERMS, biquadratic, fit_weights, hemispherical_harmonics, separate
 from kernels.relight.frames.combine import combine_batch
-from tests.kernels.scenes import HALF_ROUNDING, store
-from tests.reference.light_basis import truncation
+from tests.kernels.scenes import HALF_ROUNDING, cap, shade, store
+from tests.reference.light_basis import harmonics, polynomial, relative_rms, truncation
 
 
 def captured(lights, pixels, rank=None, seed=0):
@@ -49,20 +48,6 @@ def test_a_mask_that_is_empty_gives_zero(device):
     found = gram(packs.upload(captured(8, 40), device=device), np.zeros(40, dtype=bool))
     assert not found.any()
     assert np.array_equal(principal(found, 3).truncation, np.zeros(3))
-
-
-@pytest.mark.parametrize("chunks", [1, 5])
-def test_the_kernel_of_cuda(chunks):
-    """Packs of four, on the CPU; the lower triangle of tiles."""
-    stack, keep = captured(13, 132), kept(132)
-    lights = stack.shape[1]
-    values = wp.array(stack.reshape(3 * lights, 33, 4), dtype=pack_type(4, wp.float16), device="cpu")
-    counts = wp.array(keep.astype(np.float32).reshape(33, 4), dtype=pack_type(4, wp.float32), device="cpu")
-    tiles = np.stack(np.tril_indices(lights // 4), axis=1) * 4
-    partial = wp.zeros((chunks, 3, lights, lights), dtype=wp.float64, device="cpu")
-    devices.launch(gram_kernel(4), chunks * 3 * len(tiles), [values, counts, wp.array(tiles, dtype=wp.vec2i, device="cpu"), chunks],
-                   [partial], device="cpu")
-    assert np.allclose(np.tril(partial.numpy().sum(axis=0)), np.tril(products(stack, keep)), rtol=1e-13, atol=0)
 
 
 @pytest.mark.parametrize("count", [1, 4, 20])
@@ -118,18 +103,6 @@ def test_the_residual_is_the_sum_of_squares(pixels, low, high, device):
     assert np.allclose(found, wanted, rtol=1e-5)  # sums of 16 squares in float
 
 
-def test_the_residual_kernel_of_cuda():
-    """Packs of four, on the CPU."""
-    stack = captured(8, 20)
-    values = wp.array(stack.reshape(24, 5, 4), dtype=pack_type(4, wp.float16), device="cpu")
-    ones = wp.array(np.ones((3, 8)), dtype=wp.float32, device="cpu")
-    nothing = wp.zeros((1, 3, 5), dtype=pack_type(4, wp.float32), device="cpu")
-    squares = wp.zeros((3, 5), dtype=pack_type(4, wp.float32), device="cpu")
-    devices.launch(residual_kernel(4), 15, [values, ones, nothing, wp.zeros((3, 8, 1), dtype=wp.float32, device="cpu"),
-                                            -np.inf, np.inf], [squares], device="cpu")
-    assert np.allclose(squares.numpy().reshape(3, 20), (stack.astype(np.float64) ** 2).sum(axis=1), rtol=1e-5)  # eight squares in float
-
-
 @pytest.mark.parametrize("count", [0, 9])
 def test_a_count_out_of_range_is_refused(count):
     with pytest.raises(ArrayError, match=f"count is {count}: give 1 to 8"):
@@ -144,3 +117,61 @@ def test_what_does_not_fit_is_refused(device):
         principal(np.full((3, 2, 2), np.nan), 1)
     with pytest.raises(ArrayError, match=r"functions are \(3, 7, 2\), expected \(3, 8, 2\)"):
         squared_residual(band, np.ones((3, 8)), np.zeros((2, 3, band.packs * devices.pack_width(device))), np.zeros((3, 7, 2)))
+
+
+LIGHTS = cap(200, 85)
+
+
+def test_the_biquadratic_is_in_the_order_of_the_file():
+    assert np.allclose(biquadratic(LIGHTS), polynomial(LIGHTS), rtol=1e-14)
+
+
+@pytest.mark.parametrize("terms", HSH_TERMS)
+def test_harmonics_are_legendre_polynomials(terms):
+    assert np.allclose(hemispherical_harmonics(LIGHTS, terms), harmonics(LIGHTS, terms), atol=1e-12)
+
+
+@pytest.mark.parametrize("functions", [biquadratic(LIGHTS), hemispherical_harmonics(LIGHTS, 16)])
+def test_what_lies_in_the_functions_is_fitted_exactly(functions):
+    coefficients = np.random.default_rng(0).normal(size=(functions.shape[1], 5))
+    assert np.allclose(fit_weights(functions) @ (functions @ coefficients), coefficients, atol=1e-10)
+
+
+@pytest.mark.parametrize(("name", "functions", "limit"), [
+    # max(0, n·l) is not in any of the spaces; the figures are those of the float64 twin on these normals and lights, rounded up
+    ("ptm", polynomial(LIGHTS), 0.11), ("hsh 4", harmonics(LIGHTS, 4), 0.12), ("hsh 9", harmonics(LIGHTS, 9), 0.08),
+    ("hsh 16", harmonics(LIGHTS, 16), 0.045)])
+def test_a_lambertian_ball_is_close(name, functions, limit):
+    normal = cap(300, 60)
+    radiance = shade(normal, np.ones((300, 3)), LIGHTS, np.ones((200, 3)))[0]
+    ours = biquadratic(LIGHTS) if name == "ptm" else hemispherical_harmonics(LIGHTS, functions.shape[1])
+    error = relative_rms(ours @ (fit_weights(ours) @ radiance), radiance)
+    wanted = np.linalg.lstsq(functions, radiance, rcond=None)[0]
+    assert error == pytest.approx(relative_rms(functions @ wanted, radiance), rel=1e-9)
+    assert error < limit
+
+
+def test_lights_that_determine_nothing_are_refused():
+    ring = np.array([[np.cos(a) * 0.6, np.sin(a) * 0.6, 0.8] for a in np.linspace(0, 6, 12)])
+    for lights in (ring, LIGHTS[:5]):
+        with pytest.raises(ArrayError, match=f"{len(lights)} lights do not determine 6 coefficients"):
+            fit_weights(biquadratic(lights))
+    with pytest.raises(ArrayError, match="terms are 10"):
+        hemispherical_harmonics(LIGHTS, 10)
+
+
+def test_a_colour_times_a_luminance_is_separated():
+    rng = np.random.default_rng(3)
+    functions, colour = biquadratic(LIGHTS), rng.uniform(0.1, 0.8, (40, 3))
+    colour[7] = 0
+    normal = cap(40, 50)
+    values = 255 * shade(normal, colour, LIGHTS, np.full((200, 3), np.pi)).clip(0, 1)
+    fitted = np.einsum("tl,clp->tcp", fit_weights(functions), values).astype(np.float32)
+    found = separate(fitted, functions)
+    shown = np.einsum("lt,tp,cp->clp", functions, found.coefficients, found.colour / 255.0)
+    # each byte of the colour is rounded by a half, and the luminance, 255 at the most, follows by (1 + √3)/2 of that at the most
+    assert np.abs(shown - np.einsum("lt,tcp->clp", functions, fitted)).max() < 0.5 * (1 + (1 + 3**0.5) / 2)
+    assert found.colour.max() <= 255 and not found.colour[:, 7].any() and not found.coefficients[:, 7].any()
+    coloured = np.arange(40) != 7
+    peaks, length = (functions @ found.coefficients).max(axis=0)[coloured], np.linalg.norm(found.colour, axis=0)[coloured]
+    assert (np.abs(peaks / 255 - 1) < 0.5 * 3**0.5 / length).all()  # the rounding of the colour along itself

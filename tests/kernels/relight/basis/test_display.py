@@ -2,13 +2,10 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
-from kernels import device as devices
 from kernels import packs
 from kernels.errors import ArrayError
-from kernels.packs import pack_type
-from kernels.relight.basis.rti import encode, encode_kernel
+from kernels.relight.basis.rti import encode
 from tests.kernels.scenes import store
 from tests.reference.light_basis import srgb
 
@@ -38,16 +35,6 @@ def test_display_values(pixels, device):
     assert np.array_equal(source.values.numpy(), before)
     assert np.abs(found - expected(stack, gains)).max() < HALF_STEP + 2e-6  # and powers in float
     assert not found[:, 8:].any()
-
-
-def test_the_kernel_of_cuda():
-    """Packs of four, on the CPU."""
-    stack, gains = store(np.random.default_rng(1).random((3, 8, 12))), np.full((3, 8), 0.7)
-    inside = wp.array(stack.reshape(24, 3, 4), dtype=pack_type(4, wp.float16), device="cpu")
-    outside = wp.zeros((24, 3), dtype=pack_type(4, wp.float16), device="cpu")
-    matrix = wp.mat33(*(float(v) for v in MATRIX.astype(np.float32).reshape(-1)))
-    devices.launch(encode_kernel(4), 24, [inside, wp.array(gains, dtype=wp.float32, device="cpu"), matrix], [outside], device="cpu")
-    assert np.abs(outside.numpy().reshape(3, 8, 12) - expected(stack, gains)).max() < HALF_STEP + 2e-6
 
 
 def test_what_does_not_fit_is_refused(device):

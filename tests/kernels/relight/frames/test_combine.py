@@ -92,31 +92,6 @@ def test_rows_are_summed_as_images_are(frames, channels, device):
         combining.combine_rows(packed, weights[:, :, :-1])
 
 
-def fours(stack):
-    """[3 · light, pack] in packs of four, as on CUDA, on the CPU."""
-    padded = np.pad(stack, ((0, 0), (0, 0), (0, -stack.shape[2] % 4)))
-    return wp.array(padded.reshape(-1, padded.shape[2] // 4, 4), dtype=pack_type(4, wp.float16), device="cpu")
-
-
-@pytest.mark.parametrize("pixels", [1, 4, 130])
-def test_the_kernels_of_cuda(pixels):
-    """The register kernels, packs of four, on the CPU."""
-    stack = captured(13, pixels)
-    values = fours(stack)
-    weights = drawn((8, 3, 16))
-    frame = wp.zeros((3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
-    devices.launch(combining.frame_register_kernel(4), 3 * values.shape[1],
-                   [values, wp.array(weights[0], dtype=wp.float32, device="cpu")], [frame], device="cpu")
-    assert close(frame.numpy().reshape(3, -1)[:, :pixels], stack, weights[0])
-    two = np.concatenate([weights, -2 * weights])  # two groups of register frames
-    frames = wp.zeros((16, 3, values.shape[1]), dtype=pack_type(4, wp.float32), device="cpu")
-    devices.launch(combining.batch_register_kernel(4), 2 * 3 * values.shape[1],
-                   [values, wp.array(two, dtype=wp.float32, device="cpu")], [frames], device="cpu")
-    got = frames.numpy().reshape(16, 3, -1)[:, :, :pixels]
-    for f in range(16):
-        assert close(got[f], stack, two[f])
-
-
 @settings(max_examples=15, deadline=None)
 @given(chosen=st.permutations(range(20)), powers=st.lists(st.floats(0.0, 4.0), min_size=5, max_size=5))
 def test_superposition(chosen, powers):

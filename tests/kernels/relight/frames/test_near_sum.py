@@ -65,15 +65,6 @@ def test_it_is_the_twin(given, count, device):
     assert count == 1 or expected.max() > 0.001
 
 
-def test_packs_of_four_are_packs_of_more(monkeypatch):
-    """As CUDA takes them, on the CPU."""
-    pixels, readings, visible = scene(30)
-    expected, _ = summed(pixels, readings, ALL, LIGHTS, "cpu", visible=visible)
-    monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
-    got, _ = summed(pixels, readings, ALL, LIGHTS, "cpu", visible=visible)
-    np.testing.assert_allclose(got, expected, rtol=1e-4)  # other orders of float32 operations, in lobes too
-
-
 LAYOUTS = {"octahedron": AXES, "icosahedron": icosahedron() @ turn(0).T, "even": LIGHTS, "many": cap(150, 180), "any": scattered(40, 2),
            "cube": CUBE, "rings": np.concatenate([AXES[[1, 4]], *(ring(12, e) for e in (-60, -30, 0, 30, 60))]), "half": cap(96, 90),
            "dome": np.concatenate([AXES[[1]], *(ring(12, e) for e in (0, 30, 60))])}

@@ -75,15 +75,6 @@ def test_it_is_the_twin(count, device):
     assert count == 1 or np.ptp(got) > 0.1
 
 
-def test_packs_of_four_are_packs_of_more(monkeypatch):
-    """As CUDA takes them, on the CPU."""
-    monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
-    pixels = scattered_pixels(30)
-    parts = reference.parts(pixels, LIGHTS)
-    got, held = trusted(pixels, 0.1 + 0.6 * parts.sum(axis=0), "cpu")
-    assert close(got, held, parts)
-
-
 def test_a_model_of_two_materials_explains_its_images(device):
     """β is one of images that the twin mixes, and less where the model lacks the second material. Tolerance: as against the twin."""
     pixels, other = scattered_pixels(45, seed=1), scattered_pixels(45, seed=2)

@@ -49,14 +49,6 @@ def test_it_is_the_twin(kind, count, device):
     assert np.abs(got[:3]).max() > 0.01 and np.abs(got[3:]).max() > 0.001
 
 
-def test_packs_of_four_are_packs_of_more(monkeypatch):
-    """As CUDA takes them, on the CPU."""
-    monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
-    pixels, given = scattered_pixels(30), sources.join([lights(kind) for kind in KINDS])
-    assert upload(pixels, "cpu").packs == 8
-    assert close(radiance(pixels, given, "cpu"), pixels, given)
-
-
 def test_the_last_pack_is_filled_with_the_last_pixel(device):
     pixels = scattered_pixels(33)
     got = shading.shade(upload(pixels, device), lights("point")).numpy()

@@ -176,16 +176,6 @@ def test_the_last_pack_is_filled_with_the_last_pixel(count, device):
     assert rest.shape[1] and not rest[0].any() and rest[1].all() and not got[0, -1]
 
 
-def test_packs_of_four_are_packs_of_more(monkeypatch):
-    """As CUDA takes them, on the CPU."""
-    lights = [far(1, 0.2, 0.5), [3.0, 10.0, 20.0, 1.0]]
-    expected, _ = seen(lights, ALL[::7], block(), flat(), "cpu")
-    monkeypatch.setattr("kernels.device.pack_width", lambda device: 4)
-    got, rest = seen(lights, ALL[::7], block(), flat(), "cpu")
-    np.testing.assert_array_equal(got, expected)
-    assert rest.shape[1] == -len(ALL[::7]) % 4
-
-
 def test_no_light_has_no_rows(device):
     got, _ = seen(np.zeros((0, 4)), ALL[:40], block(), flat(), device)
     assert got.shape == (0, 40)

@@ -42,7 +42,7 @@ def test_cells_are_the_polygons_of_spherical_voronoi(direction, device):
 @pytest.mark.long
 @pytest.mark.parametrize("direction", [AXES, CUBE, icosahedron(), dodecahedron(), ring(2, 0), ring(40, 0)],
                          ids=["octahedron", "cube", "icosahedron", "dodecahedron", "halves", "40 lunes"])
-@pytest.mark.parametrize("seed", [None, 0, 1])
+@pytest.mark.parametrize("seed", [None, 0])
 def test_symmetric_lights_have_equal_cells(direction, seed, device):
     """However the map is turned; of the lunes 40 meet in one sample."""
     rotations = STILL if seed is None else turn(seed)[None]

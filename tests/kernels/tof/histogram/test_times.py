@@ -43,7 +43,7 @@ def fifths(error, sigma):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("sigma_bins", "background", "low", "high"), [
-    (0.8, 0.02, 5, 60), (0.8, 2.0, 12, 100), (0.8, 60.0, 60, 400), (2.0, 0.5, 10, 200), (4.0, 2.0, 30, 300), (0.3, 0.5, 8, 100)])
+    (0.8, 0.02, 5, 60), (0.8, 60.0, 60, 400), (4.0, 2.0, 30, 300), (0.3, 0.5, 8, 100)])
 def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, device):
     """In each fifth of the pixels, from those told best to those told worst; the median of 2400 errors scatters by 2.6 %. With the Fisher
     information, and no more than a bin over √12, sigma was too small up to 2.3 times."""
@@ -58,8 +58,7 @@ def test_sigma_is_the_error_at_low_counts(sigma_bins, background, low, high, dev
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("sigma_bins", [0.05, 0.1, 0.2])
-@pytest.mark.parametrize("photons", [20.0, 2000.0])
+@pytest.mark.parametrize(("sigma_bins", "photons"), [(0.05, 20.0), (0.1, 2000.0), (0.2, 20.0)])
 def test_sigma_is_the_error_of_pulses_that_hide_in_a_bin(sigma_bins, photons, device):
     """Errors are even over what the bin leaves open there, and not normal: RMS alone."""
     time, counts = draw(np.full(12000, photons), sigma_bins, 0.5, seed=2)
@@ -83,7 +82,7 @@ def test_sigma_knows_what_pile_up_costs(photons, pulses, device):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("apart", [2.5, 3.0, 4.0, 6.0])
+@pytest.mark.parametrize("apart", [2.5, 3.0, 6.0])
 def test_two_returns_that_overlap_are_at_their_places_with_their_errors(apart, device):
     """Pulses of two bins, `apart` of their standard deviations apart."""
     time, counts = draw(np.full(3000, 2000.0), 2.0, 0.5, seed=4, second=(2.0 * apart, 0.5))
@@ -114,8 +113,7 @@ def test_the_posterior_is_that_of_the_twin(sigma_bins, photons, pulses, device):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("background", "low", "high", "clear", "pixels"), [(0.05, 1, 40, 12, 100000), (0.5, 2, 60, 20, 200000),
-                                                                            (2.0, 3, 80, 30, 250000)])
+@pytest.mark.parametrize(("background", "low", "high", "clear", "pixels"), [(0.05, 1, 40, 12, 100000), (2.0, 3, 80, 30, 250000)])
 def test_confidence_is_how_often_the_peak_is_right(background, low, high, clear, pixels, device):
     """Every other pixel has no return: those that are accepted and wrong are as many as confidence says. There are more than 30 of them,
     whose number scatters by a sixth, and how bright returns are is not known beforehand: within a factor of two. Pixels are solved one

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kernels.photometric.reference.sampling import Regime
+from kernels.photometric.posterior.sampling import Regime
 from service.asset.content.metallic import GLASS_IOR, IOR_LIMITS, MIRROR, dielectric_ior, loss_warnings, metallic_look, specular_of_ior
 from tests.scenes.surfaces import make_ball, make_sheet
 

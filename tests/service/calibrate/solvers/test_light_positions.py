@@ -5,6 +5,7 @@ import pytest
 
 from service.calibrate.solvers.light_positions import nearest_point
 from stage.errors import CalibrationError
+from tests.reference.light_directions import least_error_degrees
 from tests.service.calibrate.solvers.balls import unit
 
 
@@ -49,3 +50,14 @@ def test_rays_that_miss_each_other_are_flagged():
     points = np.array([[-0.1, 0, 0], [0.1, 0.1, 0.0]])
     found = nearest_point(points, np.array([unit(0.3, 0, 1), unit(-0.3, 0, 1)]), np.full(2, 0.1))
     assert found.flags == ("rays miss",) and found.residual == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize("count", [12, 16, 24])
+def test_what_all_lights_share_is_left(count):
+    """One of 3 × 3 numbers is a common strength, which turns no light: eight of 2n are those of the table. A turn, three, is left where the
+    strengths are known, and a little more by readings of half a per cent."""
+    assert least_error_degrees(count, table_degrees=5.0, strength=10.0) == pytest.approx(5 * (8 / (2 * count)) ** 0.5, rel=0.01)
+    known = least_error_degrees(count, table_degrees=5.0, strength=0.001)
+    assert known == pytest.approx(5 * (3 / (2 * count)) ** 0.5, rel=0.02)
+    assert least_error_degrees(count, table_degrees=5.0, strength=0.1) == pytest.approx(
+        {12: 2.66, 16: 2.31, 24: 1.88}[count], abs=0.03)  # the table of docs/methods.md

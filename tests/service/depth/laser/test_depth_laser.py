@@ -75,6 +75,18 @@ def test_a_sweep_of_stripes(relit, tmp_path, upright):
     assert 0.5 < np.median(np.abs(ratio)) / 0.6745 < 2
 
 
+@pytest.mark.parametrize(("upright", "step"), [(True, 0.004), (False, 0.005)])
+def test_planes_in_reverse_order_are_refused(relit, tmp_path, upright, step):
+    """A sphere before a plane is seen with a relief of 0.2 m; the sweep in its own order is not refused."""
+    planes = [plane(step * (number - 6), upright=upright) for number in range(13)]
+    write_lasers(tmp_path, SCENE, planes, width=1.2e-3, noise=0.005, camera=CAMERA)
+    relit.done("depth", tmp_path, "--out", tmp_path / "right")
+    lasers = planes[::-1]
+    for number, laser in enumerate(lasers):
+        edit_frame(tmp_path, number, laser=laser)
+    assert "the planes look declared in reverse order" in relit.refused("depth", tmp_path, "--out", tmp_path / "out")
+
+
 @pytest.mark.long
 def test_a_dense_sweep_fills_the_map(relit, tmp_path):
     scene = make_scene(sphere=False, camera=CAMERA)

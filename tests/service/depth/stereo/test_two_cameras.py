@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from service.depth.stereo.row_offset import row_offsets
+from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest
@@ -103,3 +105,47 @@ def test_what_is_missing_is_named(relit, tmp_path):
     edit_manifest(tmp_path / "second", frames=kept)
     assert "second has a code of one axis alone: two cameras need" in relit.refused(*command)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("offset", [-0.7, 0.0, 0.3])
+def test_an_offset_is_measured(offset):
+    rng = np.random.default_rng(0)
+    wave, phase = rng.uniform(-1, 1, (40, 2)), rng.uniform(0, 2 * np.pi, 40)
+    y, x = np.mgrid[:60, :120].astype(float)
+
+    def image(at_x, at_y):
+        return (0.5 + 0.05 * sum(np.cos(k[0] * at_x + k[1] * at_y + p) for k, p in zip(wave, phase, strict=True))).astype(np.float32)
+
+    left, right = image(x, y), 0.6 * image(x + 7, y - offset) + 0.1  # lower by the offset
+    flat = np.zeros_like(left)
+    usable = np.zeros(left.shape, bool)
+    usable[:, 25:-8] = True
+    found = row_offsets(left, right, flat + 7, flat, flat, usable, most=200)
+    assert len(found) == 200 and np.abs(found - offset).max() < 0.02  # bicubic interpolation
+    assert len(row_offsets(left, right, flat + 7, flat, flat, ~usable & False, most=200)) == 0
+
+
+def test_means_and_contrast():
+    image = np.random.default_rng(0).random((20, 30))
+    mean = box_mean(image, 2)
+    assert abs(mean[7, 9] - image[5:10, 7:12].mean()) < 1e-12
+    assert abs(mean[0, 0] - np.pad(image, 2, mode="edge")[:5, :5].mean()) < 1e-12
+    frames = np.stack([image, 3 * image + 100]).astype(np.float32)  # an offset has no contrast
+    expected = np.sqrt((1 + 9) / 2) * image[5:10, 7:12].std()
+    assert abs(contrast(frames, 2)[7, 9] - expected) < 1e-4 * expected
+
+
+def test_a_bend_is_what_a_plane_of_least_squares_lies_above_the_surface():
+    y, x = np.mgrid[:40, :50].astype(float)
+    surface = 12 + 0.1 * x - 0.05 * y + 0.5 * 0.02 * (x - 25) ** 2 + 0.5 * -0.008 * (y - 20) ** 2
+    dy, dx = np.mgrid[-WINDOW_REACH:WINDOW_REACH + 1, -WINDOW_REACH:WINDOW_REACH + 1]
+    columns = np.stack([np.ones(dx.size), dx.ravel(), dy.ravel()], axis=-1)
+    window = surface[20 - WINDOW_REACH:21 + WINDOW_REACH, 25 - WINDOW_REACH:26 + WINDOW_REACH].ravel()
+    above = np.linalg.lstsq(columns, window, rcond=None)[0][0] - surface[20, 25]
+    usable = np.ones(surface.shape, bool)
+    found = bend(surface, usable)
+    assert abs(found[20, 25] - above) < 1e-9 and abs(above - (0.02 - 0.008) / 2 * 20 / 3) < 1e-9
+    step = np.where(x > 24, surface + 30, surface)
+    beside = np.r_[8:18, 32:42]
+    assert np.abs(bend(step, usable) - above)[8:-8, beside].max() < 1e-9 and np.abs(bend(step, usable)).max() < 0.1  # a step is no bend
+    assert not bend(surface, np.zeros_like(usable)).any()

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from service.scans.fusion.bands import Bands
-from service.scans.fusion.contradictions import compared, unlike_noise
-from service.scans.fusion.joined_normals import join_normals
+from service.scans.fusion.joined_normals import compared, join_normals, unlike_noise
 
 PIXEL = 2e-3
 COUNT = 90

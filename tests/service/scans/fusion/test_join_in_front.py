@@ -19,7 +19,7 @@ RESOLVED = 1.0
 """Degrees that the face between three exact vertices errs by at most where the mesh resolves the surface."""
 
 
-NOISE = [("plates", DEPTH_SIGMA)] + [(name, 3 * DEPTH_SIGMA) for name in SCENES]
+NOISE = [(name, DEPTH_SIGMA if name == "plates" else 3 * DEPTH_SIGMA) for name in SCENES]
 """Scenes, and the standard deviation of their depths in metres."""
 
 

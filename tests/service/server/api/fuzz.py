@@ -10,7 +10,7 @@ from service.requests.jobs import RelightJob
 from service.requests.keys import NewKey, Scope
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, keys, tables
-from tests.service.server.house import PROJECT, House
+from tests.service.server.process.house import PROJECT, House
 from tests.service.server_process import Server, environment_with
 
 SEED = "7"

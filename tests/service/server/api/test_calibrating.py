@@ -16,6 +16,7 @@ from service.calibrate.white_balance import white_balance
 from service.requests import calibrate as requests
 from tests.reference import tof
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
+from tests.service.calibrate import test_rig as lamps
 from tests.service.calibrate.solvers import test_procam as boards
 from tests.service.calibrate.test_calibrate_tof import cw, sweep
 from tests.service.calibrate.test_laser_planes import boards as laser_boards
@@ -118,7 +119,7 @@ def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("away", ["../../{other}/d0", "/etc", "d0/../../{other}/d0", "none"])
+@pytest.mark.parametrize("away", ["/etc", "d0/../../{other}/d0"])
 def test_a_sweep_of_another_capture(server, client, tmp_path, away):
     """What it names beside its own captures may be of another project."""
     path = sweep(tmp_path / "sweep", [(f"d{k}", 1.0 + k, 0.0, None) for k in range(2)], cw)
@@ -217,3 +218,21 @@ def test_the_brightness_of_lights(server, client, dome):
     assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])
     assert str(server.data) not in json.dumps(measured) and str(SAMPLES) not in json.dumps(measured)
     assert measured["options"]["capture"] == measured["capture"] == dome
+
+
+def test_the_lamps_of_a_rig_are_measured_by_a_job(server, client, relit, tmp_path):
+    stage = lamps.make_stage(1, 8)
+    rig = lamps.nominal(tmp_path, stage)
+    cues, table = lamps.swept(relit, rig, "--levels", 3)
+    capture = lamps.shoot(tmp_path / "capture", stage, lamps.grey_ball(stage), cues)
+    shutil.copy(table, capture / "cues.csv")
+    identifier = sent(server, client, capture)
+    (u, v, radius), options = map(float, lamps.CIRCLE.split(",")), {"albedo": [lamps.ALBEDO] * 3}
+    job = submit(client, kind="calibrate-rig", capture=identifier, rig=json.loads(rig.read_text()), table="cues.csv",
+                 options={"circles": [{"u": u, "v": v, "radius_px": radius}], **options})
+    finish(server, client, job)
+    assert made_by(client, job) == {"rig.json", "measured.json", "calibration.json"}
+    relit.done("calibrate", "rig", capture, rig, "--table", table, "--ball", lamps.CIRCLE, "--albedo", lamps.ALBEDO,
+               "--out", tmp_path / "measured.json")
+    found = client.get(f"/v1/jobs/{job['id']}/results/measured.json").raise_for_status().json()
+    same(found, json.loads((tmp_path / "measured.json").read_text()))

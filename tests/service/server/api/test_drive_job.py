@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stage.transforms import fibonacci_sphere
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import make_scene, write_capture, write_exr
 from tests.scenes.rigs import write_rig
 from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
+from tests.service.server.api.test_measuring import files_of, upload
 
 SUN = {"schema": "relit.keys/1", "lights": [
     {"name": "sun", "keys": [{"frame": 1, "direction": [0, 0, 1], "irradiance": [0.2, 0.2, 0.2]}]}]}
@@ -16,7 +17,9 @@ SUN = {"schema": "relit.keys/1", "lights": [
 
 @pytest.fixture(scope="module")
 def lamps(tmp_path_factory) -> dict:
-    return write_rig(tmp_path_factory.mktemp("rig") / "dome.json", fibonacci_sphere(24), irradiance=4.0, bits=16)
+    path = tmp_path_factory.mktemp("rig") / "dome.json"
+    write_rig(path, fibonacci_sphere(24), irradiance=4.0, bits=16)
+    return json.loads(path.read_text())
 
 
 @pytest.mark.long
@@ -43,6 +46,28 @@ def test_a_job_writes_the_cues_that_the_command_line_writes(server, client, regi
     beyond = submit(client, kind="drive", rig=lamps, environment=sky, options={"exposure": 12.0})
     error = finish(server, client, beyond, "failed")["error"]
     assert "is beyond all limits of the rig dome" in error and str(registered) not in error
+
+
+@pytest.mark.long
+def test_a_chart_and_a_capture_come_with_a_job(server, client, relit, tmp_path):
+    """A chart whose camera sees a quarter of the red that the irradiances say; the capture is the first sample of the service."""
+    rig = write_rig(tmp_path / "dome.json", fibonacci_sphere(24), irradiance=4.0, bits=16)
+    patches = [[0.9, 0.9, 0.9], [0.4, 0.1, 0.1], [0.1, 0.3, 0.2], [0.1, 0.1, 0.4]]
+    chart = {"schema": "relit.chart/1", "target": patches, "primaries": {name: [
+        [4 * part * (c == k) for c, part in enumerate(patch)] for patch in patches] for k, name in enumerate(("red", "green", "blue"))}}
+    chart["primaries"]["red"] = [[part / 4 for part in patch] for patch in chart["primaries"]["red"]]
+    (tmp_path / "chart.json").write_text(json.dumps(chart))
+    (tmp_path / "sun.json").write_text(json.dumps(SUN))
+    scene = write_capture(tmp_path / "object", make_scene(16, 6))
+    job = submit(client, kind="drive", rig=rig, keys=SUN, chart=chart, capture=upload(server, client, files_of(scene))["id"])
+    finish(server, client, job)
+    assert {"chart.json", "predicted.0001.exr"} <= made_by(client, job)
+    relit.done("drive", tmp_path / "dome.json", "--keys", tmp_path / "sun.json", "--chart", tmp_path / "chart.json", "--capture", scene,
+               "--out", tmp_path / "cues", "--device", "cpu")
+    for name in ("cues.csv", "predicted.0001.exr"):
+        assert client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content == (tmp_path / "cues" / name).read_bytes()
+    red = [row for row in (tmp_path / "cues" / "cues.csv").read_text().splitlines() if ",red," in row]
+    assert sum(float(row.rpartition(",")[2]) for row in red) == pytest.approx(4 * 0.05, abs=1e-3)
 
 
 @pytest.mark.long

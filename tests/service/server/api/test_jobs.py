@@ -21,8 +21,9 @@ def test_a_pipeline_solves_exports_and_relights(server, client, dome, sky):
 
 def test_a_solve_and_an_export_that_brings_lights_along(server, client, dome, solved, sky):
     job = client.get(f"/v1/jobs/{solved}").json()
-    assert job["request"]["options"] == {"align": False, "align_to": None, "crop": None, "clip_negative": False, "method": "lambert",
-                                         "lights": "declared", "intensities": "chosen", "max_sigma": None, "least_confidence": None}
+    assert job["request"]["options"] == {"albedo_scale": None, "align": False, "align_to": None, "crop": None, "clip_negative": False,
+                                         "method": "lambert", "lights": "declared", "intensities": "chosen",
+                                         "materials": "coherent", "max_sigma": None, "least_confidence": None}
     assert made_by(client, job) == {"maps.exr", "report.json"}
     report = client.get(f"/v1/jobs/{solved}/results/report.json").raise_for_status().json()
     assert report["method"] == "lambert"

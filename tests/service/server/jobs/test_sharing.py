@@ -155,6 +155,6 @@ def test_frames_are_made_by_both_workers(both, capture, tmp_path):
     row = shared(both, job, WORKERS)
     assert (row["done"], row["total"]) == (FRAMES, FRAMES)
     assert sorted(row["finished_steps"]) == sorted(f"frames {first}-{first + 1}" for first in range(1, FRAMES, 2))
-    pieces = [piece for share in begun(both, job).values() for piece in share]
-    assert sorted(pieces) == sorted(f"steps/{step}" for step in row["finished_steps"])
+    pieces = {piece for share in begun(both, job).values() for piece in share}  # one that a worker is long at is begun by the other too
+    assert pieces == {f"steps/{step}" for step in row["finished_steps"]}
     assert digests(both.results(job)) == expected

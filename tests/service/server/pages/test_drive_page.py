@@ -53,6 +53,19 @@ def test_the_lamps_of_each_frame_and_the_files(page, server, driven, tmp_path):
     page.screenshot(path=f"{PICTURES or tmp_path}/page_drive.png")
 
 
+def test_balls_the_environment_and_the_object_follow_the_slider(page, driven, solved):
+    page.goto(f"/drive/{driven}")
+    page.get_by_label("Object", exact=True).select_option(solved.capture)
+    page.locator("#picture-of-object canvas[data-ready]").wait_for(timeout=120_000)
+    canvases = page.locator("#environment canvas, #balls canvas, #picture-of-object canvas")
+    assert canvases.count() == 4
+    shown = []
+    for place in ("0", "2"):
+        page.get_by_label("Frame").fill(place)
+        shown.append(canvases.evaluate_all("found => found.map((canvas) => canvas.toDataURL())"))
+    assert all(one != other for one, other in zip(*shown, strict=True))
+
+
 def test_a_job_of_another_kind_is_said(page, solved):
     page.goto(f"/drive/{solved.solve}")
     page.locator("#state", has_text="This job drives no rig.").wait_for()

@@ -13,6 +13,8 @@ from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, Form,
 KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS
 CAPTURE, JOB, OTHER = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk", "job_1123456789abcdefghjk"
 
+RIG = {"schema": "relit.rig/1", "name": "one lamp", "lights": [
+    {"name": "A", "type": "distant", "direction": [0, 0, 1], "primaries": [{"name": "white", "irradiance": [1, 1, 1]}]}]}
 REQUIRED = {
     "calibrate-dark": {"capture": CAPTURE, "images": ["0.exr"]}, "calibrate-flat-field": {"capture": CAPTURE, "images": ["0.exr"]},
     "calibrate-response": {"capture": CAPTURE, "images": ["0.exr", "1.exr", "2.exr"]},
@@ -24,8 +26,7 @@ REQUIRED = {
     "patterns": {"options": {"code": "gray", "projector": "64x32"}},
     "gauge-board": {"study": {"schema": "relit.gauge-study/1", "name": "pads", "runs": [
         {"result": JOB, "board": "A"}, {"result": OTHER, "board": "A"}]}},
-    "drive": {"rig": {"schema": "relit.rig/1", "name": "one lamp", "lights": [
-        {"name": "A", "type": "distant", "direction": [0, 0, 1], "primaries": [{"name": "white", "irradiance": [1, 1, 1]}]}]}},
+    "drive": {"rig": RIG}, "calibrate-rig": {"capture": CAPTURE, "rig": RIG, "table": "cues.csv"},
 }
 """What a job must have beside a capture, where it must."""
 TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x6", "square_m": 0.025},
@@ -33,6 +34,8 @@ TYPED = {"calibrate-laser-planes": {"captures": [CAPTURE, CAPTURE], "board": "9x
          "calibrate-procam": {"captures": [CAPTURE], "board": "9x6", "square_m": 0.025},
          "patterns": {"code": "gray", "projector": "64x32"}}
 
+LISTS = {"corners": [1.5, 1, 9, 1, 9, 5, 1, 5], "grid": [6, 4]}
+"""Values of lists of another length than most."""
 INSTEAD = {("calibrate-laser-planes", "step_m"): ("board", "square_m")}
 """What an option stands in place of."""
 
@@ -68,7 +71,7 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
     typed = TYPED.get(kind, inputs)
     for field in fields(form_of(kind, model)).values():
         value = {"boolean": field.default != "true", "integer": int(allowed(field)), "number": allowed(field), "integers": [1, 2, 3, 4],
-                 "numbers": [0.25, 0.5, 1]}.get(field.value_type)
+                 "numbers": [0.25, 0.5, 1], **LISTS}.get(field.name if field.name in LISTS else field.value_type)
         if value is None and field.choices:
             value = next(each for each, _ in field.choices if each != field.default)
         if value is None:

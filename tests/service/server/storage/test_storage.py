@@ -1,13 +1,19 @@
 """What every storage does, whatever is behind it."""
 
+import os
 import time
 from pathlib import Path
 
 import pytest
 
+from service.requests.base import identifiers
+from service.server.base.settings import Settings
+from service.server.jobs.one_step import KEYS_FILE
+from service.server.storage import layout, objects, scratch
 from service.server.storage.bucket import PIECE_BYTES
 from service.server.storage.folder import FolderStorage
-from service.server.storage.objects import Storage
+from service.server.storage.objects import SCRATCH, Storage
+from service.server.storage.part_files import part_files_folder
 
 RESULTS = "projects/film/jobs/job_0123456789abcdefghjk"
 CAPTURE = "projects/film/captures/cap_0123456789abcdefghjk"
@@ -130,3 +136,19 @@ def test_one_file_is_deleted_and_a_storage_that_can_be_written_is_sound(storage,
     before = sorted(tmp_path.rglob("*"))
     storage.check()
     assert sorted(tmp_path.rglob("*")) == before
+
+
+TEXT = (Path(__file__).parents[4] / "docs" / "service_storage.md").read_text(encoding="utf-8")
+
+
+def test_every_name_is_in_the_docs(tmp_path):
+    settings = Settings(data=tmp_path)
+    for kind in (identifiers.CAPTURE, identifiers.ENVIRONMENT):
+        assert f"{os.path.dirname(layout.intake('PROJECT', identifiers.new_id(kind)))}/ID/…" in TEXT and f"`{kind}_…`" in TEXT
+    assert f"{os.path.dirname(layout.results('PROJECT', identifiers.new_id(identifiers.JOB)))}/ID/…" in TEXT
+    for name in (*layout.SOLVED, layout.FRAMES.replace("####", "0001"), layout.PICTURE, f"{layout.ASSET}.usdz", KEYS_FILE,
+                 f"{part_files_folder(settings).name}/", f"{settings.cache.name}/", f"{SCRATCH}/", f"{objects.REMOVED}/",
+                 objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
+        assert name in TEXT, name
+    assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
+    assert scratch.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT

@@ -30,10 +30,7 @@ def solved(relit, folder, *options):
     return outcome.out, json.loads((folder / "out" / "report.json").read_text()), SurfaceMaps.read(folder / "out" / "maps.exr")
 
 
-@pytest.mark.parametrize(("radii", "count"), [
-    (3.0, 8), pytest.param(1.5, 16, marks=pytest.mark.long),
-    pytest.param(6.0, 12, marks=pytest.mark.long)
-])
+@pytest.mark.parametrize(("radii", "count"), [(3.0, 8), pytest.param(1.5, 16, marks=pytest.mark.long)])
 def test_the_distance_is_found(relit, tmp_path, radii, count):
     """The coarse grid follows the ripples with chords: within half a per cent, and within what the report says."""
     out, report, maps = solved(relit, capture(tmp_path / "c", lamps(DOME, count, radii)))
@@ -58,10 +55,9 @@ def test_lights_that_are_not_where_they_are_said_to_be(relit, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("radii", "count"), [(1.5, 16), (6.0, 12)])
-def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path, radii, count):
+def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path):
     """The dome stands 0.08 m before z = 0, which is the default; depths count from the nearest light."""
-    lights = lamps(FLAT, count, radii)
+    lights = lamps(FLAT, 12, 6.0)
     out, report, maps = solved(relit, capture(tmp_path / "c", lights, scene=FLAT))
     found, true = report["found"]["distance"], FLAT.camera["surface_z_m"]
     below = max(lamp.position[2] for lamp in lights) - true
@@ -73,7 +69,9 @@ def test_an_orthographic_camera_sees_it_by_the_lights(relit, tmp_path, radii, co
 
 def test_an_orthographic_camera_keeps_its_default_where_images_do_not_tell(relit, tmp_path):
     lights = lamps(FLAT, 4, 3.0)
-    out, report, _ = solved(relit, capture(tmp_path / "c", lights, scene=FLAT))
+    folder = capture(tmp_path / "c", lights, scene=FLAT)  # at the wrong distance few or no pixels settle
+    out = relit("solve", folder, "--out", folder / "out", "--method", "robust", "--device", "cpu").out
+    report = json.loads((folder / "out" / "report.json").read_text())
     assert "distance" not in report["found"]
     sentence = next(one for one in report["warnings"] if "surface_z_m" in one)
     assert "the images of 4 lights do not tell it" in sentence and "0 was taken, the default of an orthographic camera" in sentence

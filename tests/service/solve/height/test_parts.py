@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from service.requests.solve import Method, SolveRequest
+from service.solve.height.parts import PlacedPart, Placement
 from service.solve.solve import solve
 from stage.results.maps import SurfaceMaps
 from tests.scenes.captures import angles_degrees
-from tests.scenes.parts import Part, ball_before_body, disc_over_plane, shoot, sphere_lights, write_shot
+from tests.scenes.parts import KINDS, Part, ball_before_body, disc_over_plane, random_layout, shoot, sphere_lights, write_shot
 
 SIDE = 64
 
@@ -67,6 +68,14 @@ def test_a_part_whose_shadow_meets_no_other_has_an_unknown_step(tmp_path):
     assert any("step to 1 large part of the object is unknown" in sentence for sentence in report["warnings"])
 
 
+def test_the_warnings_tell_shadows_that_contradict_each_other_from_none():
+    parts = [PlacedPart(900, (9, 9), None, True), PlacedPart(200, (1, 2), None, False, 0.5), PlacedPart(100, (3, 4), None, False)]
+    none, contradiction = Placement(np.zeros((1, 1), np.float32), parts).warnings()
+    assert "(3, 4)" in none and "no shadow falls across the break" in none
+    assert "(1, 2)" in contradiction and "contradict each other by 50%" in contradiction
+    assert parts[1].facts()["contradiction"] == 0.5 and "contradiction" not in parts[2].facts()
+
+
 @pytest.mark.parametrize("radius", [0.08, 0.11])
 def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_path):
     """Three pixels in radius, so that normals turn by 20 to 30° from pixel to pixel. Cut at all of these turns, nothing of it was a part.
@@ -96,6 +105,27 @@ def test_no_part_is_placed_by_the_shadows_of_one_that_has_no_place(slope, tmp_pa
     error = maps.height - shot.z
     hole = np.median(error[maps.part == 3]) - np.median(error[maps.part == 1])
     assert abs(hole) < 0.05  # it stays where it meets its neighbours in the mean; it was off by 1.9
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "hole"])  # a disc with a hole may be joined to the body without a word
+@pytest.mark.parametrize("seed", [11, 12])
+def test_steps_of_random_layouts_are_right_within_their_sigma(kind, seed, tmp_path):
+    """Two layouts of each kind that nothing was chosen on.
+
+    Tolerance: two σ, and a pixel of the image, 2.4 / 80: shapes of robust normals err by half of one. A step that is open is called so.
+    """
+    shot = random_layout(kind, seed).shoot(side=80)
+    maps, report = solved(shot, tmp_path)
+    error = maps.height - shot.z
+    for part in range(shot.part.max()):
+        mine = np.bincount(maps.part[shot.part == part].astype(int)).argmax()
+        placed = report["parts"][mine - 1]
+        if placed["status"] == "known":
+            step = np.median(error[shot.part == part]) - np.median(error[shot.part == shot.part.max()])
+            assert abs(step) < min(2.4 / 80, 2 * placed["sigma"])
+        else:
+            assert placed["status"] == "unknown" and kind != "ball"
 
 
 def test_an_object_without_a_break_has_no_parts(tmp_path):

@@ -49,8 +49,9 @@ def write(folder, groups: dict[str, np.ndarray], **changes):
     return folder
 
 
-def solve(relit, folder, *arguments):
-    relit.done("solve", folder, "--out", folder / "out", *arguments)
+def solve(relit, folder, *arguments, code=0):
+    outcome = relit("solve", folder, "--out", folder / "out", *arguments)
+    assert (outcome.code, outcome.err) == (code, ""), outcome
     return SurfaceMaps.read(folder / "out" / "maps.exr"), json.loads((folder / "out" / "report.json").read_text())
 
 
@@ -118,7 +119,7 @@ def test_gradient_is_the_default_for_gradient_frames(relit, tmp_path, diffuse, h
 
 def test_a_grey_object_is_taken_as_diffuse_and_the_report_says_so(relit, tmp_path, diffuse):
     write(tmp_path, {"none": np.repeat(diffuse[..., :1], 3, axis=-1)})
-    maps, report = solve(relit, tmp_path)
+    maps, report = solve(relit, tmp_path, code=1)  # all are ambiguous
     assert maps.specular_normal is None
     assert report["found"]["pixels_taken_as_diffuse"] == report["pixels"]["ambiguous"] == SCENE.mask.sum()
     assert angles_degrees(maps.normal, SCENE.normal)[SCENE.mask].max() < 0.08

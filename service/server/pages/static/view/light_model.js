@@ -69,6 +69,11 @@ export class LightModel {
     return found;
   }
 
+  /** Return the coefficients [tiles, terms, 3] of the sum of the captured images, each times a weight in each channel. */
+  ofCaptured(weights) {
+    return weights.reduce((found, weight, light) => this.#add(found, light, weight), new Float32Array(this.each));
+  }
+
   /** Return the coefficients [tiles, terms, 3] of a captured image. */
   capturedImage(light) {
     return this.#add(new Float32Array(this.each), light, [1, 1, 1]);

@@ -1,0 +1,196 @@
+"""An estimate for a GPU that is not at hand, from what products ask of a device and from published speeds: a section of docs/figures.md.
+
+    python -m benchmarks.device_estimate svbrdf 48 1 counted   # what one small scene asks, as JSON; or timed
+
+What is asked of the device is counted on an emulated one (tests/emulated_device.py). Small scenes stand for 12 megapixels: all limits of
+memory are made small in the same ratio, so that bands, batches and chunks of frames, and so launches and waits, are as many. Bytes, and the
+processor seconds of a run on the CPU of this machine, are a + b · pixels, and with frames (a + b · pixels) + frames · (c + d · pixels),
+from two sizes and two counts of frames.
+"""
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks.gpu.work import launches_run_by
+from kernels import device as devices
+from service.requests.solve import Method
+from tests import device_ways, emulated_device
+
+PIXELS = 12_000_000
+LEAST_BYTES, LEAST_PIXELS = 16 << 20, 1 << 15
+"""Constants of the product below these are no limits of memory."""
+COUNTED_SIDES, TIMED_SIDES = (24, 48), (96, 288)
+PRODUCT_SIDE = 2048
+"""Side of the matrices by whose product the speed of a core is measured."""
+
+
+class Published(NamedTuple):
+    """Published speeds of a device and of its link."""
+
+    name: str
+    memory_bytes: float
+    bytes_per_s: float
+    operations_per_s: float
+    """In float32, an addition and a multiplication being two."""
+    pinned_per_s: float
+    pageable_per_s: float
+    launch_s: float
+
+
+H200 = Published("H200 SXM", 141e9, 4.8e12, 67e12, 55e9, 12e9, 3e-6)
+SOURCES = ("Memory, its bandwidth and float32 operations: NVIDIA H200 Tensor Core GPU datasheet (2024). The link, PCIe 5.0 × 16, carries "
+           "63 GB/s each way (PCI-SIG); copies reach some 55 GB/s from pinned and 12 GB/s from pageable memory. A launch takes 2 to 4 µs "
+           "(NVIDIA, \"Getting started with CUDA graphs\", 2019).")
+
+
+class Work(NamedTuple):
+    """What is estimated, and the seconds that it may take."""
+
+    title: str
+    run: Callable[[int], Callable[..., object]]
+    """Returns a run of tests.device_ways that makes so many frames."""
+    frames: int | None
+    """None: there are no frames."""
+    tried: tuple[int, ...]
+    """Counts of frames of the small runs."""
+    bar_s: float
+
+
+WORKS = {
+    "svbrdf": Work("`svbrdf`, 12 megapixels × 96 lights", lambda _: device_ways.solving(Method.SVBRDF), None, (1,), 60.0),
+    "guided": Work("240 guided frames of 12 megapixels, 96 lights", lambda frames: device_ways.relighting(guided=True, frames=frames), 240,
+                   (2, 4), 150.0),
+}
+
+
+def shrink_limits(ratio: float) -> None:
+    """Make the limits of memory of the product and of the emulated device small, for the rest of the process."""
+    emulated_device.MEMORY = int(H200.memory_bytes * ratio)
+    for module in [found for name, found in sys.modules.items() if name.partition(".")[0] in ("kernels", "service", "stage")]:
+        for name, value in vars(module).items():
+            least = LEAST_BYTES if name.endswith("_BYTES") else LEAST_PIXELS if name.endswith("_PIXELS") else math.inf
+            if isinstance(value, int) and value >= least:
+                setattr(module, name, max(1, int(value * ratio)))
+
+
+@contextmanager
+def timed_launches() -> Iterator[list[float]]:
+    """Yield the processor seconds that launches on the CPU take from here on, which then run one after another."""
+    taken = [0.0]
+
+    def run(recorded: devices.Recorded) -> None:
+        began = time.thread_time()
+        for command in recorded._commands:
+            command.launch()
+        taken[0] += time.thread_time() - began
+
+    with launches_run_by(run):
+        yield taken
+
+
+def measure(work: Work, side: int, frames: int, *, counted: bool) -> dict[str, float]:
+    """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU."""
+    devices.names()
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        device_ways.distant(folder, side)
+        run = work.run(frames)
+        if counted:
+            emulated_device.install()
+        else:
+            run(folder, folder / "warm", "cpu", device_ways.Counting())  # compiles what is not cached
+            shutil.rmtree(folder / "capture" / ".relit")  # decoding is part of the work
+        if counted:
+            shrink_limits(side * side / PIXELS)
+            before = emulated_device.counts.copy()
+            run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
+            return {name: emulated_device.counts[name] - before[name] for name in emulated_device.COUNTED}
+        with timed_launches() as taken:
+            began = time.process_time()
+            run(folder, folder / "out", "cpu", device_ways.Counting())
+            return {"kernels": taken[0], "host": time.process_time() - began - taken[0]}
+
+
+def at_full_size(name: str) -> dict[str, float]:
+    """Return the quantities of a work at its full size, each fitted to small runs in processes of their own."""
+    work, found = WORKS[name], {}
+    for counted, sides in ((True, COUNTED_SIDES), (False, TIMED_SIDES)):
+        runs = {(side, frames): json.loads(subprocess.run(
+            [sys.executable, "-m", __name__, name, str(side), str(frames), "counted" if counted else "timed"], check=True,
+            capture_output=True, text=True).stdout) for side in sides for frames in work.tried}
+        for quantity in next(iter(runs.values())):
+            known = {of: run[quantity] for of, run in runs.items()}
+            if quantity in ("launches", "waits"):
+                pixels = [known[sides[-1], frames] for frames in work.tried]
+            else:
+                pixels = [_line([side * side for side in sides], [known[side, frames] for side in sides], PIXELS) for frames in work.tried]
+            found[quantity] = pixels[0] if work.frames is None else _line(work.tried, pixels, work.frames)
+    return found
+
+
+def _line(at: Sequence[int], values: Sequence[float], wanted: int) -> float:
+    """Return the value at a place on the line through two points, or the larger value if it falls."""
+    return max(values[0] + (values[1] - values[0]) * (wanted - at[0]) / (at[1] - at[0]), max(values))
+
+
+def core_speed() -> float:
+    """Return the float32 operations that one core of this machine does in a second, in a matrix product by NumPy's BLAS."""
+    a = np.ones((PRODUCT_SIDE, PRODUCT_SIDE), dtype=np.float32)
+    a @ a
+    began = time.process_time()
+    a @ a
+    return 2 * PRODUCT_SIDE**3 / (time.process_time() - began)
+
+
+def estimate_rows(device: Published = H200) -> list[str]:
+    """Return the section as lines of Markdown."""
+    speed = core_speed()
+    columns = [_column(work, at_full_size(name), speed, device) for name, work in WORKS.items()]
+    return [f"Not measured: an estimate for one {device.name}. Nothing is taken to overlap. Its terms:", "",
+            "- copies: bytes between host and device over the speed of the link",
+            "- launches: their number, and that of the reads that wait for the device, times the time of a launch",
+            "- memory: bytes of all arrays that launches were given, over the bandwidth",
+            "- arithmetic: processor seconds of the kernels on the CPU of this machine, times the float32 operations of a core of it "
+            f"({speed / 1e9:.0f} · 10⁹/s in a matrix product) over those of the device: both are taken to reach the same part of their "
+            "best",
+            "- host: processor seconds of everything else on this machine, as if one core did it: decoding, files, and the mathematics "
+            "that is not on the device", "",
+            f"{SOURCES} Counts are those of scenes of {' and '.join(map(str, COUNTED_SIDES))} pixels squared on the emulated device, "
+            f"seconds of {' and '.join(map(str, TIMED_SIDES))} pixels squared, continued in a line to the full size. For the counts all "
+            "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size.", "",
+            *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
+
+
+ROWS = ("", "---", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits", "copies, pinned memory, s",
+        "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, s", "**all**, with pageable copies, s", "bar, s")
+
+
+def _column(work: Work, asked: dict[str, float], speed: float, device: Published) -> list[str]:
+    """Return the cells of a work, in the order of ROWS."""
+    moved, captured = asked["up"] + asked["down"], PIXELS * device_ways.LIGHTS * 3 * device_ways.HALF
+    terms = [moved / device.pageable_per_s, (asked["launches"] + asked["waits"]) * device.launch_s, asked["touched"] / device.bytes_per_s,
+             asked["kernels"] * speed / device.operations_per_s, asked["host"]]
+    return [work.title, "---", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.0f}",
+            f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
+            f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
+
+
+def main() -> None:
+    """Run one small scene, for at_full_size."""
+    name, side, frames, kind = sys.argv[1:]
+    print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted")))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,288 @@
+"""Take a capture shot by shot: lamps, settling, picture, checks, files; and leave the lamps dark however it ends."""
+
+import shlex
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup, open_camera
+from service.acquisition.capture_files import CaptureFiles
+from service.acquisition.checks.fault import Fault, FaultKind
+from service.acquisition.checks.judge import FULL_SCALE, Judge
+from service.acquisition.journal import Journal
+from service.acquisition.lights.lights import Ask, Lights
+from service.acquisition.plans.plan import Plan, read_plan
+from service.acquisition.plans.shots import TRACKING, Shot, shots_of
+from service.acquisition.projector import Projector
+from service.errors import RequestError
+from service.play.play import ended_by_signals
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import REPORT_FILE, report
+from service.requests.acquire import AcquireRequest
+from stage.files import write_text
+from stage.formats import images
+from stage.importers.layout import color_space_of
+from stage.patterns.base import UniformPattern
+from stage.rig.controllers import Controllers
+from stage.rig.cues import rig_digest
+from stage.rig.rig import Rig, read_rig
+from stage.stack import fingerprint
+
+SPOOL = ".spool"
+"""The folder, in that of the capture, of files that are not of the capture yet."""
+LATE_POLL_S = 0.05
+"""The time between two looks for pictures that are late."""
+NO_LAMPS = Rig.model_construct(schema_="relit.rig/1", name="no lamps", color_space="lin_rec709_scene", subject_m=(0.0, 0.0, 0.0),
+                               controllers=Controllers(), camera=None, lights=())
+"""The rig of a capture under a projector alone."""
+
+
+class AcquireResult(NamedTuple):
+    """What was taken."""
+
+    path: Path
+    """The folder of the capture."""
+    taken: int
+    """Number of pictures that were taken in this run."""
+    there: int
+    """Number of shots of the plan that have a picture."""
+    shots: int
+    """Number of shots of the plan."""
+    faults: tuple[Fault, ...]
+    """Faults of the pictures that the capture has, and of shots without a picture."""
+    retaken: tuple[Fault, ...]
+    """Faults for which pictures were taken again."""
+    own_s: tuple[float, ...]
+    """Seconds that each picture of this run took beside settling, exposure and transfer."""
+
+
+class Acquisition:
+    """One run of a capture."""
+
+    def __init__(self, request: AcquireRequest, ask: Ask, tell: Ask = print, progress: Progress | None = None) -> None:
+        """Read the plan and the rig, and open the journal and the camera; no lamp is switched yet.
+
+        Args:
+            ask: asks a person to do something, and returns when it is done.
+            tell: tells a person something, and returns at once.
+
+        Raises:
+            RequestError: an option cannot be used, the folder holds another capture, or the camera cannot be opened.
+            StageError: the plan or the rig is wrong; names file and field.
+        """
+        self._request, self._ask, self._tell, self._timings = request, ask, tell, Timings(progress)
+        self._projector: Projector | None = None
+        self.rig: Rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
+        self.plan: Plan = read_plan(request.plan)
+        self.shots: tuple[Shot, ...] = shots_of(self.plan, self.rig, request.projector)
+        head = {"plan": self.plan.model_dump(mode="json", by_alias=True), "rig": rig_digest(self.rig), "camera": request.camera}
+        self.journal = Journal(request.out, head)
+        self._camera: Camera = open_camera(request.camera, Setup(
+            request.out / SPOOL, request.timeout, tuple(shlex.split(request.trigger or "")),
+            None if self.journal.known is None else frozenset(self.journal.known)))
+        if self.journal.known is None:
+            self.journal.begin(self._camera.present())
+        self._files = CaptureFiles(request.out, self.rig, self.shots, request.color_space, request.saturation)
+        self.judge = Judge(self.rig)
+        self.faults: dict[str, list[Fault]] = {}
+        """The faults of each shot's picture, or of its absence, by the key of the shot."""
+        self.retaken: list[Fault] = []
+        """The faults of pictures that were taken again, and of pictures that came late."""
+        self._own: list[float] = []
+
+    def run(self, stop: threading.Event | None = None) -> AcquireResult:
+        """Take all pictures that are missing; ends early when `stop` is set or the program is interrupted, with the lamps dark.
+
+        Raises:
+            RequestError: the lamps or the camera do not answer any more; the pictures that were taken are kept.
+        """
+        with ended_by_signals(stop or threading.Event()) as stopping:
+            lights = None
+            try:
+                self._recall()
+                lights = Lights(self._request.rig or Path(), self.rig, self._ask)
+                self._open_projector()
+                self._adopt()
+                if 0 < len(self.journal.taken) < len(self.shots):
+                    self._compare(lights)
+                self._timings.stage("capture", len(self.shots))
+                for number, shot in enumerate(self.shots, start=1):
+                    if shot.key not in self.journal.taken:
+                        self._take(shot, lights, stopping)
+                    if stopping.is_set():
+                        break
+                    self._timings.advance(number)
+                else:
+                    self._review(lights, stopping)
+            finally:
+                self._close(lights)
+        faults = tuple(fault for found in self.faults.values() for fault in found)
+        self._report(faults)
+        return AcquireResult(self._request.out, len(self._own), len(self.journal.taken), len(self.shots), faults, tuple(self.retaken),
+                             tuple(self._own))
+
+    def _open_projector(self) -> None:
+        """Serve the projector's page if a pattern is still to be shown, and wait for its window."""
+        request = self._request
+        if request.projector is not None and any(shot.pattern is not None and shot.key not in self.journal.taken for shot in self.shots):
+            self._projector = Projector(request.projector, request.projector_port, request.gamma, request.timeout, request.out / SPOOL)
+            self._tell(f"open {self._projector.address} in a browser on the projector's screen, and click into it")
+            self._projector.wait()
+
+    def _light(self, shot: Shot, lights: Lights) -> None:
+        """Switch the lamps of a shot, and show its pattern; other shots find the projector black."""
+        lights.set(shot.levels)
+        if self._projector is not None:
+            self._projector.show(shot.pattern or UniformPattern(code="black"))
+
+    def _recall(self) -> None:
+        """Take note of the pictures that an earlier run has taken."""
+        for shot in self.shots:
+            line = self.journal.taken.get(shot.key)
+            if line is None:
+                continue
+            path = self._request.out / line["file"]
+            self.faults[shot.key] = [Fault(shot.key, FaultKind(kind), sentence) for kind, sentence in line.get("faults", [])]
+            self.judge.accept(shot, images.read_pixels(path), *self._encoding(path), self.faults[shot.key])
+
+    def _adopt(self) -> None:
+        """Take the picture that came after an earlier run had released the camera and before it recorded the picture."""
+        released, left = self.journal.released, self._camera.unasked()
+        shot = next((shot for shot in self.shots if released is not None and shot.key == released["shot"]), None)
+        if shot is None or released is None or not left or shot.key in self.journal.taken:
+            return
+        picture = Picture(left[0], images.read_pixels(left[0]))
+        if faults := self.judge.judge(shot, picture.pixels, *self._encoding(picture.path)):
+            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, released["attempt"]), **_said(faults)})
+        else:
+            self._accept(shot, picture, [])
+
+    def _compare(self, lights: Lights) -> None:
+        """Take the last tracking picture of an earlier run again, or else its last picture, and refuse to go on if something has moved."""
+        there = [shot for shot in self.shots if shot.key in self.journal.taken]
+        shot = next((shot for shot in reversed(there) if shot.name.endswith(TRACKING)), there[-1])
+        self._light(shot, lights)
+        time.sleep(self.plan.settle_s)
+        try:
+            picture = self._camera.take(shot.exposure_s)
+        except NoPictureError as error:
+            raise RequestError(f"the camera does not answer: {error}") from error
+        self.journal.picture(shot.key, "compared", {"source": picture.path.name})
+        earlier = images.read_pixels(self._request.out / self.journal.taken[shot.key]["file"])
+        fault = self.judge.compare(shot, earlier, picture.pixels, *self._encoding(picture.path))
+        if fault is not None:
+            raise RequestError(f"{self._request.out}: {fault.sentence} since {shot.key} was taken: put it back, or give another folder to "
+                               "--out and begin again")
+
+    def _take(self, shot: Shot, lights: Lights, stopping: threading.Event) -> None:
+        """Take the picture of a shot, again where it has a fault, and keep the last one."""
+        if shot.prompt is not None:
+            self._ask(shot.prompt)
+        owed = 0  # releases whose picture has not come
+        for attempt in range(1, self._request.retakes + 2):
+            began = time.perf_counter()
+            self._light(shot, lights)
+            if stopping.wait(self.plan.settle_s):
+                return
+            for path in self._camera.unasked():
+                self._notice(Fault(shot.key, FaultKind.LATE, f"{path.name} came when no picture was asked for"), path)
+            self.journal.release(shot.key, attempt)
+            released = time.perf_counter()
+            try:
+                picture = self._camera.take(shot.exposure_s)
+            except NoPictureError as error:
+                owed += 1
+                missing = Fault(shot.key, FaultKind.MISSING, str(error))
+                self.faults[shot.key] = [missing]
+                self.retaken.append(missing)
+                continue
+            came = time.perf_counter()
+            if owed:
+                self._await(shot, owed, stopping)
+                owed = 0
+            faults = self.judge.judge(shot, picture.pixels, *self._encoding(picture.path))
+            if faults and attempt <= self._request.retakes:
+                self.retaken += faults
+                self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
+                continue
+            self._accept(shot, picture, faults)
+            self._own.append(released - began - self.plan.settle_s + time.perf_counter() - came)
+            return
+
+    def _await(self, shot: Shot, owed: int, stopping: threading.Event) -> None:
+        """Wait for pictures that are late, while the lamps shine for which they were asked, so that none is taken for another shot's."""
+        until = time.monotonic() + self._request.timeout
+        while owed > 0 and time.monotonic() < until and not stopping.wait(LATE_POLL_S):
+            for path in self._camera.unasked():
+                self._notice(Fault(shot.key, FaultKind.LATE, f"{path.name} came late"), path)
+                owed -= 1
+
+    def _notice(self, fault: Fault, path: Path) -> None:
+        """Record a picture that no shot has."""
+        self.retaken.append(fault)
+        self.journal.picture(fault.shot, "unasked", {"source": path.name, **_said([fault])})
+
+    def _encoding(self, path: Path) -> tuple[str, float]:
+        """Return the colour space of a picture, and the value from which its readings are clipped."""
+        return self._request.color_space or color_space_of(path), self._request.saturation or FULL_SCALE
+
+    def _accept(self, shot: Shot, picture: Picture, faults: list[Fault]) -> None:
+        self.judge.accept(shot, picture.pixels, *self._encoding(picture.path), faults)
+        self.faults[shot.key] = faults
+        self.journal.picture(shot.key, "taken", {**self._files.keep(shot, picture.path), **_said(faults)})
+        self._files.write_manifest(shot.folder, self.journal.taken)
+
+    def _review(self, lights: Lights, stopping: threading.Event) -> None:
+        """Take those pictures again, the worst first, in which all of them together show a fault that none showed when it came."""
+        shots = {shot.key: shot for shot in self.shots}
+        for fault in self.judge.review() if self._request.retakes else ():
+            shot, line = shots[fault.shot], self.journal.taken[fault.shot]
+            if self.faults.get(shot.key) or stopping.is_set():
+                continue
+            self.retaken.append(fault)
+            self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line, 0), **_said([fault])})
+            self.judge.forget(shot)
+            self._take(shot._replace(prompt=None), lights, stopping)
+        self.faults = {key: found for key, found in self.faults.items() if key not in self.journal.taken}  # no picture came
+        for fault in self.judge.review():
+            self.faults[fault.shot] = [fault]
+
+    def _close(self, lights: Lights | None) -> None:
+        try:
+            if lights is not None:
+                lights.close()
+        finally:
+            if self._projector is not None:
+                self._projector.close()
+            self._camera.close()
+
+    def _report(self, faults: tuple[Fault, ...]) -> None:
+        """Write report.json of the capture."""
+        missing = [shot.key for shot in self.shots if shot.key not in self.journal.taken]
+        own = {"median": round(1e3 * float(np.median(self._own)), 1)} if self._own else {}
+        rig = self._request.rig
+        inputs = {} if rig is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
+        text = report(self._request, inputs=inputs,
+                      rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots), pictures=len(self.journal.taken),
+                      missing=missing, faults=[fault._asdict() for fault in faults],
+                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own, seconds=self._timings.close())
+        write_text(self._request.out / REPORT_FILE, text)
+
+
+def acquire(request: AcquireRequest, ask: Ask, tell: Ask = print, progress: Progress | None = None, stop: threading.Event | None = None
+            ) -> AcquireResult:
+    """Take a capture, or go on with one; see `Acquisition`."""
+    return Acquisition(request, ask, tell, progress).run(stop)
+
+
+def refuse_to_ask(what: str) -> None:
+    """Refuse what a person would have to do, where nobody can be asked."""
+    raise RequestError(f"somebody must act: {what}: start the capture from a terminal")
+
+
+def _said(faults: list[Fault]) -> Mapping[str, Any]:
+    return {"faults": [[str(fault.kind), fault.sentence] for fault in faults]} if faults else {}

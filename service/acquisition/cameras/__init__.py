@@ -1,0 +1,1 @@
+"""Cameras that take pictures on request; a module for each kind."""

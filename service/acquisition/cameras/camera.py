@@ -1,0 +1,85 @@
+"""The interface that every camera has, and how one is named on the command line."""
+
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from service.errors import RequestError
+
+KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device"}
+"""The module of each kind of camera, KIND or KIND:DETAIL. A new one is a module with a function `open_camera(detail, setup)`, and an entry
+here."""
+
+
+class NoPictureError(Exception):
+    """No picture came in time."""
+
+
+class Picture(NamedTuple):
+    """A picture that a camera took."""
+
+    path: Path
+    """The file, which stays where it is."""
+    pixels: np.ndarray
+    """[rows, cols, 3] float32 or float16, the recorded values: integers as fractions of full scale."""
+
+
+class Setup(NamedTuple):
+    """What a camera is told when it is opened."""
+
+    spool: Path
+    """A folder for the files of cameras that do not write them into one themselves."""
+    timeout_s: float
+    """The longest time from the release to the whole file, beside the exposure."""
+    trigger: tuple[str, ...]
+    """The program that releases a camera whose folder is watched, with its arguments; empty: a person or another program does."""
+    known: frozenset[str] | None
+    """The names of files of a watched folder that were there before the capture began, or belong to its pictures; None: all that are
+    there."""
+
+
+class Camera(Protocol):
+    """A camera that takes one picture after another; all its settings stay as they are but the exposure time."""
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Return the settings that decide what a picture looks like, by name; those that cannot be read are left out."""
+
+    def present(self) -> list[str]:
+        """Return the names of the files that are known: those that were there when the camera was opened, or were told then."""
+
+    def take(self, exposure_s: float | None) -> Picture:
+        """Take a picture and wait for it.
+
+        Args:
+            exposure_s: the exposure time; None: the one that the camera has.
+
+        Raises:
+            NoPictureError: no picture came in time.
+            RequestError: the camera does not answer, or cannot be set to the exposure.
+        """
+
+    def unasked(self) -> list[Path]:
+        """Return the pictures that came without being asked for since the last one, as late ones do; they are not told again."""
+
+    def close(self) -> None:
+        """Let go of the camera."""
+
+
+def open_camera(given: str, setup: Setup) -> Camera:
+    """Return the camera that a text names, such as watch:/mnt/tether/*.jpg.
+
+    Raises:
+        RequestError: there is no such kind of camera, a package or the camera is missing, or it is in an automatic mode.
+    """
+    kind, _, detail = given.partition(":")
+    if kind not in KINDS:
+        raise RequestError(f"--camera {given}: there is no kind of camera {kind}: give one of {', '.join(KINDS)}")
+    try:
+        adapter = import_module(f"service.acquisition.cameras.{KINDS[kind]}")
+    except ModuleNotFoundError as error:
+        raise RequestError(f"--camera {given}: needs the package {error.name}, which is not installed: pip install 'relit[set]'") from error
+    camera: Camera = adapter.open_camera(detail, setup)
+    return camera

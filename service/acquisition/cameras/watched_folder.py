@@ -1,0 +1,104 @@
+"""A camera whose pictures another program writes into a folder, as tethering programs do."""
+
+import subprocess
+import time
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from service.acquisition.cameras.camera import NoPictureError, Picture, Setup
+from service.errors import RequestError
+from stage.errors import ImageError, storage
+from stage.formats import images
+
+POLL_S = 0.01
+"""The time between two looks at the folder."""
+
+
+class WatchedFolder:
+    """Takes new files of a folder for pictures, in the order in which they come."""
+
+    def __init__(self, folder: Path, pattern: str, setup: Setup) -> None:
+        if not folder.is_dir():
+            raise RequestError(f"--camera watch:{folder}: there is no such folder: give the one into which the tethering program writes")
+        self._folder, self._pattern, self._setup = folder, pattern, setup
+        self._known = {path.name for path in self._files()} if setup.known is None else set(setup.known)
+        self.settings: dict[str, str] = {}
+
+    def present(self) -> list[str]:
+        """Return the names of the files that are known."""
+        return sorted(self._known)
+
+    def take(self, exposure_s: float | None) -> Picture:
+        """Release the camera, where a program does it, and wait for the next file."""
+        if exposure_s is not None and not self._setup.trigger:
+            raise RequestError("exposures_s: a watched folder without --trigger cannot set an exposure time")
+        self._release(exposure_s)
+        until = time.monotonic() + self._setup.timeout_s + (exposure_s or 0.0)
+        sizes: dict[str, int] = {}
+        while time.monotonic() < until:
+            for path in self._new():
+                size = path.stat().st_size
+                if size > 0 and sizes.get(path.name) == size and (pixels := _whole(path)) is not None:
+                    self._known.add(path.name)
+                    return Picture(path, pixels)
+                sizes[path.name] = size
+            time.sleep(POLL_S)
+        if sizes:
+            raise NoPictureError(f"{self._folder / next(iter(sizes))} was begun and is no whole image")
+        raise NoPictureError(f"no file came into {self._folder} within {self._setup.timeout_s:g} s")
+
+    def unasked(self) -> list[Path]:
+        """Return the files that came without being asked for."""
+        found = self._new()
+        self._known.update(path.name for path in found)
+        return found
+
+    def close(self) -> None:
+        """Do nothing."""
+
+    def _release(self, exposure_s: float | None) -> None:
+        if not self._setup.trigger:
+            return
+        command = [part.replace("{exposure_s}", "" if exposure_s is None else f"{exposure_s:g}") for part in self._setup.trigger]
+        try:
+            subprocess.run(command, check=True, timeout=self._setup.timeout_s + (exposure_s or 0.0), capture_output=True, text=True)
+        except FileNotFoundError as error:
+            raise RequestError(f"--trigger {command[0]}: there is no such program") from error
+        except subprocess.TimeoutExpired as error:
+            raise RequestError(f"--trigger {' '.join(command)}: did not end within {error.timeout:g} s") from error
+        except (subprocess.CalledProcessError, OSError) as error:
+            said = " ".join(str(getattr(error, "stderr", "") or error).split())[:200]
+            raise RequestError(f"--trigger {' '.join(command)}: failed: {said}") from error
+
+    def _files(self) -> list[Path]:
+        """Return the images of the folder, those first that were changed first; hidden ones are left out."""
+        with storage("read", self._folder):
+            found = []
+            for path in self._folder.iterdir():
+                if not path.name.startswith(".") and fnmatch(path.name, self._pattern) and path.suffix.lower() in images.SUFFIXES:
+                    try:
+                        found.append((path.stat().st_mtime_ns, path))
+                    except FileNotFoundError:  # a temporary name, which has just got its own
+                        continue
+            return [path for _, path in sorted(found)]
+
+    def _new(self) -> list[Path]:
+        return [path for path in self._files() if path.name not in self._known]
+
+
+def _whole(path: Path) -> np.ndarray | None:
+    """Return the pixels of a file, or None if it is not a whole image yet."""
+    try:
+        return images.read_pixels(path)
+    except ImageError:
+        return None
+
+
+def open_camera(detail: str, setup: Setup) -> WatchedFolder:
+    """Return the camera of FOLDER, or of the files in it that match, FOLDER/*.jpg."""
+    if not detail:
+        raise RequestError("--camera watch: give the folder, as in watch:/mnt/tether")
+    path = Path(detail)
+    return WatchedFolder(path.parent, path.name, setup) if any(sign in path.name for sign in "*?[") else WatchedFolder(path, "*", setup)

@@ -1,0 +1,362 @@
+"""The pictures of a capture, judged as they come and once more when all are there.
+
+A picture is compared with what it should be: under one lamp, the prediction from the lamps around it; under several, the median of those of
+the same levels. Lamps that light next to nothing of the object, as those behind it, show no fault and are not judged.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from service.acquisition.checks.fault import Fault, FaultKind
+from service.acquisition.checks.motion import Bands, Motion, bands_of, motion_between
+from service.acquisition.checks.prediction import LEAST_LAMPS, prediction_weights, rough_weights
+from service.acquisition.checks.sample import Sample, place_of_tile, sample_of
+from service.acquisition.plans.shots import Shot
+from stage.rig.rig import Rig
+
+FULL_SCALE = 0.995
+"""A reading above this part of full scale is clipped."""
+CLIPPED_SHARE = 0.03
+"""The largest share of the pixels that are not dark that may be clipped: highlights of a glossy object are."""
+LEAST_BRIGHT = 0.03
+"""The least that the brightest thousandth of a picture reads under several lamps, as a part of full scale."""
+LEAST_LIGHT = 0.05
+"""A lamp is judged if it gives, or should give, this part of the light that lamps give on the average."""
+UNLIT_PART = 0.03
+"""A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
+SAME_PART = 0.2
+"""Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
+LEAST_MISFIT, AGREEMENT_WEIGHT = 1e-4, 4.0
+"""A misfit below the first is as good as none; a correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
+NEAR_COSINE = 0.3
+"""Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
+MOVED_PX, MOVED_GAIN, MOVED_CORRELATION = 1.5, 1.6, 0.35
+"""A picture has moved if it fits better by this factor, and as well as this, at a shift of more pixels."""
+BLURRED_CONTRAST, BLURRED_MATCH = 0.75, 0.5
+"""A picture is out of focus if its details have less contrast, and match the expected ones by less: other light lowers one alone."""
+AMBIENT_PART = 0.1
+"""The part of the mean picture under one lamp that may be added to a prediction before light that is not the rig's is on."""
+INSIDE_GAIN, BORDER_AMBIENT_PART = 1.3, 0.3
+"""The same part where lamps are on one side only: the sum of the sizes of weights, 1 within them, grows with the extrapolation."""
+AMBIENT_GAIN = 1.1
+"""Pictures of equal levels may have this factor of the light of the others."""
+SHADE_QUANTILE, DARK_PART = 0.1, 0.1
+"""What a dark picture may read above the darkest tenth of the readings under lamps, as a part of their mean."""
+EXPECTED_GAIN = 0.02
+"""The weight, over that of the picture, with which the part of the prediction is held at 1: under lamps near the camera the
+prediction is like the usual picture, and the two parts could stand for one another."""
+SHADE_PART = 0.1
+"""The reading, as a part of the mean one, below which errors of the prediction count no less."""
+LEAST_WEIGHT = 1e-3
+"""Pictures with less weight are left out of a prediction."""
+
+CERTAIN = (FaultKind.DOUBLED, FaultKind.CLIPPED, FaultKind.DARK)
+"""What a picture shows by itself."""
+
+
+class _Seen(NamedTuple):
+    """A picture that a shot has."""
+
+    shot: Shot
+    sample: Sample
+    root: np.ndarray  # [blocks] the square roots of the sample's blocks, of unit length: highlights count little
+    bands: Bands
+    faults: tuple[Fault, ...]
+
+
+class Judge:
+    """Judges pictures against those that were taken before."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._directions = rig.directions
+        self._place: tuple[int, int] | None = None
+        self._seen: dict[str, _Seen] = {}
+        self._digests: dict[bytes, str] = {}
+        self._latest: tuple[np.ndarray, _Seen] | None = None
+
+    def judge(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> list[Fault]:
+        """Return the faults of a picture that has just come.
+
+        Args:
+            pixels: [rows, cols, 3] recorded values, integers as fractions of full scale.
+            space: the colour space of the picture.
+            full_scale: the recorded value from which readings are clipped.
+        """
+        seen = self._look(shot, pixels, space, full_scale)
+        doubled = None if seen.sample.digest is None else self._digests.get(seen.sample.digest)
+        if doubled is not None:
+            return [Fault(shot.key, FaultKind.DOUBLED, f"is the picture of {doubled} again")]
+        if seen.sample.digest is not None:
+            self._digests[seen.sample.digest] = shot.key
+        found = [*self._exposure_faults(seen), *self._faults(seen, self._others(seen, self._sound()))]
+        return found[:1]
+
+    def accept(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float, faults: Sequence[Fault] = ()) -> None:
+        """Take note of the picture that a shot has from now on, with the faults that were found when it came."""
+        seen = self._look(shot, pixels, space, full_scale)
+        if seen.sample.digest is not None:
+            self._digests.setdefault(seen.sample.digest, shot.key)
+        self._seen[shot.key] = seen._replace(faults=tuple(faults))
+        self._latest = None
+
+    def forget(self, shot: Shot) -> None:
+        """Take note that a shot has no picture any more."""
+        self._seen.pop(shot.key, None)
+
+    def compare(self, shot: Shot, earlier: np.ndarray, pixels: np.ndarray, space: str, full_scale: float) -> Fault | None:
+        """Return what moved between two pictures of one shot, or None."""
+        before, after = (self._look(shot, picture, space, full_scale) for picture in (earlier, pixels))
+        return _moved(shot, motion_between(after.bands, before.bands))
+
+    def review(self) -> list[Fault]:
+        """Return the faults that all pictures together show, one for a picture, the worst first.
+
+        Pictures with faults mislead what is expected of others, so the worst is left out first, and the others are judged anew; at the end
+        each that was left out is judged against those that are sound, which also clears what was suspected before all pictures were there.
+        """
+        certain = {key: each.faults[0] for key, each in self._seen.items() if each.faults and each.faults[0].kind in CERTAIN}
+        found: dict[str, Fault] = {}
+        keys = [key for key in self._seen if key not in certain]
+        for key in keys:
+            if faults := self._dark_faults(self._seen[key], [self._seen[other] for other in keys if other not in found]):
+                found[key] = faults[0]
+        doubtful: dict[str, tuple[float, Fault]] = {}
+        affected = [key for key in keys if key not in found]
+        while True:
+            kept = [key for key in keys if key not in found]
+            for key in affected:
+                seen = self._seen[key]
+                others = self._others(seen, kept)
+                doubtful.pop(key, None)
+                if faults := self._faults(seen, others):
+                    doubtful[key] = self._misfit(seen, others), faults[0]
+            if not doubtful:
+                break
+            worst = max(doubtful, key=lambda key: doubtful[key][0])
+            found[worst] = doubtful.pop(worst)[1]
+            affected = [key for key in kept if key != worst and self._leans_on(key, worst, kept)]
+        for key in list(found):
+            seen = self._seen[key]
+            if seen.shot.levels.any():
+                others = self._others(seen, [other for other in keys if other not in found])
+                if faults := self._faults(seen, others):
+                    found[key] = faults[0]
+                elif self._weights(seen, others) is not None:
+                    del found[key]
+        return [*certain.values(), *found.values()]
+
+    def _look(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> _Seen:
+        """Return a picture as it is judged."""
+        if self._latest is not None and self._latest[0] is pixels and self._latest[1].shot is shot:
+            return self._latest[1]
+        place = self._place
+        if place is None:
+            place = place_of_tile(pixels)
+            if pixels.max() > LEAST_BRIGHT * full_scale:  # of a dark picture the place of detail is that of noise
+                self._place = place
+        sample = sample_of(pixels, place, space, full_scale)
+        seen = _Seen(shot, sample, _root(sample.blocks), bands_of(sample.tile), ())
+        self._latest = pixels, seen
+        return seen
+
+    def _exposure_faults(self, seen: _Seen) -> Iterator[Fault]:
+        shot, sample = seen.shot, seen.sample
+        if sample.clipped > CLIPPED_SHARE:
+            yield Fault(shot.key, FaultKind.CLIPPED, f"{100 * sample.clipped:.2g} % of the lit pixels are clipped")
+        if shot.lamp is None and shot.levels.any() and sample.bright < LEAST_BRIGHT:
+            dark = [each.sample.bright for each in self._seen.values() if _is_dark(each.shot)]
+            kind = FaultKind.UNLIT if dark and sample.bright < 2 * max(dark) else FaultKind.DARK
+            yield Fault(shot.key, kind, f"the brightest readings are {100 * sample.bright:.2g} % of full scale: check the lamps, or expose "
+                        "longer")
+
+    def _dark_faults(self, seen: _Seen, others: list[_Seen]) -> list[Fault]:
+        """Return the faults of a picture without any lamp: it can read no more anywhere than the others do."""
+        lamps = [each.sample.blocks for each in others if each.shot.lamp is not None and _comparable(each.shot, seen.shot)]
+        if not _is_dark(seen.shot) or len(lamps) < LEAST_LAMPS:
+            return []
+        usual = np.mean(lamps, axis=0)
+        lit = usual > 2 * SHADE_PART * usual.mean()
+        above = float((seen.sample.blocks - np.quantile(lamps, SHADE_QUANTILE, axis=0))[lit].mean() / max(float(usual[lit].mean()), 1e-30))
+        return [Fault(seen.shot.key, FaultKind.AMBIENT, f"reads {100 * above:.2g} % of the light of a lamp more than pictures under lamps "
+                      "do in the shade")] if above > DARK_PART else []
+
+    def _faults(self, seen: _Seen, others: list[_Seen]) -> list[Fault]:
+        """Return the fault that a picture shows against others, if it shows one."""
+        shot, sample = seen.shot, seen.sample
+        if not shot.levels.any() or not others:
+            return []
+        used = self._weights(seen, others)
+        usual = np.mean([each.sample.blocks for each in others], axis=0)
+        dark = self._dark(shot)
+        if used is None:
+            return self._few_faults(seen, others, dark) if len(others) + 1 < LEAST_LAMPS else []
+        expected = _blocks(used)
+        light, should = float((sample.blocks - dark).mean()), float((expected - dark).mean())
+        least = LEAST_LIGHT * float((usual - dark).mean())
+        if shot.lamp is not None:
+            should = min(should, _lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
+        if should < least:
+            return []
+        if light < UNLIT_PART * should:
+            return [Fault(shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / should):.2g} % of the light that the others predict")]
+        if shot.lamp is not None and (twin := self._twin(seen, others)) is not None:
+            return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
+        if light < least:
+            return []
+        motion = motion_between(seen.bands, _bands(used))
+        if (moved := _moved(shot, motion)) is not None:
+            return [moved]
+        if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
+            return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
+        if shot.lamp is None:
+            more = light / should - 1 if light > AMBIENT_GAIN * should else 0.0
+        else:
+            more = _added(sample.blocks, expected, usual)
+        gain = sum(abs(float(weight)) for weight, _ in used)
+        inside = shot.lamp is not None and gain < INSIDE_GAIN and self._interpolated(seen, others)
+        if more > (0.0 if shot.lamp is None else AMBIENT_PART if inside else BORDER_AMBIENT_PART):
+            return [Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")]
+        return []
+
+    def _few_faults(self, seen: _Seen, others: list[_Seen], dark: np.ndarray | float) -> list[Fault]:
+        """Return the fault of a picture under one of a few lamps, of which none is predicted."""
+        light = float((seen.sample.blocks - dark).mean())
+        usual = float(np.median([(each.sample.blocks - dark).mean() for each in others]))
+        if light < UNLIT_PART * LEAST_LIGHT * usual:
+            return [Fault(seen.shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / usual):.2g} % of the light of the others")]
+        return []
+
+    def _twin(self, seen: _Seen, others: list[_Seen]) -> str | None:
+        """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.
+
+        The farther apart two lamps are, the more their pictures differ; so the picture's differences from the other pictures tell which of
+        both lamps shone.
+        """
+        if len(others) < LEAST_LAMPS:
+            return None
+        differ = 1 - np.array([each.root for each in others]) @ seen.root
+        order = np.argsort(differ)
+        if differ[order[0]] > SAME_PART * differ[order[2]]:
+            return None
+        other, rest = others[order[0]], order[1:]
+        remaining = [others[index] for index in rest]
+        towards = self._towards(remaining)
+        here, there = (self._misfit(each, remaining) for each in (seen, other))
+        own, its = (_agreement(differ[rest], towards @ self._directions[lamp]) for lamp in (seen.shot.lamp, other.shot.lamp))
+        evidence = np.log(max(here, LEAST_MISFIT) / max(there, LEAST_MISFIT)) + AGREEMENT_WEIGHT * (its - own)
+        return other.shot.key if evidence > 0 else None
+
+    def _towards(self, pictures: list[_Seen]) -> np.ndarray:
+        """Return the directions of the lamps of pictures, [pictures, 3]."""
+        return np.asarray(self._directions[np.array([each.shot.lamp for each in pictures], dtype=np.intp)])
+
+    def _interpolated(self, seen: _Seen, others: list[_Seen]) -> bool:
+        """Return whether other lamps stand all around that of a picture."""
+        assert seen.shot.lamp is not None
+        return prediction_weights(self._directions[seen.shot.lamp], self._towards(others)) is not None
+
+    def _misfit(self, seen: _Seen, others: list[_Seen]) -> float:
+        """Return how far a picture is from what is expected of it, 0 to 1."""
+        used = self._weights(seen, others)
+        return 0.0 if used is None else 1 - float(seen.root @ _root(_blocks(used)))
+
+    def _weights(self, seen: _Seen, others: list[_Seen]) -> "list[tuple[np.float32, _Seen]] | None":
+        """Return the weights of those pictures whose sum is expected under a lamp, or None."""
+        if seen.shot.lamp is None:
+            return [(np.float32(1 / len(others)), each) for each in others] or None
+        wanted, directions = self._directions[seen.shot.lamp], self._towards(others)
+        weights = prediction_weights(wanted, directions)
+        if weights is None:
+            weights = rough_weights(wanted, directions)
+        if weights is None:
+            return None
+        return [(np.float32(weight), each) for weight, each in zip(weights, others, strict=True) if abs(weight) > LEAST_WEIGHT]
+
+    def _sound(self) -> list[str]:
+        return [key for key, each in self._seen.items() if not each.faults]
+
+    def _others(self, seen: _Seen, keys: Collection[str]) -> list[_Seen]:
+        """Return the pictures that say what another one should be: of other lamps, or of the same levels."""
+        return [each for key in keys if key != seen.shot.key and _same_kind((each := self._seen[key]).shot, seen.shot)]
+
+    def _leans_on(self, key: str, other: str, keys: Collection[str]) -> bool:
+        """Return whether what is expected of a picture depends on another one."""
+        seen = self._seen[key]
+        if not _same_kind(seen.shot, self._seen[other].shot):
+            return False
+        used = self._weights(seen, self._others(seen, keys))
+        return used is None or any(each.shot.key == other for _, each in used)
+
+    def _dark(self, shot: Shot) -> np.ndarray | float:
+        """Return the mean picture without any lamp, [blocks]; 0 where there is none."""
+        dark = [each.sample.blocks for each in self._seen.values()
+                if not each.faults and _is_dark(each.shot) and _comparable(each.shot, shot)]
+        found: np.ndarray | float = np.mean(dark, axis=0) if dark else 0.0
+        return found
+
+
+def _blocks(used: list[tuple[np.float32, _Seen]]) -> np.ndarray:
+    """Return the expected means of blocks; of equal pictures the median, which one with a fault does not mislead."""
+    if used[0][1].shot.lamp is None:
+        return np.asarray(np.median([each.sample.blocks for _, each in used], axis=0))
+    return np.maximum(np.sum([weight * each.sample.blocks for weight, each in used], axis=0), 0)
+
+
+def _bands(used: list[tuple[np.float32, _Seen]]) -> Bands:
+    """Return the expected details."""
+    if used[0][1].shot.lamp is None:
+        return Bands(*(np.median([each.bands[band] for _, each in used], axis=0) for band in (0, 1)))
+    return Bands(*(np.sum([weight * each.bands[band] for weight, each in used], axis=0) for band in (0, 1)))
+
+
+def _lower_quartile(weighted: list[tuple[np.float32, float]]) -> float:
+    """Return the value below which a quarter of the weight is."""
+    weights, values = (np.array(column)[np.argsort([value for _, value in weighted])] for column in zip(*weighted, strict=True))
+    return float(values[np.searchsorted(weights.cumsum(), 0.25 * weights.sum())])
+
+
+def _root(blocks: np.ndarray) -> np.ndarray:
+    found = np.sqrt(np.maximum(blocks, 0))
+    return np.asarray(found / max(float(np.linalg.norm(found)), 1e-30))
+
+
+def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
+    """Return the correlation of pictures' differences with the angles to their lamps, of those that are near."""
+    near = cosines > NEAR_COSINE
+    if near.sum() < 3:
+        return -1.0
+    return float(np.corrcoef(differences[near], np.arccos(np.minimum(cosines[near], 1)))[0, 1])
+
+
+def _is_dark(shot: Shot) -> bool:
+    return shot.pattern is None and not shot.levels.any()
+
+
+def _comparable(shot: Shot, other: Shot) -> bool:
+    """Return whether two shots are of the same object at the same exposure."""
+    return shot.folder == other.folder and shot.exposure_s == other.exposure_s
+
+
+def _same_kind(shot: Shot, other: Shot) -> bool:
+    """Return whether the picture of a shot says what that of another one should be."""
+    if not _comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.pattern is not None:
+        return False
+    return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)
+
+
+def _moved(shot: Shot, motion: Motion | None) -> Fault | None:
+    if motion is None or np.hypot(*motion.shift_px) < MOVED_PX or motion.gain < MOVED_GAIN or motion.correlation < MOVED_CORRELATION:
+        return None
+    return Fault(shot.key, FaultKind.MOVED, "everything is shifted by {:.0f}, {:.0f} pixels".format(*motion.shift_px))
+
+
+def _added(blocks: np.ndarray, expected: np.ndarray, usual: np.ndarray) -> float:
+    """Return the part b of the usual picture in a picture that is fitted as g expected + b usual, relative errors alike and g near 1."""
+    weight = 1 / (expected + SHADE_PART * usual.mean())
+    seen = usual > 2 * SHADE_PART * usual.mean()
+    columns, found = np.column_stack([expected * weight, usual * weight])[seen], (blocks * weight)[seen]
+    normal, right = columns.T @ columns, columns.T @ found
+    held = EXPECTED_GAIN * normal[0, 0]
+    return float(np.linalg.solve(normal + np.diag([held, 1e-9 * normal[1, 1]]), right + np.array([held, 0]))[1])

@@ -1,0 +1,87 @@
+"""The interface that every way to switch lamps has, and the lamps of a rig, each switched by the way of its address."""
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from service.errors import RequestError
+from stage.rig.rig import Rig
+
+ADAPTERS = {"sacn": "dmx", "artnet": "dmx", "serial": "serial_line", "http": "http_requests", "manual": "by_hand"}
+"""The module of each protocol of an address. A new one is a module with a function `open_switch(path, rig, ask)`, and an entry here."""
+
+Ask = Callable[[str], None]
+"""Asks a person to do something, and returns when it is done; raises RequestError where nobody can be asked."""
+
+
+class Switch(Protocol):
+    """Switches the lamps of one way; others are left alone."""
+
+    def set(self, levels: np.ndarray) -> None:
+        """Let the lamps shine at levels [emitters] of the rig, and return when they have been told.
+
+        Raises:
+            RequestError: the lamps do not answer.
+        """
+
+    def close(self) -> None:
+        """Turn the lamps dark, as far as they can be reached, and let go of the line."""
+
+
+class Lights:
+    """All lamps of a rig."""
+
+    def __init__(self, path: Path, rig: Rig, ask: Ask) -> None:
+        """Open the ways to the lamps; nothing is switched yet.
+
+        Args:
+            path: of the rig, for messages.
+            ask: asks the person who holds a lamp.
+
+        Raises:
+            RequestError: a package or a device is missing.
+            ManifestError: a lamp has no address, or one that cannot be used.
+        """
+        self._switches: list[Switch] = []
+        protocols = {lamp.address.protocol for lamp in rig.lights if lamp.address is not None}
+        try:
+            for module in sorted({ADAPTERS[protocol] for protocol in protocols}):
+                try:
+                    adapter = import_module(f"service.acquisition.lights.{module}")
+                except ModuleNotFoundError as error:
+                    raise RequestError(f"{path}: lights[].address.protocol: {module.replace('_', ' ')} needs the package {error.name}, "
+                                       "which is not installed: pip install 'relit[set]'") from error
+                self._switches.append(adapter.open_switch(path, rig, ask))
+        except BaseException:
+            self.close()
+            raise
+
+    def set(self, levels: np.ndarray) -> None:
+        """Let the lamps shine at levels [emitters]."""
+        for switch in self._switches:
+            switch.set(levels)
+
+    def close(self) -> None:
+        """Turn all lamps dark, those of each way also where another one fails, and raise the first failure."""
+        refused: RequestError | None = None
+        for switch in self._switches:
+            try:
+                switch.close()
+            except RequestError as error:
+                refused = refused or error
+        self._switches.clear()
+        if refused is not None:
+            raise refused
+
+
+def lamp_levels(rig: Rig, levels: np.ndarray, protocols: Sequence[str]) -> dict[int, float]:
+    """Return the greatest level among the primaries of each lamp that has one of some protocols, by the lamp's index."""
+    found: dict[int, float] = {}
+    for (index, _), level in zip(rig.emitters, levels.tolist(), strict=True):
+        address = rig.lights[index].address
+        if address is not None and address.protocol in protocols:
+            found[index] = max(found.get(index, 0.0), level)
+    return found

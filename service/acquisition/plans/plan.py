@@ -1,0 +1,134 @@
+"""The plan of a capture, plan.json with schema relit.plan/1: the sequences of pictures that are taken one after another."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from service.errors import RequestError
+from service.requests.patterns import PatternAxis, PatternCode
+from stage.capture.light import Polarization
+from stage.model import Count, FirstFault, Fraction, NotNegative, Positive, Strict, Text
+from stage.records import read_record
+
+PLAN_SCHEMA = "relit.plan/1"
+
+
+class Sequence(Strict):
+    """What every sequence of pictures has."""
+
+    prompt: Text | None = None
+    """What a person does before the first picture, such as placing a card: the pictures wait until it is confirmed. None: nothing."""
+    exposures_s: Annotated[tuple[Positive, ...], FirstFault] = ()
+    """The exposure times of each picture, one after another; none: the one that the camera has."""
+
+
+class OlatSequence(Sequence):
+    """One picture under each lamp alone."""
+
+    take: Literal["olat"]
+    """The kind of the sequence."""
+    lights: Annotated[tuple[Text, ...], FirstFault] | None = None
+    """The names of the lamps; None: all lamps of the rig."""
+    level: Annotated[Fraction, Field(gt=0)] = 1.0
+    """The light of each lamp, a fraction of that at full level, of all its primaries alike."""
+
+
+class GradientSequence(Sequence):
+    """Pictures under spherical gradients along x, y and z, rising and falling, and under full light (Ma et al. 2007)."""
+
+    take: Literal["gradients"]
+    """The kind of the sequence."""
+    polarization: Polarization = "none"
+    """How the polariser of the camera stands to those of the lamps during the sequence."""
+
+
+class DarkSequence(Sequence):
+    """Pictures without any lamp, which are subtracted from the others."""
+
+    take: Literal["dark"]
+    """The kind of the sequence."""
+    count: Count = 1
+    """Number of pictures."""
+
+
+class FlatSequence(Sequence):
+    """A picture of an evenly lit white card under all lamps, by which the others are divided."""
+
+    take: Literal["flat"]
+    """The kind of the sequence."""
+
+
+class BallSequence(Sequence):
+    """A picture of a ball under each lamp alone, in a capture of its own, in the folder of its kind, for `relit calibrate lights`."""
+
+    take: Literal["mirror-ball", "grey-ball"]
+    """The kind of the sequence."""
+
+
+class ChartSequence(Sequence):
+    """A picture of a colour chart under all lamps, in a capture of its own, in the folder chart."""
+
+    take: Literal["chart"]
+    """The kind of the sequence."""
+
+
+class PatternSequence(Sequence):
+    """Pictures of patterns that a projector shows."""
+
+    take: Literal["patterns"]
+    """The kind of the sequence."""
+    code: PatternCode
+    """The code, as `relit patterns` has it, with its default options."""
+    axis: PatternAxis = PatternAxis.COLUMN
+    """The projector coordinate to code."""
+
+
+AnySequence = Annotated[OlatSequence | GradientSequence | DarkSequence | FlatSequence | BallSequence | ChartSequence | PatternSequence,
+                        Field(discriminator="take")]
+
+
+class Plan(Strict):
+    """The content of a plan."""
+
+    schema_: Literal["relit.plan/1"] = Field(alias="schema")
+    """The kind and version of the file."""
+    sequences: Annotated[tuple[AnySequence, ...], Field(min_length=1), FirstFault]
+    """The sequences, in the order in which they are taken."""
+    settle_s: NotNegative = 0.1
+    """The time between a change of the lamps or the pattern and the picture."""
+    tracking_every: Count | None = None
+    """A picture under full light is taken before every so many pictures of lamps, and after the last; None: none."""
+
+
+_WHITE_CARD = "put a white card in the place of the object, and let it fill the picture"
+NAMED: dict[str, tuple[AnySequence, ...]] = {
+    "olat": (OlatSequence(take="olat"),),
+    "gradients": (GradientSequence(take="gradients"),),
+    "polarised": (
+        GradientSequence(take="gradients", polarization="parallel", prompt="turn the camera's polariser parallel to those of the lamps"),
+        GradientSequence(take="gradients", polarization="cross", prompt="turn the camera's polariser across those of the lamps")),
+    "dark": (DarkSequence(take="dark"),),
+    "flat": (FlatSequence(take="flat", prompt=_WHITE_CARD),),
+    "mirror-ball": (BallSequence(take="mirror-ball", prompt="put the mirror ball in the place of the object"),),
+    "grey-ball": (BallSequence(take="grey-ball", prompt="put the grey ball in the place of the object"),),
+    "chart": (ChartSequence(take="chart", prompt="put the colour chart in the place of the object"),),
+    **{str(code): (PatternSequence(take="patterns", code=code),) for code in PatternCode},
+}
+"""The sequences that a name stands for."""
+
+
+def read_plan(given: str) -> Plan:
+    """Return the plan of a file, or of names with commas between them, such as dark,olat.
+
+    Raises:
+        RequestError: no file and no name.
+        ManifestError: the file is wrong; names file and field.
+    """
+    if Path(given).suffix == ".json" or Path(given).is_file():
+        return read_record(given, Plan, PLAN_SCHEMA)
+    names = given.split(",")
+    unknown = [name for name in names if name not in NAMED]
+    if unknown:
+        raise RequestError(f"the plan {given}: {unknown[0]} is neither a file nor one of {', '.join(NAMED)}")
+    return Plan(schema="relit.plan/1", sequences=tuple(sequence for name in names for sequence in NAMED[name]))

@@ -1,0 +1,1 @@
+"""The solution of every depth method, and what a capture needs to be triangulated."""

@@ -1,0 +1,257 @@
+"""Checks of what codes are declared to be, by the redundancy that they have: stripes follow each other, lie on the projector, and waves run
+with the stripes that number them. No calibration is needed, and scenes with edges, shadows and noise have the same redundancy.
+"""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.phase import weights
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+
+CLEAR_BIT, CLEAR_SIGMAS = 0.4, 4.0
+"""A bit is read where its contrast is this part of the largest of the pixel's bits, and this many deviations."""
+READ_SHARE = 0.5
+"""Finer bits than the first that fewer of the pixels read are left out."""
+REACH = 3
+"""Largest distance in pixels of two pixels of a row whose stripes are compared."""
+JUMP = 4.0
+"""Steps between neighbours, in the usual number of stripes, from which on they are jumps."""
+SHORTER, NO_LONGER = 0.8, 0.98
+"""The mean logarithm of the steps of another order, over that of the declared one, below which it is named, and below which it is where it
+mends jumps too."""
+PLACES, AT_A_PLACE, OF_STEPS = 3, 8, 0.01
+"""Number of places of the code at which another order of bits mends jumps, of image rows in which it does so at each, and least part of the
+steps, from which on that order is named. An edge of depth jumps between other stripes in every row."""
+MENDED = 5.0
+"""Jumps that another order mends over those that it makes."""
+BEYOND_SHARE = 0.02
+"""Share of the neighbours whose stripes lie beyond the projector, side by side, from which on its size is doubted."""
+CLEAR_WAVE = 0.4
+"""Least length of the mean of a wave's phasors over its stripes: 0.64 where stripes are half a period wide, and 1 where they are narrow."""
+SOME = 3000
+"""Number of pixels whose phasors are compared."""
+AS_DECLARED, OFFSET = (0.9, 0.7), (0.12, 0.2)
+"""Length of the mean at the declared period over the largest at any, below which another period is named, and periods by which a wave is
+offset, from which on it is doubted: with stripes up to half a period, and with wider ones, which tell less. A wave that runs backwards is
+an offset where the stripes are half a period wide and lie along the image rows."""
+
+
+class Stripes(NamedTuple):
+    """The bits of one code, in Gray code, that a sample of the pixels reads."""
+
+    bits: np.ndarray  # [bits, rows, cols] bool, the finest that is read first
+    known: np.ndarray  # [rows, cols] bool: all of them are read
+    finest: int
+    """Number of finer bits that are left out."""
+
+
+def check_codes(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
+    """Return a sentence if the stripes or the waves of a sample contradict what they are declared to be; None if they do not."""
+    for code in collected.codes:
+        if isinstance(code, BinaryCode):
+            extent = projector.resolution[0 if code.axis == "column" else 1]
+            stripes = read_stripes(sample, code, collected, noise)
+            if stripes is not None:
+                found = _check_order(stripes, code, extent) or _check_waves(sample, stripes, code, collected, noise)
+                if found is not None:
+                    return f"frames: {found}"
+    return None
+
+
+def read_stripes(sample: Sample, code: BinaryCode, collected: Collected, noise: NoiseModel) -> Stripes | None:
+    """Return the bits of a code; None without the frames that tell them, or if too few pixels read them."""
+    grey = sample.grey
+    frames = grey[list(code.frames)]
+    if code.inverses is not None:
+        others = grey[list(code.inverses)]
+    elif collected.white is not None and collected.black is not None:
+        others = np.broadcast_to(grey[collected.white] + grey[collected.black] - frames, frames.shape)
+    else:
+        return None
+    contrast = frames - others
+    largest = np.abs(contrast).max(axis=0)
+    deviation = np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(frames + others, 0))
+    lit = sample.mask.ravel() & (largest > CLEAR_SIGMAS / CLEAR_BIT * deviation.max(axis=0))
+    if sample.saturated is not None:
+        lit &= ~sample.saturated.any(axis=0)
+    if lit.sum() < ENOUGH:
+        return None
+    read = (np.abs(contrast) > np.maximum(CLEAR_BIT * largest, CLEAR_SIGMAS * deviation)) & lit
+    clear = read.sum(axis=1) >= READ_SHARE * lit.sum()
+    finest = int(np.argmin(clear[::-1])) if not clear.all() else len(clear)
+    finest = len(clear) - finest
+    if len(clear) - finest < 3:
+        return None
+    bits = contrast > 0
+    if code.name == "xor":
+        bits[code.base_bit + 1 :] ^= bits[code.base_bit]
+        if finest > code.base_bit:
+            return None
+    shape = (-1, *sample.mask.shape)
+    return Stripes(bits[finest:].reshape(shape), read[finest:].all(axis=0).reshape(shape[1:]), finest)
+
+
+def _numbers(bits: np.ndarray, *, gray: bool) -> np.ndarray:
+    """Return the number that bits [bits, …] spell, bit 0 first."""
+    if gray:
+        bits = np.logical_xor.accumulate(bits[::-1], axis=0)[::-1]
+    return np.tensordot(1 << np.arange(len(bits)), bits, 1)
+
+
+class _Pairs(NamedTuple):
+    """Neighbouring pixels of the image rows that read their stripe."""
+
+    first: np.ndarray  # [pairs] index into the flat sample
+    second: np.ndarray  # [pairs]
+    row: np.ndarray  # [pairs]
+
+    @classmethod
+    def of(cls, known: np.ndarray) -> "_Pairs":
+        """Return each pixel with the next of its row that is known, if it is near."""
+        width = known.shape[1]
+        at = np.flatnonzero(known)
+        near = (at[1:] - at[:-1] <= REACH) & (at[1:] // width == at[:-1] // width)
+        return cls(at[:-1][near], at[1:][near], at[1:][near] // width)
+
+    def steps(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the distance of their stripes, [pairs]."""
+        flat = numbers.ravel()
+        return np.asarray(np.abs(flat[self.second] - flat[self.first]))
+
+
+def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
+    """Return what bits are declared wrongly, or how wide the projector looks; None if stripes follow each other as declared."""
+    pairs = _Pairs.of(stripes.known)
+    declared = _numbers(stripes.bits, gray=code.name != "binary")
+    steps = pairs.steps(declared)
+    if len(steps) < ENOUGH:
+        return None
+    stripe_px = code.stripe_px * 2**stripes.finest
+    usual = max(float(np.median(steps[steps > 0])) if steps.any() else 1.0, 1.0)
+    jumps = steps > JUMP * usual
+    beyond = (np.minimum(*(declared.ravel()[side] for side in (pairs.first, pairs.second))) * stripe_px >= extent) & ~jumps
+    outside = beyond.sum() > max(BEYOND_SHARE * len(steps), AT_A_PLACE)
+    if steps.any():
+        orders = [("binary" if code.name == "gray" else "gray", None)] if code.name != "xor" else []
+        swaps = [] if code.name == "xor" else list(combinations(range(len(stripes.bits)), 2))
+        mended: list[tuple[float, str]] = []
+        for other, swap in [*orders, *((code.name, swap) for swap in swaps)]:
+            bits = stripes.bits
+            if swap is not None:
+                order = np.arange(len(bits))
+                order[list(swap)] = swap[::-1]
+                bits = bits[order]
+            part = _mends(_numbers(bits, gray=other != "binary"), pairs, steps, jumps, extent / stripe_px, outside=bool(outside))
+            words = (f"a {code.name} code is declared, and they follow each other as those of a {other} code: check code" if swap is None
+                     else f"they follow each other if the bits {' and '.join(str(bit + stripes.finest) for bit in swap)} are exchanged: "
+                          "check bit")
+            if part is not None:
+                mended.append((part, words))
+        if mended:
+            return f"the {code.axis} stripes jump between {jumps.sum()} neighbours; {min(mended)[1]} in the frames' patterns"
+    if outside:
+        widest = np.percentile(np.maximum(declared.ravel()[pairs.first], declared.ravel()[pairs.second])[~jumps], 99.9)
+        return (f"{100 * beyond.mean():.2g} % of the {code.axis} stripes that are seen lie beyond the {extent} px of projector.resolution: "
+                f"the projector looks {(widest + 1) * stripe_px:.0f} px large at least; check stripe_px and bit too")
+    return None
+
+
+def _mends(numbers: np.ndarray, pairs: _Pairs, declared: np.ndarray, jumps: np.ndarray, count: float, *, outside: bool) -> float | None:
+    """Return the mean logarithm of the steps under other numbers of the stripes over that under the declared ones, if the stripes follow
+    each other much better so; else None.
+
+    Args:
+        declared: [pairs] steps as declared, and `jumps` among them.
+        count: number of stripes that the projector shows.
+        outside: whether stripes lie beyond the projector as declared.
+    """
+    steps, flat = pairs.steps(numbers), numbers.ravel()
+    if (flat[pairs.first] >= count).mean() > BEYOND_SHARE or not steps.any():
+        return None
+    part = float(np.log2(1 + steps).sum() / np.log2(1 + declared).sum())
+    if part < SHORTER:
+        return part
+    usual = max(float(np.median(steps[steps > 0])), 1.0)
+    mended, made = jumps & (steps <= 2 * usual), ~jumps & (steps > JUMP * usual)
+    if part > NO_LONGER or mended.sum() < max(MENDED * made.sum(), OF_STEPS * (declared > 0).sum()) or jumps.sum() > 2 * mended.sum():
+        return None
+    place = (flat[pairs.first] + flat[pairs.second])[mended] // int(4 * usual)
+    rows = [len(np.unique(pairs.row[mended][place == key])) for key in np.unique(place)]
+    return part if sum(number >= AT_A_PLACE for number in rows) >= PLACES - outside else None
+
+
+def _check_waves(sample: Sample, stripes: Stripes, code: BinaryCode, collected: Collected, noise: NoiseModel) -> str | None:
+    """Return how the waves of the same axis run otherwise than the stripes; None if they run with them, or do not tell."""
+    phase = next((other for other in collected.codes if isinstance(other, PhaseCode) and other.axis == code.axis and not other.micro), None)
+    if phase is None:
+        return None
+    stripe_px = code.stripe_px * 2**stripes.finest
+    place, known = _smooth_place(stripes, gray=code.name != "binary", stripe_px=stripe_px)
+    for period in dict.fromkeys(phase.periods_px):
+        members = [index for index, other in enumerate(phase.periods_px) if other == period]
+        if len(members) < FULL_STEPS or stripe_px > period:
+            continue
+        readings = sample.grey[[phase.frames[index] for index in members]]
+        _, along, across = weights(np.array([phase.shifts[index] for index in members]), period).T @ readings
+        swing = np.hypot(along, across)
+        good = known.ravel() & (swing > CLEAR_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(readings.mean(axis=0), 0)))
+        if good.sum() < ENOUGH:
+            continue
+        some = np.flatnonzero(good)[:: max(1, int(good.sum()) // SOME)]
+        found = _compare_wave((along + 1j * across)[some] / swing[some], place.ravel()[some], period, wide=2 * stripe_px > period)
+        if found is not None:
+            return f"the {code.axis} phases of {period:g} px {found} in the frames' patterns"
+    return None
+
+
+def _smooth_place(stripes: Stripes, *, gray: bool, stripe_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the places in the projector of pixels from the stripes about them, [rows, cols] in its pixels, and where they are known."""
+    number = _numbers(stripes.bits, gray=gray).astype(np.float64)
+    changes = np.diff(number, axis=1) != 0
+    both = stripes.known[:, 1:] & stripes.known[:, :-1]
+    width = 2 * int(np.clip(both.sum() / max((changes & both).sum(), 1) / 2, 0, stripes.known.shape[1] // 8)) + 1
+    weight = uniform_filter1d(stripes.known.astype(np.float64), width, axis=1, mode="constant")
+    mean = uniform_filter1d(np.where(stripes.known, number, 0), width, axis=1, mode="constant") / np.maximum(weight, 1e-9)
+    known = stripes.known & (np.abs(mean - number) <= 1)
+    return (np.where(known, mean, number) + 0.5) * stripe_px, known
+
+
+def _compare_wave(phasors: np.ndarray, place: np.ndarray, period: float, *, wide: bool) -> str | None:
+    """Return how a wave runs otherwise than declared: by the frequency at which its phasors [n] turn over their places [n] in pixels.
+
+    `wide` says that the places are those of stripes wider than half a period.
+    """
+    span = float(np.ptp(np.percentile(place, [2, 98])))
+    if span < 2 * period:
+        return None
+    fine = 1 / (8 * span)
+    frequencies = np.arange(-2 / period, 2 / period, 4 * fine)
+    best = frequencies[np.abs(_turning(phasors, place, frequencies)).argmax()]
+    near = best + fine * np.linspace(-4, 4, 65)
+    strengths = np.abs(_turning(phasors, place, near))
+    best, strength = float(near[strengths.argmax()]), float(strengths.max())
+    if strength < CLEAR_WAVE:
+        return None
+    declared, free = _turning(phasors, place, np.array([1 / period, best]))
+    offset, own = (float(np.angle(mean)) / (2 * np.pi) for mean in (declared, free))
+    if abs(declared) >= AS_DECLARED[wide] * strength and abs(offset) <= OFFSET[wide]:
+        return None
+    if abs(best + 1 / period) * span < 0.5:
+        return "run against the stripes: check step, whose order is reversed,"
+    if abs(declared) < AS_DECLARED[wide] * strength or abs(own) < abs(offset) / 2:
+        return f"look like waves of {1 / abs(best):.4g} px{' that run against the stripes' if best < 0 else ''}: check period_px"
+    return f"are offset by {offset:+.2g} periods against the stripes: check step and offset_rad"
+
+
+def _turning(phasors: np.ndarray, place: np.ndarray, frequencies: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the means of phasors [n] that are turned back at frequencies [f] over their places [n]."""
+    return np.array([(phasors * np.exp(-2j * np.pi * frequency * place)).mean() for frequency in frequencies])

@@ -1,1 +1,0 @@
-"""The result of every depth method, and its points."""

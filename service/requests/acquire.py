@@ -1,0 +1,44 @@
+"""The options of `relit capture`."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from service.requests.base.base import DeviceRequest, Role, Spelling, WidthHeight
+from service.requests.patterns import Side
+from stage.colour.colour_spaces import ColorSpaceName
+from stage.model import Line, Positive
+
+
+class AcquireRequest(DeviceRequest):
+    """Take a capture: switch each light or show each pattern, take the picture, check it, and write the capture folder as it goes. Given
+    again, the command takes the pictures that are missing."""
+
+    plan: Annotated[Line, Role.INPUT, Spelling(argument=True, metavar="PLAN")]
+    """What is captured: a plan.json (relit.plan/1), or names with commas between, such as dark,olat: olat, gradients, polarised, dark,
+    flat, chart, mirror-ball, grey-ball, or a code of relit patterns."""
+    camera: Annotated[Line, Spelling(metavar="CAMERA")]
+    """The camera: watch:FOLDER or watch:FOLDER/*.jpg for the files that a tethering program writes, gphoto2 or gphoto2:PORT for a camera at
+    a USB port, video:0 for a video device."""
+    out: Annotated[Path, Role.OUTPUT, Spelling(metavar="CAPTURE")]
+    """The folder of the capture."""
+    rig: Annotated[Path | None, Role.INPUT, Spelling(metavar="RIG.json")] = None
+    """The lamps (relit.rig/1); None: a projector alone gives light."""
+    trigger: Annotated[Line | None, Spelling(metavar="COMMAND")] = None
+    """The program that releases a camera whose folder is watched, with its arguments; {exposure_s} stands for the exposure time. None: a
+    person or another program releases it."""
+    retakes: Annotated[int, Field(ge=0, le=20)] = 2
+    """How often a picture with a fault is taken again."""
+    timeout: Positive = 30.0
+    """Seconds until a picture counts as missing, beside its exposure."""
+    projector: Annotated[tuple[Side, Side] | None, WidthHeight, Spelling(metavar="WxH")] = None
+    """Width and height of the projector in pixels, for patterns."""
+    projector_port: Annotated[int, Field(ge=0, le=65535)] = 8572
+    """The port, on this machine, of the page that shows patterns in a browser on the projector's screen; 0: any free one."""
+    gamma: Positive = 1.0
+    """Gamma of the projector: a level of linear light is shown as level^(1/gamma)."""
+    color_space: ColorSpaceName | None = None
+    """The colour space of the pictures; None: srgb_texture for integers of 8 bits, else scene-linear."""
+    saturation: Positive | None = None
+    """The recorded value from which readings are clipped, which the manifest has too; None: full scale."""

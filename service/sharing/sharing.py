@@ -1,0 +1,221 @@
+"""A solve that several workers share: each runs the same solve, and every piece of a pass over the image is done by one of them.
+
+What a pass finds at the pixels of a piece is stored under the number of the pass and the number of the piece, from where the other workers
+read it. So all have the same arrays when a pass ends, and the next begins. What looks at the whole object is done by every worker: kernels
+add nothing up in the order in which threads happen to end, so workers on devices of one kind find the same. A digest of what a pass follows
+from is part of its name; a worker that finds something else shares nothing any more.
+
+A device gets the next piece when it is done with one. How the image is cut does not depend on the number of devices, every piece has
+pixels of its own, and no piece reads what another found: so results are the same to the last bit on one device and on several of its kind.
+"""
+
+import dataclasses
+import hashlib
+import io
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import warp as wp
+
+from kernels import device as devices
+from kernels.relight.frames import cublas
+from service.reporting.provenance import versions
+from service.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
+
+Piece = TypeVar("Piece")
+
+
+def deal(devices: Sequence[str], pieces: Iterable[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None]) -> None:
+    """Do the work of every piece.
+
+    Args:
+        devices: names of one or more; one that is named twice works on two pieces at a time.
+        pieces: are taken one by one in the thread of the caller.
+        work: does a piece on a device, and stores what it finds at the piece's own pixels; called in several threads at once.
+        done: is told each piece when it is done, on several devices not in their order; called in the thread of the caller.
+
+    Raises:
+        BaseException: what a piece or `done` raised, or an interruption; no piece is begun after it, and those of all devices have ended.
+    """
+    left = iter(pieces)
+    if len(devices) == 1:
+        for piece in left:
+            work(piece, devices[0])
+            done(piece)
+        return
+    with ThreadPoolExecutor(len(devices), thread_name_prefix="relit-device") as pool:
+        running: dict[Future[None], tuple[Piece, str]] = {}
+
+        def begin(device: str) -> None:
+            for piece in left:
+                running[pool.submit(work, piece, device)] = piece, device
+                return
+
+        for device in devices:
+            begin(device)
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                piece, device = running.pop(future)
+                future.result()
+                begin(device)
+                done(piece)
+
+
+LEAST_PIECES = 2
+"""A pass of fewer pieces is done by every worker."""
+
+
+class Results(NamedTuple):
+    """The results of a pass over the image, and the values that they follow from."""
+
+    arrays: Sequence[np.ndarray]  # each [..., pixels]: where the work of a piece stores what it finds, at the pixels of the piece
+    follows_from: object = None
+    """Values that the work reads besides the images and the results of earlier passes: numbers, strings, arrays, and tuples of these."""
+
+
+class SharedSolve:
+    """The part of one worker in a solve."""
+
+    def __init__(self, store: PieceStore, *, leads: bool, invite: Callable[[int], None] = lambda pieces: None) -> None:
+        """Take part in the solve whose pieces are in the store.
+
+        Args:
+            leads: whether this worker has the job; it alone says what a pass follows from.
+            invite: called with the number of pieces before each pass that can be shared.
+        """
+        self._store, self._leads, self._invite = store, leads, invite
+        self._solve, self._passes, self._has_agreed = "", 0, False
+
+    def identify(self, device: str, *given: object) -> None:
+        """Take note of what is solved: workers with other inputs, programs or kinds of device share nothing."""
+        self._solve = digest((kind_of_worker(device), given))
+
+    def deal(self, names: Sequence[str], pieces: Sequence[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None], *,
+             waiting: Callable[[], None], pixels_of: Callable[[Piece], Any], results: Results) -> None:
+        """Do the pieces of a pass that no other worker does, and read those of the others.
+
+        Args:
+            names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
+            waiting: called now and then while pieces of other workers are waited for.
+            pixels_of: returns the place of a piece on the last axis of the arrays.
+        """
+        self._passes += 1
+        if len(pieces) < LEAST_PIECES:
+            deal(names, pieces, work, done)
+            return
+        shared = _Pass(self._store, f"{self._solve[:16]}/{self._passes:03d}", digest(results.follows_from), self._leads, results.arrays)
+        shared.agree(is_begun=not self._has_agreed)
+        self._has_agreed = True
+        self._invite(len(pieces))
+
+        def keep(piece: tuple[int, Piece], device: str) -> None:
+            work(piece[1], device)
+            shared.write(piece[0], pixels_of(piece[1]))
+
+        def left() -> Iterator[tuple[int, Piece]]:
+            open_pieces = list(enumerate(pieces))
+            while open_pieces:
+                others = []
+                for number, piece in open_pieces:
+                    if shared.read(number, pixels_of(piece)):
+                        done(piece)
+                    elif shared.claim(number):
+                        yield number, piece
+                    else:
+                        others.append((number, piece))
+                if len(others) == len(open_pieces):
+                    waiting()
+                    time.sleep(LOOK_S)
+                open_pieces = others
+
+        deal(names, left(), keep, lambda piece: done(piece[1]))
+
+
+class _Pass:
+    """The results of all workers in one pass."""
+
+    def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
+        self._store, self._name, self._leads, self._arrays = store, name, leads, arrays
+        self._follows_from = follows_from
+        self._folder = f"{name}-{follows_from[:16]}"
+
+    def agree(self, *, is_begun: bool = False) -> None:
+        """Record what the pass follows from, or compare it with what the worker that leads has recorded; as of piece_store.agree."""
+        agree(self._store, self._name, self._follows_from, leads=self._leads, is_begun=is_begun)
+
+    def read(self, number: int, pixels: Any) -> bool:
+        """Take over what another worker has found in a piece; return False if it is not there."""
+        found = _unpacked(self._store.read(self._file(number)))
+        places = [array[..., pixels] for array in self._arrays]
+        if found is None or [(a.shape, a.dtype) for a in found] != [(a.shape, a.dtype) for a in places]:
+            return False
+        for array, values in zip(self._arrays, found, strict=True):
+            array[..., pixels] = values
+        return True
+
+    def claim(self, number: int) -> bool:
+        """Return whether this worker is to do a piece."""
+        if not self._leads:
+            self.agree()
+        return self._store.claim(f"{self._file(number)}.claim")
+
+    def write(self, number: int, pixels: Any) -> None:
+        """Give the others what this worker has found in a piece."""
+        self._store.write(self._file(number), _packed([array[..., pixels] for array in self._arrays]))
+
+    def _file(self, number: int) -> str:
+        return f"{self._folder}/{number:05d}"
+
+
+def kind_of_worker(device: str) -> str:
+    """Return what workers have in common that find the same to the last bit: the kind of device, all versions, and cuBLAS."""
+    return digest((devices.kind(device), versions(), cublas.product_of(device) is not None))
+
+
+def digest(value: object) -> str:
+    """Return the SHA-256, hexadecimal, of numbers, strings, arrays and of tuples, lists and dataclasses of these.
+
+    Raises:
+        TypeError: a value is of another kind, whose content is not known.
+    """
+    hasher = hashlib.sha256()
+    _add(value, hasher.update)
+    return hasher.hexdigest()
+
+
+def _add(value: object, add: Callable[[bytes], None]) -> None:
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    if isinstance(value, np.ndarray):
+        add(f"{value.dtype}{value.shape}".encode())
+        add(np.ascontiguousarray(value).tobytes())
+    elif value is None or isinstance(value, bool | int | float | str | np.generic):
+        add(f"{type(value).__name__} {value!r};".encode())
+    elif isinstance(value, tuple | list):
+        add(f"{type(value).__name__} {len(value)}:".encode())
+        for part in value:
+            _add(part, add)
+    elif isinstance(value, dict):
+        _add(list(value.items()), add)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        _add([(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)], add)
+    else:
+        raise TypeError(f"the content of a {type(value).__name__} is not known")
+
+
+def _packed(arrays: Sequence[np.ndarray]) -> bytes:
+    """Return arrays as sealed bytes."""
+    buffer = io.BytesIO()
+    np.savez(buffer, *arrays, allow_pickle=False)
+    return sealed(buffer.getvalue())
+
+
+def _unpacked(stored: bytes | None) -> list[np.ndarray] | None:
+    """Return the arrays of `_packed`, or None if the bytes are not there or not what was written."""
+    if (content := opened(stored)) is None:
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as found:
+        return [found[name] for name in found.files]

@@ -1,1 +1,0 @@
-"""The pieces of a solve over devices and workers."""

@@ -1,0 +1,193 @@
+"""Guesses the layout of a folder from what its images show: stripes and waves of patterns, an object under lights, and what is neither."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+
+from stage.errors import ManifestError, storage
+from stage.importers.camera_options import words_of
+from stage.importers.content import SMOOTH, Pictures, Stripes
+from stage.importers.folder import Folder, Guess, arrays_of, encoding, made, spelling
+from stage.importers.pattern_order import GrayStack
+from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
+
+PROJECTORS = ((1280, 800), (1920, 1080), (1024, 768), (1280, 720), (854, 480), (912, 1140), (800, 600), (1920, 1200), (640, 480),
+              (3840, 2160))
+"""Sizes of projectors, the more frequent first."""
+STEADY = 0.05
+"""Largest difference of the sums of images over their median at which they count as an image and its inverse, or as steps of a wave."""
+ONE_PERIOD, MANY_PERIODS = 1.3, 4
+"""Most periods that an image shows of a wave over the whole projector, and least ratio of the periods of both waves of SLStudio's 2x3."""
+METRES = 5.0
+"""Distances of a camera from its projector that are longer are in millimetres."""
+FOLLOWED = 0.5
+"""Least correlation of the place of light on an object with the direction of the light."""
+MOST_STEPS = 16
+SURE_PHOTOS = 8
+"""Images from which relit solve --lights unknown finds the lights."""
+LEFT_WORDS, RIGHT_WORDS = frozenset({"left", "l", "cam0", "im0"}), frozenset({"right", "r", "cam1", "im1"})
+FITTED = re.compile(r"plane_\d+\.(?:jpg|jpeg|png)|.*\.(?:ptm|rti|hsh)", re.IGNORECASE)
+"""Names of files with fitted coefficients: those of Relight and of RTIBuilder's fitters."""
+FEWEST_PHOTOS = 4
+"""Images of one size that may be frames of one capture; fewer are likelier pictures of something."""
+
+
+def followed(shown: Pictures, vectors: np.ndarray) -> tuple[float, float]:
+    """Return how the bright side of the object moves with x and with y of the lights, as correlations; 0 where it cannot be told."""
+    centres = shown.bright_sides()
+    if len(centres) != len(vectors) or not (np.ptp(centres, axis=0) > 0).all() or not (np.ptp(vectors[:, :2], axis=0) > 0).all():
+        return 0.0, 0.0
+    across, up = (float(np.corrcoef(centres[:, axis], vectors[:, axis])[0, 1]) for axis in (0, 1))
+    return across, up
+
+
+def scanner(folder: Folder, shown: Pictures) -> Guess | None:
+    """Return that images are those of a codec of SLStudio, whose calibration lies beside or above them."""
+    count = len(folder.pictures)
+    for path in folder.with_suffix(".xml", ".yml", ".yaml"):
+        matrices = arrays_of(path)
+        if not set(PROJECTOR_MATRIX) & set(matrices):
+            continue
+        size = projector_size(path)
+        if size is None:
+            continue
+        bits = [min(most, (side - 1).bit_length()) for most, side in zip((10, 6), size, strict=True)]
+        codecs = {2 + bits[0]: ("slstudio-gray", "column"), 2 + sum(bits): ("slstudio-gray", "both"), 6: ("slstudio-phase-2x3", "column"),
+                  12: ("slstudio-phase-2x3", "both"), 3: ("slstudio-phase-3", "column"), 4: ("slstudio-phase-4", "column")}
+        if count not in codecs or not _shows(shown, codecs[count][0]):
+            continue
+        codec, axis = codecs[count]
+        return made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
+                     ["scanner", folder.path, "--calibration", path, "--codec", codec, "--axis", axis, "--unit-m", "0.001"], folder.path,
+                     solve=False, sure=True, assumed=("the calibration is in millimetres",))
+    return None
+
+
+def _shows(shown: Pictures, codec: str) -> bool:
+    """Return whether images are those of a codec of SLStudio, of which several have as many."""
+    if codec == "slstudio-gray":
+        return shown.stripes() is not None
+    if codec != "slstudio-phase-2x3":
+        return True  # steps of a single wave
+    fine, coarse = (shown.waves(shown.names[at:at + 3], 3)[1] for at in (0, 3))
+    return shown.steady_sums(shown.names, 3, STEADY) and coarse <= ONE_PERIOD and fine >= MANY_PERIODS * coarse
+
+
+def gray(folder: Folder, shown: Pictures) -> Guess | None:
+    """Return that images are those of a Gray code; a plain binary code raises ManifestError."""
+    stripes = shown.stripes()
+    if stripes is None:
+        return _half_lit(folder, shown)
+    if stripes.binary:
+        bits = f"{stripes.column_bits} bits of columns and {stripes.row_bits} of rows"
+        raise ManifestError(f"{folder.path}: looks like a plain binary code, {bits}, whose stripes have edges in common: relit import "
+                            "reads Gray codes; docs/capture.md shows the pattern binary")
+    words, assumed, sure = _rig(folder, stripes)
+    plain = ("columns", "rows", "white", "black")
+    inverses = {"pairs": "each second of which is the inverse of the one before", "blocks": "whose inverses follow all of an axis",
+                "none": "without inverses"}[stripes.inverses]
+    coded = " and ".join(part for part in plain[:2] if part in stripes.sequence)
+    reason = f"{len(shown.names)} images of {coded} in two levels, {inverses}"
+    chosen = [] if len(shown.others) == 0 else ["--images", spelling(shown.names[0])]
+    if stripes.sequence == plain and stripes.inverses == "pairs" and not stripes.fine_first and not chosen and sure:
+        return made("a Gray code in OpenCV's order", reason, ["opencv-gray", folder.path, *words], folder.path, solve=False, sure=True,
+                    assumed=assumed)
+    order = ["--sequence", ",".join(stripes.sequence), "--inverses", stripes.inverses, *(["--fine-first"] if stripes.fine_first else [])]
+    return made("a Gray code", reason, ["gray", folder.path, *words, *order, *chosen], folder.path, solve=False, sure=sure, assumed=assumed)
+
+
+def _half_lit(folder: Folder, shown: Pictures) -> Guess | None:
+    """Return that images are in OpenCV's order by their number and inverses, where the object shows too little of the coarse stripes."""
+    names = [f"{width}x{height}" for width, height in PROJECTORS if len(GrayStack().entries((width, height))) == len(shown.names)]
+    if not names or shown.others or not shown.steady_sums(shown.names[:-2], 2, STEADY):
+        return None
+    return made("a Gray code in OpenCV's order", f"{len(shown.names)} images, each second of which is the inverse of the one before",
+                ["opencv-gray", folder.path, "--projector", names[0]], folder.path, solve=False, sure=True,
+                assumed=(f"the projector has {' or '.join(names)} pixels: these have as many bits",))
+
+
+def _rig(folder: Folder, stripes: Stripes) -> tuple[list[object], tuple[str, ...], bool]:
+    """Return the options for the projector of a code and its calibration, what they assume, and whether the number of bits fits them."""
+    def fits(size: tuple[int, int]) -> bool:
+        return all(bits in (0, (side - 1).bit_length()) for bits, side in zip((stripes.column_bits, stripes.row_bits), size, strict=True))
+
+    for path in folder.with_suffix(".xml", ".yml", ".yaml", ".json"):
+        matrices = arrays_of(path)
+        if not set(PROJECTOR_MATRIX) & set(matrices):
+            continue
+        size = projector_size(path)
+        moved = next((matrices[name] for name in ("T", "Tp", "trans", "translation") if name in matrices), None)
+        metres = moved is not None and float(np.linalg.norm(moved)) < METRES
+        if size is not None and fits(size):
+            return (["--projector", f"{size[0]}x{size[1]}", "--calibration", path, "--unit-m", "1" if metres else "0.001"],
+                    (f"the calibration is in {'metres' if metres else 'millimetres'}, as the distance of the projector suggests",), True)
+    sizes = [f"{width}x{height}" for width, height in PROJECTORS if fits((width, height))]
+    if not sizes:
+        bits_of = {"columns": stripes.column_bits, "rows": stripes.row_bits}
+        told = " and ".join(f"{bits} bits of {name}" for name, bits in bits_of.items() if bits)
+        return ["--projector", "WIDTHxHEIGHT"], (f"WIDTHxHEIGHT is the projector in pixels; the images show {told}",), False
+    return ["--projector", sizes[0]], (f"the projector has {' or '.join(sizes)} pixels: these have as many bits",), True
+
+
+def phase(folder: Folder, shown: Pictures) -> Guess | None:
+    """Return that images are steps of waves."""
+    count = len(folder.pictures)
+    if shown.steady_sums(shown.names, 2, STEADY):  # images and their inverses
+        return None
+    for steps in range(3, MOST_STEPS + 1):
+        if count % steps == 0 and count > steps and shown.steady_sums(shown.names, steps, STEADY):
+            groups = [shown.names[at:at + steps] for at in range(0, count, steps)]
+            axis = shown.waves(groups[0], steps)[0]
+            named = [re.match(r"[A-Za-z_]*?(\d+(?:\.\d+)?)[_-]", name) for name in shown.names[::steps]]
+            numbers = [found.group(1) for found in named if found is not None]
+            told = len(numbers) == len(groups) == len(set(numbers)) and all(float(number) > 2 for number in numbers)
+            periods = ",".join(numbers if told else [f"P{n + 1}" for n in range(len(groups))])
+            return made("phase shifts", f"the sums of each {steps} images are alike", [
+                "phase", folder.path, "--projector", "WIDTHxHEIGHT", "--periods", periods, "--steps", steps,
+                *(["--axis", axis] if axis == "row" else [])], folder.path, solve=False, assumed=(
+                    "WIDTHxHEIGHT is the projector in pixels" + ("" if told else ", P1 and so on are the periods in its pixels"),
+                    *((f"the names of the images have the periods, {periods} pixels of the projector",) if told else ()),
+                    f"the {axis}s are coded, and waves move to larger ones: else --axis and --shift"))
+    return None
+
+
+def photos(folder: Folder, shown: Pictures) -> Guess | None:
+    """Return that images are those of an object under lights; images of something else are refused with what they look like."""
+    left, right = (sum(bool(words_of(name) & words) for name in folder.pictures) for words in (LEFT_WORDS, RIGHT_WORDS))
+    with storage("read", folder.path):
+        children = {path.name.lower() for path in folder.path.iterdir() if path.is_dir()}
+    if (left and left == right) or (children & LEFT_WORDS and children & RIGHT_WORDS):
+        raise ManifestError(f"{folder.path}: looks like images of two cameras, left and right: docs/capture.md says how other_cameras and "
+                            "stereo of a capture.json name them")
+    fitted = [name for name in folder.names if FITTED.fullmatch(name)]
+    if fitted:
+        raise ManifestError(f"{folder.path}: {fitted[0]} looks like a coefficient image that was fitted to images under lights (RTI): "
+                            "import those images with their light list, which relit basis fits anew")
+    if shown.names and shown.size is not None and shown.size[0] == 2 * shown.size[1] and all(
+            Path(name).suffix.lower() in (".exr", ".hdr") for name in shown.names):
+        raise ManifestError(f"{folder.path}: {shown.names[0]} looks like an environment map, twice as wide as high: relit relight CAPTURE "
+                            f"--environment {shlex.quote(str(folder.path / shown.names[0]))} takes it")
+    if len(shown.names) < FEWEST_PHOTOS:
+        return None
+    if shown.two_valued():
+        raise ManifestError(f"{folder.path}: its {len(shown.names)} images have two values each, as masks have: name the folder of the "
+                            "photographs")
+    left_over = shown.unexplained_by_lights()
+    smooth = left_over <= SMOOTH
+    found = made("images under lights of which nothing says where they were", f"{len(shown.names)} images of one size and no table; " + (
+        f"three of them explain the others to {100 * left_over:.0f} %, as those of one object under far lights" if smooth else
+        f"three of them leave {100 * left_over:.0f} % of the others unexplained, which is much for one object under far lights"),
+        ["photos", folder.path, *(["--images", spelling(shown.names[0])] if shown.others else [])], folder.path, solve=True,
+        sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1, assumed=(
+            "each image has one far light of its own, and the camera stood still", *_left_out(shown), *encoding(folder)))
+    return found._replace(then=found.then + " --lights unknown")
+
+
+def _left_out(shown: Pictures) -> tuple[str, ...]:
+    """Return the sentence for images of another size, which are left out."""
+    if not shown.others or shown.size is None:
+        return ()
+    return (f"{shown.others[0]}{' and others' if len(shown.others) > 1 else ''} of another size than {shown.size[0]}x{shown.size[1]} "
+            "is left out",)

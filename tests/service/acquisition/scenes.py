@@ -1,0 +1,105 @@
+"""Pictures under single lamps, in memory, with the noise and the faults of a camera."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from service.acquisition.checks.fault import FaultKind
+from service.acquisition.plans.plan import Plan
+from service.acquisition.plans.shots import Shot, shots_of
+from service.twin.camera import AMBIENT, BLUR_PX, OVEREXPOSED, SHIFT_PX
+from stage.capture.capture import Capture
+from stage.formats import images
+from stage.rig.rig import Rig
+from tests.service.owl import OWL, block_mean
+
+
+class Scene(NamedTuple):
+    """What each lamp lights."""
+
+    radiance: np.ndarray  # [lamps, rows, cols, 3] float32, full scale 1
+    directions: np.ndarray  # [lamps, 3]
+
+
+def owl() -> Scene:
+    """The shipped owl under lamps all around, at half its width."""
+    names = sorted(OWL.glob("[0-9][0-9][0-9].exr"))
+    directions = np.array([frame.light.direction for frame in Capture.open(OWL).manifest.frames])
+    return Scene(np.stack([block_mean(images.read_pixels(name).astype(np.float32), 2) for name in names]) / 2.83, directions)
+
+
+def relief(seed: int, rings: tuple[int, ...] = (12, 10, 8, 4)) -> Scene:
+    """Textured bumps with cast shadows and a little gloss, under a dome of rings that a person has built."""
+    random, (rows, cols) = np.random.default_rng(seed), (110, 130)
+    y, x = np.mgrid[:rows, :cols].astype(np.float32)
+    height = np.zeros((rows, cols), np.float32)
+    for _ in range(10):
+        radius, middle = random.uniform(8, 30), random.uniform(0.1, 0.9, 2) * (rows, cols)
+        squared = ((y - middle[0]) ** 2 + (x - middle[1]) ** 2) / radius**2
+        height = np.maximum(height, random.uniform(0.3, 0.9) * radius * np.sqrt(np.clip(1 - squared, 0, None)))
+    height = ndimage.gaussian_filter(height, 1) + 3 * ndimage.gaussian_filter(random.normal(size=height.shape), 3)
+    down, right = np.gradient(height)
+    normal = np.dstack([-right, down, np.ones_like(height)])
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    texture = ndimage.gaussian_filter(random.normal(size=height.shape), 1.2)
+    albedo = np.clip(0.45 + 0.15 * texture / texture.std(), 0.05, 0.95)[..., None] * random.uniform(0.5, 1, 3)
+    directions = np.array([[np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)]
+                           for count, degrees in zip(rings, np.linspace(18, 78, len(rings)), strict=True)
+                           for up, around in zip(np.radians(degrees + random.normal(0, 1, count)),
+                                                 2 * np.pi * (np.arange(count) + random.uniform()) / count, strict=True)])
+    pictures = []
+    for towards in directions:
+        lit = np.ones(height.shape, dtype=bool)
+        for step in range(1, int(min(60, 35 / towards[2]))):
+            lit &= ndimage.shift(height, (towards[1] * step, -towards[0] * step), order=1, mode="nearest") <= height + step * towards[2]
+        half = (towards + [0, 0, 1]) / np.linalg.norm(towards + [0, 0, 1])
+        cosine = np.clip(normal @ towards, 0, None)
+        pictures.append((cosine[..., None] * albedo + 0.1 * (normal @ half)[..., None] ** 40 * (cosine > 0)[..., None]) * lit[..., None])
+    return Scene(np.array(pictures, dtype=np.float32) * 0.35, directions)
+
+
+def rig_of(scene: Scene) -> Rig:
+    """Return a rig of the lamps, whose brightness is driven."""
+    return Rig.model_validate({"schema": "relit.rig/1", "name": "test", "color_space": "lin_rec709_scene", "lights": [
+        {"name": f"L{index}", "type": "distant", "direction": (towards / np.linalg.norm(towards)).tolist(),
+         "primaries": [{"name": "white", "irradiance": [1, 1, 1]}],
+         "address": {"protocol": "sacn", "universe": 1, "channels": {"white": index + 1}}}
+        for index, towards in enumerate(scene.directions)]})
+
+
+def shots_on(rig: Rig, tracking_every: int = 24) -> tuple[Shot, ...]:
+    """Return the shots of a dark picture and of each lamp alone, with tracking pictures."""
+    return shots_of(Plan.model_validate({"schema": "relit.plan/1", "tracking_every": tracking_every,
+                                         "sequences": [{"take": "dark", "count": 2}, {"take": "olat"}]}), rig, None)
+
+
+class NoisyCamera:
+    """Takes pictures of a scene at the levels of shots."""
+
+    def __init__(self, scene: Scene, seed: int, noise: float = 0.004) -> None:
+        self._scene, self._random, self._noise = scene, np.random.default_rng(seed), noise
+        self._previous: np.ndarray | None = None
+
+    def take(self, shot: Shot, fault: FaultKind | None = None) -> np.ndarray:
+        """Return [rows, cols, 3] of a shot, with a fault."""
+        levels = shot.levels
+        if fault is FaultKind.UNLIT:
+            levels = np.zeros_like(levels)
+        if fault is FaultKind.WRONG_LIGHT:
+            levels = np.roll(levels, 1)
+        if fault is FaultKind.AMBIENT:
+            levels = levels + AMBIENT * 4 / len(levels)
+        pixels = np.tensordot(levels.astype(np.float32), self._scene.radiance, 1)
+        if fault is FaultKind.MOVED:
+            pixels = np.roll(pixels, SHIFT_PX, axis=1)
+        if fault is FaultKind.UNSHARP:
+            pixels = ndimage.gaussian_filter(pixels, (BLUR_PX, BLUR_PX, 0))
+        if fault is FaultKind.CLIPPED:
+            pixels = pixels * OVEREXPOSED
+        shot_noise = np.sqrt(np.maximum(pixels, 0) / 4 + 1 / 16)
+        taken = np.clip(pixels + self._noise * shot_noise * self._random.standard_normal(pixels.shape, np.float32), None, 1)
+        if fault is FaultKind.DOUBLED and self._previous is not None:
+            taken = self._previous
+        self._previous = taken
+        return taken.astype(np.float32)

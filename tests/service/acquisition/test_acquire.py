@@ -1,0 +1,257 @@
+"""Whole captures without hardware: a serial board at a pseudo-terminal, HTTP, a person, and a camera that writes files."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+import tty
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import service
+from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
+from service.acquisition.checks.fault import FaultKind
+from service.errors import RequestError
+from service.requests.acquire import AcquireRequest
+from stage.capture.capture import Capture
+from stage.errors import StageError
+from tests.scenes.captures import make_scene, write_exr
+from tests.service.full_disk import files_of_at_most
+from tests.service.waiting import until
+
+ROOT = Path(service.__file__).parents[1]
+LAMPS = 6
+
+
+class Stage:
+    """Lamps that can be switched, and a camera that writes into a folder what they light; `faults` are kinds by the number of a release."""
+
+    def __init__(self, folder: Path, faults: dict[int, FaultKind] | None = None) -> None:
+        self.scene, self.folder, self.faults = make_scene(size=24, lights=LAMPS), folder, faults or {}
+        self.on: set[int] = set()
+        self.released, self.asked = 0, []
+        self.random = np.random.default_rng(1)
+        self.last = None
+        folder.mkdir()
+
+    def command(self, text: str) -> None:
+        word, *rest = text.split()
+        self.on = set() if word == "off" else self.on | {int(rest[0])}
+
+    def release(self) -> None:
+        self.released += 1
+        fault, path = self.faults.get(self.released), self.folder / f"IMG_{self.released:04d}.exr"
+        pixels = 0.2 * sum((self.scene.images[lamp] for lamp in self.on), np.zeros_like(self.scene.images[0])) \
+            + self.random.normal(0, 1e-3, self.scene.images[0].shape)
+        if fault is FaultKind.CLIPPED:
+            pixels = np.minimum(50 * pixels, 1)
+        pixels = self.last if fault is FaultKind.DOUBLED else pixels
+        self.last = pixels
+        if fault is FaultKind.LATE:
+            threading.Timer(0.5, write_exr, [path, pixels]).start()
+        elif fault is not FaultKind.MISSING:
+            write_exr(path, pixels)
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    """A stage whose camera is released by the program of --trigger."""
+    found = Stage(tmp_path / "watch")
+    monkeypatch.setattr("service.acquisition.cameras.watched_folder.WatchedFolder._release", lambda camera, exposure: found.release())
+    return found
+
+
+def write_rig(path: Path, stage: Stage, protocol: str, controllers: dict | None = None) -> Path:
+    path.write_text(json.dumps({"schema": "relit.rig/1", "name": "dome", "controllers": controllers or {}, "lights": [
+        {"name": f"L{index}", "type": "distant", "direction": towards, "primaries": [{"name": "white", "irradiance": [1, 1, 1]}],
+         "address": {"protocol": protocol}} for index, towards in enumerate(stage.scene.directions.tolist())]}))
+    return path
+
+
+def request(folder: Path, stage: Stage, rig: Path, **changes) -> AcquireRequest:
+    plan = folder / "plan.json"
+    if not plan.exists():
+        plan.write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}))
+    return AcquireRequest(**{"plan": str(plan), "rig": rig, "camera": f"watch:{stage.folder}", "out": folder / "capture", "timeout": 0.3,
+                             **changes})
+
+
+def by_hand(folder: Path, stage: Stage) -> tuple[Path, object]:
+    """Return a rig whose lamps a person switches, and the person."""
+    def ask(what: str) -> None:
+        stage.asked.append(what)
+        stage.on = {index for index in range(LAMPS) if f"L{index} " in what}
+    return write_rig(folder / "rig.json", stage, "manual"), ask
+
+
+def check(folder: Path, stage: Stage) -> None:
+    """Compare each frame with the light that its entry names, and each file with the one that came."""
+    capture, lines = Capture.open(folder), [json.loads(line) for line in (folder / "acquisition.jsonl").read_text().splitlines()]
+    sources = {line["file"]: line["source"] for line in lines if line.get("event") == "taken"}
+    assert len(capture.manifest.frames) == LAMPS + 1 and len(sources) == LAMPS + 1
+    for frame in capture.manifest.frames:
+        assert (folder / frame.image).read_bytes() == (stage.folder / sources[frame.image]).read_bytes()
+    lights = [frame.light.direction for frame in capture.manifest.frames if frame.light.type == "distant"]
+    assert np.allclose(lights, stage.scene.directions, atol=1e-6)
+    pictures = [line["shot"] for line in lines if line.get("event") == "taken"]
+    assert len(pictures) == len(set(pictures))
+
+
+def test_by_hand_each_lamp_is_asked_for_and_a_capture_that_is_there_is_not_taken_again(tmp_path, stage):
+    rig, ask = by_hand(tmp_path, stage)
+    result = acquire(request(tmp_path, stage, rig), ask)
+    assert result.faults == () and result.taken == LAMPS + 1
+    assert all(f"L{index} " in stage.asked[index] for index in range(LAMPS))
+    check(tmp_path / "capture", stage)
+    assert acquire(request(tmp_path, stage, rig), ask).taken == 0
+
+
+def test_a_serial_board_is_told_and_answers_and_is_dark_at_the_end(tmp_path, stage):
+    host, board = os.openpty()
+    tty.setraw(board)
+    heard = []
+
+    def answer() -> None:
+        text = b""
+        while not text.endswith(b"bye\n"):
+            text += os.read(host, 100)
+            while b"\n" in text and not text.startswith(b"bye"):
+                line, text = text.split(b"\n", 1)
+                heard.append(line.decode())
+                stage.command(heard[-1])
+                os.write(host, b"ok\n")
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    serial = {"port": os.ttyname(board), "on": "on {index}\n", "off": "off\n", "acknowledge": "^ok", "ready_s": 0}
+    rig = write_rig(tmp_path / "rig.json", stage, "serial", {"serial": serial})
+    assert acquire(request(tmp_path, stage, rig), refuse_to_ask).faults == ()
+    check(tmp_path / "capture", stage)
+    assert heard == ["off", *(text for index in range(LAMPS) for text in (f"on {index}", "off"))]
+    deaf = write_rig(tmp_path / "deaf.json", stage, "serial", {"serial": {**serial, "acknowledge": "^never", "timeout_s": 0.2}})
+    with pytest.raises(RequestError, match="answers 'ok'"):
+        acquire(request(tmp_path, stage, deaf, out=tmp_path / "other"), refuse_to_ask)
+
+
+def test_http_lamps_are_dark_however_a_capture_ends(tmp_path, stage):
+    class Controller(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            stage.command(self.path.strip("/").replace("/", " "))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *what: object) -> None:
+            """Say nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        rig = write_rig(tmp_path / "rig.json", stage, "http", {"http": {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}})
+        stop = threading.Event()
+        release = stage.release
+
+        def stopped() -> None:
+            release()
+            if stage.released == 3:
+                stop.set()
+        stage.release = stopped
+        result = acquire(request(tmp_path, stage, rig), refuse_to_ask, stop=stop)
+        assert 0 < result.there < LAMPS and stage.on == set()
+
+        def broken() -> None:
+            raise RequestError("the camera is gone")
+        stage.release = broken
+        with pytest.raises(RequestError, match="camera is gone"):
+            acquire(request(tmp_path, stage, rig, out=tmp_path / "second"), refuse_to_ask)
+        assert stage.on == set()
+        stage.release = release
+        with files_of_at_most(600), pytest.raises(StageError):
+            acquire(request(tmp_path, stage, rig, out=tmp_path / "full"), refuse_to_ask)
+        assert stage.on == set() and not list((tmp_path / "full").glob("*.exr"))
+        assert acquire(request(tmp_path, stage, rig), refuse_to_ask).there == LAMPS + 1
+        check(tmp_path / "capture", stage)
+        server.shutdown()
+    with pytest.raises(RequestError, match="no answer"):
+        acquire(request(tmp_path, stage, rig, out=tmp_path / "third"), refuse_to_ask)
+
+
+@pytest.mark.parametrize("kind", [FaultKind.DOUBLED, FaultKind.MISSING, FaultKind.LATE, FaultKind.CLIPPED])
+def test_a_picture_with_a_fault_is_taken_again(tmp_path, stage, kind):
+    rig, ask = by_hand(tmp_path, stage)
+    stage.faults = {4: kind}
+    result = acquire(request(tmp_path, stage, rig), ask)
+    assert result.faults == () and kind in {fault.kind for fault in result.retaken}
+    assert {fault.shot for fault in result.retaken} == {"0004_light_003"}
+    check(tmp_path / "capture", stage)
+
+
+@pytest.mark.parametrize("after", (1, 4, 7))
+def test_a_capture_goes_on_after_it_was_cut_off_at_any_picture(tmp_path, stage, monkeypatch, after):
+    rig, ask = by_hand(tmp_path, stage)
+    run = Acquisition(request(tmp_path, stage, rig), ask)
+
+    def dies(shot, picture, faults):
+        if stage.released == after:
+            raise KeyboardInterrupt
+        Acquisition._accept(run, shot, picture, faults)
+    monkeypatch.setattr(run, "_accept", dies)
+    with pytest.raises(KeyboardInterrupt):
+        run.run()
+    stage.on = set()
+    acquire(request(tmp_path, stage, rig), ask)
+    check(tmp_path / "capture", stage)
+    assert stage.released <= LAMPS + 2  # those of the plan, and one that shows that nothing moved
+
+
+@pytest.mark.long
+def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
+    stage = Stage(tmp_path / "watch")
+
+    class Controller(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            word = self.path.strip("/").replace("/", " ")
+            stage.release() if word == "shoot" else stage.command(word)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *what: object) -> None:
+            """Say nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        rig = write_rig(tmp_path / "rig.json", stage, "http", {"http": {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}})
+        given = request(tmp_path, stage, rig)
+        shoot = f"{sys.executable} -S -c \"import urllib.request as u; u.urlopen('{url}/shoot')\""
+        command = [sys.executable, "-m", "service.cli.main", "capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out",
+                   str(given.out), "--trigger", shoot, "--timeout", "10"]
+        random, kills = np.random.default_rng(2), 0
+        for _ in range(10):
+            before = stage.released
+            program = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
+            until(lambda program=program, before=before: stage.released > before or program.poll() is not None, "no picture", every_s=0.001)
+            time.sleep(random.uniform(0, 0.4))
+            kills += program.poll() is None
+            program.kill()
+            program.wait()
+        subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)
+        server.shutdown()
+    assert kills and stage.on == set()
+    check(tmp_path / "capture", stage)
+
+
+def test_bad_input_is_refused_with_one_sentence(tmp_path, stage):
+    rig, ask = by_hand(tmp_path, stage)
+    for changes, words in (({"camera": f"watch:{tmp_path}/none"}, "no such folder"), ({"camera": "film:1"}, "no kind of camera"),
+                           ({"plan": "olat,moon"}, "moon"), ({"plan": "gray"}, "--projector")):
+        with pytest.raises(RequestError, match=words):
+            acquire(request(tmp_path, stage, rig, **changes), ask)
+    acquire(request(tmp_path, stage, rig), ask)
+    with pytest.raises(RequestError, match="another plan"):
+        acquire(request(tmp_path, stage, rig, plan="olat"), ask)
+    with pytest.raises(RequestError, match="somebody must act"):
+        acquire(request(tmp_path, stage, rig, out=tmp_path / "other"), refuse_to_ask)

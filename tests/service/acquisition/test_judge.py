@@ -1,0 +1,51 @@
+"""The judge of pictures against pictures in memory whose faults are known."""
+
+import numpy as np
+import pytest
+
+from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.judge import FULL_SCALE, Judge
+from tests.service.acquisition.scenes import NoisyCamera, Scene, owl, relief, rig_of, shots_on
+
+KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
+         FaultKind.UNSHARP)
+VISIBLE = 0.3
+"""Faults are put where a lamp gives this part of the mean light of a lamp: behind the object nothing tells a lamp from none."""
+
+BRIGHT = 1.5
+"""Ambient light of 0.8 of the mean picture goes where a lamp gives less than this: the prediction errs by more beside the brightest."""
+
+
+def named(scene: Scene, seed: int, kinds: tuple[FaultKind, ...]) -> tuple[dict[str, FaultKind], dict[str, FaultKind]]:
+    """Return the faults that were made, at random frames, and those that the judge names at the end."""
+    rig = rig_of(scene)
+    shots, random, judge = shots_on(rig), np.random.default_rng(seed), Judge(rig)
+    light = scene.radiance.mean(axis=(1, 2, 3))
+    bright = light > VISIBLE * light.mean()
+    able = [index for index, shot in enumerate(shots)
+            if shot.lamp is not None and bright[shot.lamp] and bright[(shot.lamp + 1) % len(light)]]
+    made: dict[int, FaultKind] = {}
+    for kind in kinds:  # beside a wrong lamp stands a right picture of the lamp that shone
+        free = [index for index in able if not {index - 1, index, index + 1} & made.keys()
+                and (kind is not FaultKind.AMBIENT or light[shots[index].lamp] < BRIGHT * light.mean())]
+        made[int(random.choice(free))] = kind
+    camera = NoisyCamera(scene, seed)
+    for index, shot in enumerate(shots):
+        pixels = camera.take(shot, made.get(index))
+        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE))
+    return {shots[index].key: kind for index, kind in made.items()}, {fault.shot: fault.kind for fault in judge.review()}
+
+
+@pytest.mark.parametrize("kinds", [(), KINDS])
+def test_each_fault_is_named_with_its_frame_and_none_else(kinds):
+    made, found = named(relief(1), 1, kinds)
+    assert found == made
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scene", [owl, lambda: relief(5)], ids=["owl", "relief"])
+def test_each_fault_is_named_over_random_seeds(scene):
+    pictures = scene()
+    for seed in range(6):
+        made, found = named(pictures, seed, KINDS if seed else ())
+        assert found == made, seed

@@ -1,0 +1,66 @@
+"""Codes that are declared otherwise than they were shown are named, and right ones raise no doubt: a sphere before a plane, with shadow."""
+
+import numpy as np
+import pytest
+
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.code_checks import check_codes
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.pattern_checks import Sample
+from stage.capture.manifest import Frame
+from stage.patterns.codes import collect
+from tests.scenes.depth import AMBIENT, BLACK_WHITE, PROJECTOR, gray_patterns, make_scene, phase_patterns, shown
+
+SIZE = PROJECTOR.width, PROJECTOR.height
+NOISE = 0.004
+GRAY = [*gray_patterns("column", stripe=2), *BLACK_WHITE]
+WAVES = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
+THREE = [*phase_patterns("column", 18.0, 3), *gray_patterns("column", stripe=8, inverse=False), *BLACK_WHITE]
+BINARY = [{**pattern, "code": "binary"} if pattern["code"] == "gray" else pattern for pattern in GRAY]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+def said(scene, patterns, declared, size=SIZE):
+    """The sentence about these frames, with noise, of every second row."""
+    rng = np.random.default_rng(2)
+    frames = [scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv) * ~scene.shaded + AMBIENT) for pattern in patterns]
+    values = (np.array(frames) + rng.normal(0, NOISE, (len(frames), *scene.depth.shape)))[:, ::2].astype(np.float32)
+    rows = np.zeros(values.shape[1:], np.float32)
+    sample = Sample(values.reshape(len(frames), 1, -1), None, rows, rows, np.ones(rows.shape, bool))
+    entries = [Frame.model_validate({"image": "a.png", "pattern": pattern}).pattern for pattern in declared]
+    return check_codes(sample, collect(entries), PatternProjector(size), NoiseModel(NOISE, 0.0))
+
+
+def changed(patterns, code, **fields):
+    """Patterns with fields of those of one code changed by functions of the pattern."""
+    return [{**pattern, **{name: change(pattern) for name, change in fields.items()}} if pattern["code"] == code else pattern
+            for pattern in patterns]
+
+
+@pytest.mark.parametrize("patterns", [
+    GRAY, BINARY, WAVES, THREE, [*phase_patterns("row", 16.0), *gray_patterns("row", stripe=8)],
+    [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=16)]], ids=["gray", "binary", "waves", "three", "rows", "wide"])
+def test_right_declarations_raise_no_doubt(scene, patterns):
+    assert said(scene, patterns, patterns) is None
+
+
+@pytest.mark.parametrize(("patterns", "declared", "words"), [
+    (GRAY, BINARY, "as those of a gray code"),
+    (BINARY, GRAY, "as those of a binary code"),
+    (GRAY, changed(GRAY, "gray", bit=lambda p: {1: 3, 3: 1}.get(p["bit"], p["bit"])), "the bits 1 and 3 are exchanged"),
+    (WAVES, changed(WAVES, "phase", step=lambda p: -p["step"] % 4), "run against the stripes"),
+    (THREE, changed(THREE, "phase", step=lambda p: -p["step"] % 3), "run against the stripes"),
+    (WAVES, changed(WAVES, "phase", step=lambda p: (p["step"] + 1) % 4), "are offset by"),
+    (BINARY, changed(BINARY, "binary", bit=lambda p: {4: 5, 5: 4}.get(p["bit"], p["bit"])), "the bits 4 and 5 are exchanged"),
+    (WAVES, changed(WAVES, "phase", period_px=lambda p: 15.0), "look like waves of 1"),
+], ids=["gray as binary", "binary as gray", "bits", "reversed", "three reversed", "sine", "coarse bits", "period"])
+def test_a_wrong_declaration_is_named(scene, patterns, declared, words):
+    assert words in said(scene, patterns, declared)
+
+
+def test_stripes_beyond_the_projector_are_named(scene):
+    assert "projector.resolution" in said(scene, GRAY, GRAY, (88, 96))

@@ -1,0 +1,159 @@
+"""relit import scans: PLY files as they come are registered with nothing written by hand; files do not say where the scanner stood."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from service.scans.points.rigid import inverse
+from service.scans.viewpoints import find_viewpoints
+from stage.formats.ply import PointCloud, write_ply
+from stage.results.depth_maps import DepthMaps
+from tests.scenes.turntable import DISTANCE_M, View, figure, turntable
+from tests.service.scans.test_register import off
+
+ANGLES = [0.0, 40.0, 80.0, 120.0, 160.0, 200.0, 240.0, 280.0, 320.0]
+SHIFT = np.array([0.02, -0.05, DISTANCE_M])
+"""From the camera's frame to one whose origin lies within the figure."""
+
+
+@pytest.fixture(scope="module")
+def views() -> list[View]:
+    return turntable(figure, ANGLES, rows=120)
+
+
+def points_of(view: View) -> np.ndarray:
+    """[n, 3] of a scan in a frame of the device, whose origin lies within the figure."""
+    return view.camera.points(-view.depth)[view.mask].astype(float) + SHIFT
+
+
+def write(folder: Path, clouds: list[np.ndarray], normals: list[np.ndarray] | None = None) -> Path:
+    folder.mkdir()
+    for number, points in enumerate(clouds):
+        write_ply(PointCloud(points.astype(np.float32), np.zeros((len(points), 3), dtype=np.uint8),
+                             None if normals is None else normals[number].astype(np.float32)), folder / f"scan_{24 * number}.ply")
+    return folder
+
+
+def degrees_off(place: np.ndarray, scans: list[np.ndarray], truth: np.ndarray) -> np.ndarray:
+    direction = place - [points.mean(axis=0) for points in scans]
+    return np.degrees(np.arccos(np.clip((direction * truth).sum(axis=-1) / np.linalg.norm(direction, axis=-1), -1, 1)))
+
+
+@pytest.mark.long
+def test_a_turntable_whose_origin_lies_within_the_object(relit, tmp_path, views):
+    """Millimetres, and no pose is known."""
+    folder = write(tmp_path / "scans", [1000 * points_of(view) for view in views])
+    said = relit.done("import", "scans", folder, tmp_path / "set", "--unit", "mm")
+    assert 0.8 < float(said.out.split("size")[1].split()[0]) < 1.2  # metres
+    relit.done("register", tmp_path / "set", "--out", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert all(scan["joined"] for scan in report["scans"])
+    shifted = [view._replace(world_from_scan=view.world_from_scan @ inverse(_moved(SHIFT))) for view in views]
+    assert all(metres < 0.001 and degrees < 0.2 for metres, degrees in off(tmp_path / "out", shifted).values())  # as with given viewpoints
+
+
+def _moved(shift: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = shift
+    return pose
+
+
+def test_the_direction_to_the_scanner(views):
+    scans = [points_of(view) for view in views]
+    towards = np.array([(SHIFT - points.mean(axis=0)) / np.linalg.norm(SHIFT - points.mean(axis=0)) for points in scans])
+    nothing = [None] * len(scans)
+    found = find_viewpoints(scans, nothing)
+    assert degrees_off(found.place, scans, towards).max() < 15  # a scanner at 2.5 extents is taken to be far away
+
+    # the same with the poses applied: each scan has a direction of its own
+    poses = [view.world_from_scan @ inverse(_moved(SHIFT)) for view in views]
+    world = [points @ pose[:3, :3].T + pose[:3, 3] for points, pose in zip(scans, poses, strict=True)]
+    found = find_viewpoints(world, nothing)
+    turned = np.einsum("nij,nj->ni", np.array(poses)[:, :3, :3], towards)
+    assert degrees_off(found.place, world, turned).max() < 35
+
+    # and in the frame of the camera, whose origin is the scanner
+    found = find_viewpoints([points - SHIFT for points in scans], nothing)
+    assert not found.place.any() and found.spread_degrees == 0
+
+
+def test_a_flat_wall_has_two_sides_unless_its_normals_tell():
+    random = np.random.default_rng(3)
+    wall = np.column_stack([random.uniform(-1, 1, (3000, 2)), 0.002 * random.normal(size=3000)])
+    found = find_viewpoints([wall, wall], [None, None])
+    assert found.place is None and "side" in found.reason
+    normals = np.tile([0.0, 0.0, -1.0], (3000, 1))
+    found = find_viewpoints([wall, wall], [normals, normals])
+    assert degrees_off(found.place, [wall, wall], np.array([0.0, 0.0, -1.0])).max() < 5
+
+
+def test_a_body_seen_from_all_around_is_no_scan():
+    random = np.random.default_rng(4)
+    ball = random.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    found = find_viewpoints([ball], [None])
+    assert found.place is None and "one place" in found.reason
+
+
+def test_poses_of_a_conf_file_and_what_is_wrong_with_it(relit, tmp_path, views):
+    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+    turn = Rotation.from_euler("y", 24, degrees=True)
+    lines = ["camera 0 0 0 0 0 0 1", "bmesh scan_0.ply 0 0 0 0 0 0 1",
+             f"bmesh scan_24.ply 0.1 0.2 0.3 {' '.join(map(str, turn.inv().as_quat()))}"]
+    (folder / "scans.conf").write_text("\n".join(lines))
+    relit.done("import", "scans", folder, tmp_path / "set", "--viewpoint", "0,0,9")
+    scans = json.loads((tmp_path / "set" / "scan-set.json").read_text())["scans"]
+    assert [scan["viewpoint_m"] for scan in scans] == [[0, 0, 9]] * 2
+    pose = np.array(scans[1]["scan_to_world"])
+    assert pose[:3, :3] == pytest.approx(turn.as_matrix()) and pose[:3, 3] == pytest.approx([0.1, 0.2, 0.3])
+
+    for line, words in (("bmesh scan_0.ply 0 0 0 0 0 0", "line 1"), ("bmesh scan_0.ply 0 0 0 9 0 0 1", "line 1"),
+                        ("camera 0", "names no scans")):
+        (folder / "scans.conf").write_text(line)
+        assert words in relit.refused("import", "scans", folder, tmp_path / "other")
+    (tmp_path / "none").mkdir()
+    assert "neither PLY files" in relit.refused("import", "scans", tmp_path / "none")
+    (folder / "scans.conf").unlink()
+    (folder / "scan_0.ply").write_bytes(b"not a cloud")
+    assert "scan_0.ply" in relit.refused("import", "scans", folder, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, tmp_path, views):
+    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+    (folder / "scan-set.json").write_text(json.dumps({"schema": "relit.scan-set/1", "name": "figure", "scans": [
+        {"name": f"s{number}", "path": f"scan_{24 * number}.ply"} for number in range(2)]}))
+    relit("register", folder, "--out", tmp_path / "out")
+    said = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"] if (tmp_path / "out" / "report.json").exists() else []
+    assert any("s0, s1: viewpoint_m is missing" in warning for warning in said)
+
+
+def test_frames_of_a_depth_camera(relit, tmp_path, views):
+    """Millimetres, edges that are left out, and poses in the axes of OpenCV, a little off a rotation."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    focal = views[0].camera.focal_px[0]
+    height, width = views[0].mask.shape
+    (folder / "camera-intrinsics.txt").write_text(f"{focal} 0 {width / 2 - 0.5}\n0 {focal} {height / 2 - 0.5}\n0 0 1\n")
+    for number, view in enumerate(views[:2]):
+        cv2.imwrite(str(folder / f"f{number}.depth.png"), np.where(view.mask, 1000 * view.true_depth, 0).round().astype(np.uint16))
+        pose = view.world_from_scan @ np.diag([1.0, -1, -1, 1])
+        pose[:3, :3] *= 1 + 1e-4
+        np.savetxt(folder / f"f{number}.pose.txt", pose)
+    said = relit.done("import", "scans", folder, tmp_path / "set").out
+    assert "2 depth images" in said and "nearest" in said
+    scans = json.loads((tmp_path / "set" / "scan-set.json").read_text())["scans"]
+    for entry, view in zip(scans, views, strict=False):
+        assert np.array(entry["scan_to_world"]) == pytest.approx(view.world_from_scan, abs=1e-6)
+        depth = DepthMaps.read(tmp_path / "set" / entry["path"] / "depth.exr")
+        assert np.abs(depth.depth - view.true_depth)[depth.mask].max() < 0.0006  # half a millimetre is rounded
+        assert 0.3 < depth.mask.sum() / view.mask.sum() < 1 and not depth.mask[~view.mask].any()
+        points, truth = depth.camera.points(-depth.depth), view.camera.points(-view.true_depth)
+        assert np.abs(points - truth)[depth.mask].max() < 0.001
+    assert "depth images are converted" in relit.refused("import", "scans", folder)
+    (folder / "camera-intrinsics.txt").write_text("1 2 3")
+    assert "camera-intrinsics.txt" in relit.refused("import", "scans", folder, tmp_path / "other")

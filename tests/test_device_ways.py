@@ -1,0 +1,54 @@
+"""The products on another device than the CPU: CUDA where present, or the emulated device (`--device-emulated`), where what each stage asks
+of the device is what device_counts.txt says.
+
+A change that asks for more or less writes the table anew: python -m tests.device_ways.
+"""
+
+import numpy as np
+import pytest
+
+from tests import emulated_device
+from tests.device_ways import SIDES, WAYS, Counting, count, read, results
+
+SMALL, LARGE = SIDES
+ITERATED = "diagnosis", "height", "surface", "start"
+"""Stages whose solvers stop at a residual: how many iterations they take depends on the last bits of the processor, and so do all counts
+but the bytes uploaded. The first start of a process waits twice more than later ones."""
+
+
+@pytest.fixture(autouse=True)
+def only_where_it_is(device):
+    if device == "cpu":
+        pytest.skip("compares another device with the CPU")
+
+
+def rows_of(way, side):
+    return steady(row for row in read() if (row.way, row.side) == (way, side))
+
+
+def steady(rows):
+    uploaded = list(emulated_device.COUNTED).index("up")
+    return [row._replace(counts=row.counts[uploaded:uploaded + 1]) if row.stage in ITERATED else row for row in rows]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
+    """Lanes of a pack stop their iterations together, and packs differ in width: a value in a hundred may be off by 1e-3 of the largest."""
+    captured = WAYS[way].write(tmp_path, SMALL)
+    WAYS[way].run(tmp_path, tmp_path / "cpu", "cpu", Counting())
+    rows = count(way, SMALL, captured, tmp_path, tmp_path / "out", device)
+    known, found = results(tmp_path / "cpu"), results(tmp_path / "out")
+    assert known and known.keys() == found.keys()
+    for layer, values in known.items():
+        off = np.abs(values.astype(float) - found[layer])
+        assert np.mean(off > 1e-3 * np.abs(values).max()) <= 0.01, layer
+    if device == emulated_device.NAME:
+        assert steady(rows) == rows_of(way, SMALL)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("way", WAYS)
+def test_what_a_larger_scene_asks_of_the_device(way, device, tmp_path):
+    if device != emulated_device.NAME:
+        pytest.skip("counted on the emulated device")
+    assert steady(count(way, LARGE, WAYS[way].write(tmp_path, LARGE), tmp_path, tmp_path / "out", device)) == rows_of(way, LARGE)
