@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.gpu.work import launches_run_by
 from kernels import device as devices
 from service.requests.solve import Method
 from tests import device_ways, emulated_device
@@ -95,7 +95,7 @@ def timed_launches() -> Iterator[list[float]]:
             command.launch()
         taken[0] += time.thread_time() - began
 
-    with launches_run_by(run):
+    with patch.object(devices.Recorded, "run", run):
         yield taken
 
 

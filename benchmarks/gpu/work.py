@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import warp as wp
@@ -89,17 +90,6 @@ class Table:
 
 
 @contextmanager
-def launches_run_by(run: Callable[[devices.Recorded], None]) -> Iterator[None]:
-    """Let a function run all launches until the block ends."""
-    plain = devices.Recorded.run
-    devices.Recorded.run = run  # type: ignore[assignment, method-assign]
-    try:
-        yield
-    finally:
-        devices.Recorded.run = plain  # type: ignore[method-assign]
-
-
-@contextmanager
 def counted_launches() -> Iterator[list[devices.Recorded]]:
     """Yield a list to which each launch is added."""
     launches: list[devices.Recorded] = []
@@ -109,7 +99,7 @@ def counted_launches() -> Iterator[list[devices.Recorded]]:
         launches.append(recorded)
         plain(recorded)
 
-    with launches_run_by(run):
+    with patch.object(devices.Recorded, "run", run):
         yield launches
 
 

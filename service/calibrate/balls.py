@@ -15,7 +15,8 @@ from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, ball_from_circle, project, view_ball
 from service.light_estimation.ball_outline import ball_from_mask
 from service.light_estimation.grey_ball import fit_brightness, fit_direction
-from service.requests.calibrate import BallRequest, RigCalibrationRequest
+from service.requests.calibrate import BallRequest
+from service.requests.rig import RigCalibrationRequest
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME

@@ -23,7 +23,7 @@ from service.calibrate.solvers.lamp_response import LEAST_DRIVES, MeasuredPrimar
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, view_ball
 from service.reporting.progress import Progress, Timings
-from service.requests.calibrate import RigCalibrationRequest, RigTarget
+from service.requests.rig import RigCalibrationRequest, RigTarget
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight
 from stage.capture.manifest import Frame

@@ -18,10 +18,10 @@ from service.requests.calibrate import (
     MirrorBallOptions,
     ProcamOptions,
     ResponseOptions,
-    RigCalibrationOptions,
     WhiteBalanceOptions,
 )
 from service.requests.drive import RIG, RigDocument
+from service.requests.rig import RigCalibrationOptions
 from stage.model import Line
 
 MOST_CAPTURES = 100

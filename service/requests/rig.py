@@ -1,11 +1,12 @@
-"""The options of `relit rig`."""
+"""The options of `relit rig` and of `relit calibrate rig`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from service.requests.base.base import CAPTURE, Choice, Commas, Options, Role, Spelling
+from service.requests.base.base import CAPTURE, Choice, Commas, CropBox, Options, Role, Spelling
+from service.requests.calibrate import MirrorBallOptions, albedo_channels
 from service.requests.drive import RIG
 from service.requests.light.picture_options import FrameRate
 from service.requests.play import Protocol
@@ -106,3 +107,50 @@ class RigPlanRequest(Options):
     """Numbers of lamps, with commas between; they are spread evenly over the sphere."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder of the results: plan.csv and plan.png."""
+
+
+GridCount = Annotated[int, Field(ge=2, le=100)]
+
+
+class RigTarget(Choice):
+    """The target from which the lamps of a rig are measured."""
+
+    GREY_BALL = "grey-ball", "a matt ball of known albedo"
+    MIRROR_BALL = "mirror-ball", "a mirror ball, in which no lamp is saturated"
+    CARD = "card", "a grey card, or a neutral patch of a colour chart"
+    CHART = "chart", "a colour chart of known reflectances, whose readings under each primary `relit drive --chart` takes"
+
+
+class RigCalibrationOptions(MirrorBallOptions):
+    """The target in the images of a rig's lamps."""
+
+    target: RigTarget = RigTarget.GREY_BALL
+    """What the lamps light."""
+    region: Annotated[CropBox | None, Commas, Spelling(metavar="X,Y,W,H")] = None
+    """Part of the images that the card fills: first column, first row, width and height in pixels."""
+    card_normal: Annotated[tuple[Finite, Finite, Finite], Commas, Spelling(metavar="X,Y,Z")] = (0.0, 0.0, 1.0)
+    """The direction in which the card or chart faces, in the camera frame; 0,0,1: towards the camera."""
+    corners: Annotated[tuple[Finite, ...], Field(min_length=8, max_length=8), Commas, Spelling(metavar="U,V,…")] | None = None
+    """Pixels of the centres of four patches of the chart: the first, the last of the first row, the last, and the first of the last row."""
+    grid: Annotated[tuple[GridCount, GridCount], Commas, Spelling(metavar="COLUMNS,ROWS")] = (6, 4)
+    """Columns and rows of the chart's patches."""
+    albedo: Annotated[tuple[Positive, Positive, Positive] | None, BeforeValidator(albedo_channels), Spelling(metavar="R,G,B")] = None
+    """Albedo of the ball or card, reflectance of the mirror, one number or three; None: the mean of all irradiances is set to 1."""
+
+
+class RigCalibrationRequest(RigCalibrationOptions):
+    """Irradiance, colour and response of each primary of a rig, from a capture in which one primary shines at a time."""
+
+    capture: Annotated[Path, Role.INPUT, CAPTURE]
+    """Folder of a capture with a frame for each primary and level; its lights may be placeholders."""
+    rig: Annotated[Path, Role.INPUT, RIG]
+    """The rig that was driven (JSON, schema relit.rig/1); docs/drive.md."""
+    table: Annotated[Path, Role.INPUT, Spelling(metavar="TABLE.csv")]
+    """What each frame shows: CSV with the columns frame, light, primary, level, as the cues.csv of `relit rig sweep`; a frame is an
+    image, or its number in the capture from 1."""
+    out: Annotated[Path, Role.OUTPUT]
+    """The rig file to write, with calibration.json beside it, and chart.json where a chart is the target."""
+    masks: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--ball-mask")] = ()
+    """Mask image of the ball, in place of `ball`; more precise."""
+    reflectances: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE.csv")] = None
+    """The chart's reflectances in the capture's colour space: CSV with the columns name, r, g, b, its patches in reading order."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.requests.imports import ScansImport
+from service.requests.imports.scans import ScansImport
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.rigid import nearest_rigid
 from service.scans.rgbd import DEPTH, depth_names, write_frames

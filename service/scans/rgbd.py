@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from service.requests.imports import ScansImport
+from service.requests.imports.scans import ScansImport
 from service.scans.points.rigid import nearest_rigid
 from stage.capture.camera import Camera
 from stage.errors import ManifestError

@@ -1,9 +1,13 @@
 """Candidate normals: rings about a normal, on the host and in kernels."""
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
+
+from kernels.device import once
+from kernels.packs import pack_type
 
 LEAST_NZ = 0.02
 """Least cosine between a candidate and the viewer: a visible surface faces the viewer."""
@@ -38,3 +42,21 @@ def candidate_at(n: wp.vec3, offset: wp.vec4, v: wp.vec3):
     moved = offset[1] * n + offset[0] * (offset[2] * tangent + offset[3] * other)
     moved += wp.max(LEAST_NZ - wp.dot(moved, v), 0.0) * v
     return moved * (1.0 / wp.sqrt(wp.dot(moved, moved)))
+
+
+@once
+def candidate_packs(lanes: int) -> Any:
+    """Return the Warp function that is `candidate_at` for packs: components of the normals and views in, those of the candidates out."""
+    lane_type = pack_type(lanes, wp.float32)
+
+    @wp.func
+    def candidates_at(nx: lane_type, ny: lane_type, nz: lane_type, offset: wp.vec4, vx: lane_type, vy: lane_type, vz: lane_type):
+        x, y, z = lane_type(), lane_type(), lane_type()
+        for k in range(lanes):
+            moved = candidate_at(wp.vec3(nx[k], ny[k], nz[k]), offset, wp.vec3(vx[k], vy[k], vz[k]))
+            x[k] = moved[0]
+            y[k] = moved[1]
+            z[k] = moved[2]
+        return x, y, z
+
+    return candidates_at

@@ -14,7 +14,7 @@ from kernels import device as devices
 from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type, vector_at
-from kernels.photometric.model.candidates import candidate_at
+from kernels.photometric.model.candidates import candidate_packs
 from kernels.photometric.model.lobes import Lobes
 from kernels.photometric.model.samples import Samples, per_pixel, samples_type, scratch_memory, scratch_type, to_host
 from kernels.photometric.model.tabulated_lobes import tabulated_lobes
@@ -79,6 +79,7 @@ def score_normals(samples: Samples, centre: np.ndarray, offsets: np.ndarray, *, 
 def _score_kernel(lanes: int, lobes: Lobes) -> Any:
     lane_type, samples_struct, scratch_struct = pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes)
     mixture, _, relaxation, _, fill = lobes
+    candidates_at = candidate_packs(lanes)
     coefficients = wp.types.matrix(shape=(mixture, lanes), dtype=wp.float32)
     gram = wp.types.matrix(shape=(mixture * (mixture + 1) // 2, lanes), dtype=wp.float32)
 
@@ -107,13 +108,7 @@ def _score_kernel(lanes: int, lobes: Lobes) -> Any:
                 brightest[k] = wp.max(brightest[k], reading[k])
         x = coefficients()
         for candidate in range(offsets.shape[0]):
-            o = offsets[candidate]
-            nx, ny, nz = lane_type(), lane_type(), lane_type()
-            for k in range(lanes):
-                n = candidate_at(wp.vec3(cx[k], cy[k], cz[k]), o, wp.vec3(vx[k], vy[k], vz[k]))
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
+            nx, ny, nz = candidates_at(cx, cy, cz, offsets[candidate], vx, vy, vz)
             fill(samples, table, wp.vec2(), nx, ny, nz, p, scratch)
             total, lit, bright, bright2, dim, dim2 = lane_type(), lane_type(), lane_type(), lane_type(), lane_type(), lane_type()
             for turn in range(REWEIGHTINGS + 1):

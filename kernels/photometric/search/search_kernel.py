@@ -7,7 +7,7 @@ import warp as wp
 from kernels.device import once
 from kernels.elementary import log_of
 from kernels.packs import pack_type, vector_at
-from kernels.photometric.model.candidates import candidate_at, tangents
+from kernels.photometric.model.candidates import candidate_packs, tangents
 from kernels.photometric.model.lobes import Lobes
 from kernels.photometric.model.robust_weights import LARGEST_SQUARE, LOG_GROUP, Criteria, weigh_grey
 from kernels.photometric.model.samples import samples_type, scratch_type
@@ -39,6 +39,7 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
     lane_type, samples_struct, scratch_struct, search_struct = (pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes),
                                                                 search_type(lanes))
     mixture, _, relaxation, prepare, fill = lobes
+    candidates_at = candidate_packs(lanes)
     coefficients = wp.types.matrix(shape=(mixture, lanes), dtype=wp.float32)
     gram = wp.types.matrix(shape=(mixture * (mixture + 1) // 2, lanes), dtype=wp.float32)
     triples = wp.types.matrix(shape=(3, lanes), dtype=wp.float32)
@@ -71,12 +72,7 @@ def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> A
         x_found = coefficients()
         for candidate in range(offsets.shape[0]):
             o = offsets[candidate]
-            nx, ny, nz = lane_type(), lane_type(), lane_type()
-            for k in range(lanes):
-                n = candidate_at(wp.vec3(cx[k], cy[k], cz[k]), o, wp.vec3(vx[k], vy[k], vz[k]))
-                nx[k] = n[0]
-                ny[k] = n[1]
-                nz[k] = n[2]
+            nx, ny, nz = candidates_at(cx, cy, cz, o, vx, vy, vz)
             fill(samples, table, criteria.form, nx, ny, nz, p, scratch)
             # the robust non-negative mixture
             x_best = coefficients()

@@ -20,12 +20,12 @@ from service.requests.calibrate import (
     MirrorBallRequest,
     ProcamRequest,
     ResponseRequest,
-    RigCalibrationRequest,
     SaturationRequest,
     StereoRequest,
     TofCalibrationRequest,
     WhiteBalanceRequest,
 )
+from service.requests.rig import RigCalibrationRequest
 
 if TYPE_CHECKING:
     from service.calibrate.images import ImageCalibration

@@ -8,30 +8,22 @@ import typer
 
 from service.cli.groups import make_group
 from service.cli.request_commands import local_command
-from service.requests.imports import (
-    DiligentImport,
+from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
+from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
+from service.requests.imports.patterns import (
     ExposureOrder,
     GrayImport,
-    ImageOptions,
-    ImportRequest,
     LaserImport,
-    LensOptions,
-    LpImport,
-    NearLightsImport,
-    OlatImport,
     OpencvGrayImport,
     PatternImageOptions,
     PhaseImport,
     PhaseShift,
-    PhotosImport,
-    RelightlabImport,
     RigOptions,
     ScannerImport,
-    ScansImport,
-    Sense,
     WaveOrigin,
 )
-from service.requests.imports_tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
+from service.requests.imports.scans import ScansImport
+from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
 
 if TYPE_CHECKING:

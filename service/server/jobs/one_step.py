@@ -177,13 +177,14 @@ def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.Stereo
 
 def _calibrate_lamps(request: calibration_jobs.RigCalibrationJob, files: StepFiles) -> None:
     from service.calibrate.rig import calibrate_rig
+    from service.requests.rig import RigCalibrationRequest
 
     rig = files.out / RIG_FILE
     write_text(rig, request.rig.model_dump_json(by_alias=True) + "\n")
     folder = files.intake(request.capture)
     table = file_within(folder, request.table, "table")
     reflectances = None if request.reflectances is None else file_within(folder, request.reflectances, "reflectances")
-    calibrate_rig(files.request(calibrate.RigCalibrationRequest, request, rig=rig, table=table, reflectances=reflectances,
+    calibrate_rig(files.request(RigCalibrationRequest, request, rig=rig, table=table, reflectances=reflectances,
                                 out=files.out / MEASURED_FILE, capture=folder), files.progress)
 
 

@@ -18,7 +18,6 @@ from service.requests import (
     depth,
     drive,
     export,
-    imports,
     jobs,
     keys,
     patterns,
@@ -32,7 +31,10 @@ from service.requests import (
 from service.requests.base.base import Choice, Options, Role
 from service.requests.base.options import build, help_text, options_of, typed, values_of
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
-from service.requests.imports_tof import HistogramImport, KinectImport, TofImport
+from service.requests.imports import lights
+from service.requests.imports import patterns as pattern_images
+from service.requests.imports.scans import ScansImport
+from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
 from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
 
 COMMANDS: dict[str, list[type[Options]]] = {
@@ -46,12 +48,13 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "play": [play.PlayRequest], "capture": [acquire.AcquireRequest], "twin": [play.TwinRequest],
     "basis": [basis.BasisRequest], "view": [captures.ViewRequest], "demo": [demo.DemoRequest],
     "bench": [demo.BenchRequest],
-    "import diligent": [imports.DiligentImport], "import lp": [imports.LpImport], "import olat": [imports.OlatImport],
-    "import opencv-gray": [imports.OpencvGrayImport], "import near-lights": [imports.NearLightsImport],
-    "import photos": [imports.PhotosImport],
-    "import relightlab": [imports.RelightlabImport], "import gray": [imports.GrayImport], "import phase": [imports.PhaseImport],
-    "import scanner": [imports.ScannerImport], "import tof": [TofImport], "import histogram": [HistogramImport],
-    "import kinect": [KinectImport], "import laser": [imports.LaserImport],
+    "import diligent": [lights.DiligentImport], "import lp": [lights.LpImport], "import olat": [lights.OlatImport],
+    "import opencv-gray": [pattern_images.OpencvGrayImport], "import near-lights": [lights.NearLightsImport],
+    "import photos": [lights.PhotosImport],
+    "import relightlab": [lights.RelightlabImport], "import gray": [pattern_images.GrayImport],
+    "import phase": [pattern_images.PhaseImport], "import scans": [ScansImport],
+    "import scanner": [pattern_images.ScannerImport], "import tof": [TofImport], "import histogram": [HistogramImport],
+    "import kinect": [KinectImport], "import laser": [pattern_images.LaserImport],
     "drive": [drive.DriveRequest], "rig check": [rig.RigCheckRequest], "rig from-capture": [rig.RigFromCaptureRequest],
     "rig from-csv": [rig.RigFromCsvRequest], "rig from-mvr": [rig.RigFromMvrRequest], "rig plan": [rig.RigPlanRequest],
     "rig sweep": [rig.RigSweepRequest],
@@ -63,7 +66,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "calibrate laser-planes": [calibrate.LaserPlanesRequest],
     "calibrate procam": [calibrate.ProcamRequest],
     "calibrate stereo": [calibrate.StereoRequest], "calibrate response": [calibrate.ResponseRequest],
-    "calibrate tof": [calibrate.TofCalibrationRequest], "calibrate rig": [calibrate.RigCalibrationRequest],
+    "calibrate tof": [calibrate.TofCalibrationRequest], "calibrate rig": [rig.RigCalibrationRequest],
     **{f"submit {kind}": [model] for kind, model in jobs.JOBS.items()},
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }

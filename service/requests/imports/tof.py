@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from service.requests.base.base import Choice, Commas, Role, Spelling, WidthHeight
-from service.requests.imports import CameraOptions, ImportRequest
+from service.requests.imports.base import CameraOptions, ImportRequest
 from stage.model import Count, Finite, Line, Positive, Resolution
 
 

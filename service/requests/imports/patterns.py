@@ -1,57 +1,15 @@
-"""The options of `relit import`: one frozen model for each layout of files."""
+"""The options of `relit import` for images of projected patterns and of laser stripes."""
 
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from service.requests.base.base import Choice, Commas, Options, Role, Spelling, WidthHeight
+from service.requests.imports.base import Axes, ImageOptions, ImportRequest, LensOptions
 from service.requests.patterns import PatternAxis
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.model import Count, Finite, Line, Positive, Resolution
-
-
-class ImportRequest(Options):
-    """Base of every layout: where the files are, and where the capture comes to be."""
-
-    source: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SRC")]
-    """Folder of the data."""
-    destination: Annotated[Path | None, Role.OUTPUT, Spelling(argument=True, metavar="DST")] = None
-    """Folder for the capture, which gets links to the files; None: SRC, where nothing but capture.json is written."""
-
-    @property
-    def folder(self) -> Path:
-        """The folder for the capture."""
-        return self.destination or (self.source.parent if self.source.is_file() else self.source)
-
-
-class DiligentImport(ImportRequest):
-    """An object's folder of the DiLiGenT benchmark."""
-
-
-class ScanUnit(Choice):
-    """The unit of coordinates."""
-
-    M = "m"
-    CM = "cm"
-    MM = "mm"
-    UM = "um"
-    INCH = "in"
-
-
-class ScansImport(ImportRequest):
-    """PLY files of one object scanned from several places, whose scanner is found, or the frames of a depth camera, as a scan set."""
-
-    unit: ScanUnit = ScanUnit.M
-    """The unit of the coordinates."""
-    viewpoint_m: Annotated[tuple[Finite, Finite, Finite] | None, Commas, Spelling(flag="--viewpoint", metavar="X,Y,Z")] = None
-    """Where the scanner stood in the frame of every scan, metres; None: it is estimated."""
-    poses: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE.conf")] = None
-    """Poses of the scans, in the format of the Stanford 3D Scanning Repository; None: the only .conf file of SRC, if there is one."""
-    every: Count = 1
-    """Take the first of so many depth images."""
-    depth_unit_m: Positive = 0.001
-    """Metres in one unit of a depth image."""
 
 
 class OpencvGrayImport(ImportRequest):
@@ -64,133 +22,6 @@ class OpencvGrayImport(ImportRequest):
     such a file."""
     unit_m: Positive = 1.0
     """Metres in one unit of T, such as 0.001 for millimetres."""
-
-
-def _one_or_two(values: tuple[float, ...]) -> tuple[float, ...]:
-    if len(values) not in (1, 2):
-        raise ValueError("give one focal length, or two with a comma between")
-    return values
-
-
-def _four_or_five(values: tuple[float, ...]) -> tuple[float, ...]:
-    if len(values) not in (4, 5):
-        raise ValueError("give k1,k2,p1,p2 or k1,k2,p1,p2,k3")
-    return values
-
-
-class LensOptions(Options):
-    """Focal length, principal point and distortion of a camera's lens."""
-
-    focal_px: Annotated[tuple[Positive, ...] | None, Commas, AfterValidator(lambda v: v and _one_or_two(v)),
-                        Spelling(metavar="F[,F]")] = None
-    """Focal length in pixels, one or that of columns and rows; None: the camera is orthographic."""
-    principal_px: Annotated[tuple[Finite, Finite] | None, Commas, Spelling(metavar="U,V")] = None
-    """Principal point in pixels, where the centre of the first pixel is 0.5,0.5 (add 0.5 to OpenCV's); None: the centre of the image."""
-    distortion: Annotated[tuple[Finite, ...] | None, Commas, AfterValidator(lambda v: v and _four_or_five(v)),
-                          Spelling(metavar="K1,K2,P1,P2[,K3]")] = None
-    """Lens distortion as OpenCV has it."""
-
-
-class CameraOptions(LensOptions):
-    """The camera; without a focal length it is taken to be orthographic."""
-
-    pixel_size_m: Positive | None = None
-    """Orthographic camera: side of a pixel on the object, metres; None: heights are in pixels."""
-    surface_z_m: Finite | None = None
-    """Mean z of the object in the camera frame, metres: negative before a perspective camera. None: under near lights relit solve
-    estimates it; else it is 0 for an orthographic camera."""
-
-
-class EncodingOptions(Options):
-    """The encoding of images."""
-
-    color_space: ColorSpaceName | None = None
-    """Colour space of the images; None: sRGB for 8-bit images, scene-linear for others."""
-
-
-class LpImport(CameraOptions, EncodingOptions, ImportRequest):
-    """An RTI light list (.lp) with its images; SRC may be the .lp file."""
-
-
-class ImageOptions(EncodingOptions):
-    """The images of the folder that are frames, and their encoding."""
-
-    images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
-    """Names of the frames, such as 'img_*.png'; None: every image but the mask and the ambient image."""
-    mask: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image of the mask; None: the one with the word mask in its name, if there is one."""
-    ambient: Annotated[Line | None, Spelling(metavar="NAME")] = None
-    """Image without any of the lights, which is subtracted; None: the one with the word ambient in its name, if there is one."""
-
-
-class Sense(Choice):
-    """The direction of the vectors of a table."""
-
-    TO_LIGHT = "to-light", "directions to the light, or its position seen from the object"
-    FROM_LIGHT = "from-light", "along the rays, away from the light"
-
-
-class Run(Choice):
-    """The rows or columns of a table of numbers, each a light."""
-
-    ROWS = "rows"
-    COLUMNS = "columns"
-
-
-class AxisWay(Choice):
-    """The direction of an axis, as seen by the camera."""
-
-    RIGHT = "right"
-    LEFT = "left"
-    UP = "up"
-    DOWN = "down"
-    TOWARDS = "towards"
-    AWAY = "away"
-
-
-Axes = Annotated[tuple[AxisWay, AxisWay, AxisWay], Commas, Spelling(metavar="X,Y,Z")]
-
-
-class OlatImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one far light each, with a table of the lights: .csv, .txt, .json, .mat or .npy."""
-
-    axes: Axes
-    """Where x, y and z of the table point as seen by the camera: right or left, up or down, towards the camera or away from it. relit and
-    OpenGL have right,up,towards, OpenCV has right,down,away."""
-    sense: Annotated[Sense, Spelling(flag="--vectors")]
-    """The meaning of the vectors of the table."""
-    lights: Annotated[Path | None, Role.INPUT] = None
-    """Table of the lights: rows of an image name or none, three numbers, and one or three of the strength or none; None: the only table in
-    SRC."""
-    variable: Line | None = None
-    """Variable of a .mat table, or key of a .json; None: the only one that can be meant."""
-    lights_in: Run | None = None
-    """A light's numbers in the table are a row or a column; None: as its shape says."""
-    strengths: Annotated[Path | None, Role.INPUT] = None
-    """File with the strength of each light, one or three numbers; None: that in the table, else equal."""
-
-
-class PhotosImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one far light each where nothing says where the lights were: relit solve --lights unknown finds them, or relit
-    calibrate measures them."""
-
-
-class NearLightsImport(CameraOptions, ImageOptions, ImportRequest):
-    """Images under one near light each (LEDs), with a .mat or .json file of the rig as near_ps has it: S, Dir, Phi and mu."""
-
-    axes: Axes
-    """Where x, y and z of the rig point as seen by the camera, whose centre is their origin: right or left, up or down, towards the camera
-    or away from it. near_ps and OpenCV have right,down,away."""
-    unit_m: Positive
-    """Metres in one unit of the positions: near_ps has millimetres, 0.001."""
-    lights: Annotated[Path | None, Role.INPUT] = None
-    """File of the rig: positions and, if they are known, directions, intensities and mu (anisotropy); None: the only table in SRC."""
-    camera: Annotated[Path | None, Role.INPUT] = None
-    """File with the matrix of the camera: K of a .mat file, or an OpenCV file (.yml, .xml, .json); None: as the other options say."""
-
-
-class RelightlabImport(EncodingOptions, ImportRequest):
-    """A project of RelightLab (.relight), or its dome (.dome) beside the images; SRC may be the file."""
 
 
 class PlaneForm(Choice):
