@@ -44,7 +44,7 @@ class Projector:
         listening = page_socket(port, "--projector-port")
         self.address = page_address(listening)
         """The address of the page."""
-        self._server = uvicorn.Server(uvicorn.Config(self._app(), ws="none", log_level="warning", access_log=False,
+        self._server = uvicorn.Server(uvicorn.Config(self._app(), ws="none", log_config=None, log_level="warning", access_log=False,
                                                      timeout_graceful_shutdown=1))
         self._thread = threading.Thread(target=self._server.run, args=[[listening]], name="relit-projector", daemon=True)
         self._thread.start()

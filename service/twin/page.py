@@ -29,7 +29,7 @@ PICTURE_ROWS = 480
 def serve_page(listening: socket.socket, rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCamera | None) -> None:
     """Serve the page on a socket until the program is interrupted."""
     app = make_app(rig, listener, picture, camera)
-    config = uvicorn.Config(app, ws="none", log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    config = uvicorn.Config(app, ws="none", log_config=None, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
     uvicorn.Server(config).run(sockets=[listening])
 
 

@@ -1,6 +1,7 @@
 """Patterns through the page in a browser: a camera that sees the window pixel by pixel decodes where each pixel of the projector is."""
 
 import json
+import logging
 import threading
 from pathlib import Path
 
@@ -78,6 +79,7 @@ def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_pa
     assert (result.there, result.faults) == (42 + 12, ())  # white and black once
     decoded = depth(DepthRequest(capture=request.out, out=tmp_path / "depth"))
     channels, _ = exr.read(decoded.depth_path)
+    assert logging.getLogger("uvicorn").propagate  # the page leaves the logging of the program as it is
     u, v, mask = channels["projector.U"], channels["projector.V"], channels["mask.Y"] > 0
     assert mask.mean() > 0.99
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
