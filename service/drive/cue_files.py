@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.drive.chart_view import ChartView
 from service.drive.dilation import Dilated
 from service.drive.judgement import Judgement
 from service.drive.light import Light
@@ -87,7 +88,7 @@ def drive_warnings(rig: Rig, light: Light, wanted: WantedLevels, dilated: Dilate
 
 
 def report_sections(light: Light, wanted: WantedLevels, dilated: Dilated, quantised: Quantised, judgement: Judgement, unrounded: Judgement,
-                    rig: Rig, exposure: float, numbers: Sequence[int]) -> dict[str, object]:
+                    rig: Rig, exposure: float, numbers: Sequence[int], chart: ChartView | None) -> dict[str, object]:
     """Return the sections of the report."""
     change = np.abs(np.diff(quantised.level, axis=0)).max(initial=0)
     share = np.abs(np.diff(wanted.level, axis=0)).max(initial=0)
@@ -97,6 +98,7 @@ def report_sections(light: Light, wanted: WantedLevels, dilated: Dilated, quanti
         "irradiance_error": {"rms_percent": _spread(100 * judgement.rms), "chromaticity_uv": _spread(judgement.chromaticity),
                              "energy": _spread(judgement.energy),
                              "quantisation_percent": _spread(100 * np.abs(judgement.rms - unrounded.rms))},
+        **({} if chart is None else {"chart": {"rms_percent": _spread(100 * chart.rms)}}),
         "limits": {"frames": int((dilated.radius > 0).sum()), "dilation_degrees": float(np.degrees(dilated.radius.max())),
                    "left_out": dilated.left.sum(axis=0).tolist(), "out_of_gamut": wanted.out_of_gamut.sum(axis=0).tolist(),
                    "beyond_share": float(light.beyond.max())},

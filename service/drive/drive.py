@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
+from service.drive.chart_view import view_chart
 from service.drive.cue_files import drive_warnings, report_sections, write_cue_files
 from service.drive.dilation import Dilated, dilate
 from service.drive.judgement import Judgement
@@ -94,12 +95,13 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     factor = exposure * 2.0**light.stops
     judgement, unrounded = (judge_all(light, level, rig, factor) for level in (quantised.level, dilated.level))
     timings.advance(4)
+    shown = None if chart is None else view_chart(chart, rig, light.far, quantised.level, factor)
     warnings = tuple(drive_warnings(rig, light, wanted, dilated, factor, environments))
     rate = request.frames_per_second or (None if keys is None else keys.frames_per_second) or FRAMES_PER_SECOND
-    sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers)
+    sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers, shown)
     timings.stage("files", 1)
     cues, report = write_cue_files(request, rig, quantised, numbers, rate, sections, warnings, timings)
-    picture = write_picture(request.out, rig, light.far, quantised.level, factor, numbers)
+    picture = write_picture(request.out, rig, light.far, quantised.level, factor, numbers, shown)
     if request.capture is not None:
         camera = TwinPicture(rig, TwinRequest(rig=request.rig, capture=request.capture, device=device, cache=request.cache), timings)
         warnings += tuple(camera.warnings)

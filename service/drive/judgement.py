@@ -79,6 +79,17 @@ def irradiance_of(direction: np.ndarray, energy: np.ndarray, normals: np.ndarray
     return found
 
 
+def far_irradiance(light: FarLight, normals: np.ndarray, most_rows: int = FOLDED_ROWS) -> np.ndarray:
+    """Return the irradiance [normals, 3] of surfaces of these normals [normals, 3] under the light of a frame, before its exposure."""
+    found = np.zeros((len(normals), 3))
+    if light.environment is not None:
+        found += irradiance_of(*environment_samples(light.environment, most_rows), normals @ light.rotation) * light.gain
+    for disc in light.discs:
+        samples = disc_light(disc, disc_samples(disc.direction, disc.angle_degrees))
+        found += irradiance_of(samples.direction, samples.energy, normals)
+    return found
+
+
 def environment_samples(environment: EnvironmentMap, most_rows: int = FOLDED_ROWS) -> tuple[np.ndarray, np.ndarray]:
     """Return samples of a map, unit vectors [n, 3] and their energies [n, 3], as many as a map of `most_rows` rows has or fewer.
 

@@ -1,13 +1,13 @@
-"""The picture of a drive: the environment, what a mirror ball and a matte ball show under it and under the lamps, and their difference."""
+"""The picture of a drive: the environment, what a mirror ball, a matte ball and a chart show under it and under the lamps."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from kernels.relight.model.sources import disc_samples
-from service.drive.judgement import environment_samples, irradiance_of, lamp_irradiance
-from service.relight.far_light import FarLight, disc_light
+from service.drive.chart_view import ChartView
+from service.drive.judgement import far_irradiance, irradiance_of, lamp_irradiance
+from service.relight.far_light import FarLight
 from service.relight.sheet import BACKGROUND, display, write_sheet
 from stage.rig.rig import Rig
 
@@ -28,7 +28,8 @@ LAMP_COSINE = float(np.cos(np.radians(4.0)))
 """Half the width at which lamps are drawn."""
 
 
-def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, numbers: Sequence[int]) -> Path:
+def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, numbers: Sequence[int],
+                  chart: ChartView | None) -> Path:
     """Write the picture into a folder and return its path.
 
     Args:
@@ -38,25 +39,21 @@ def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.nda
         level: [frames, emitters] of `rig.emitters`, 0…1.
         exposure: [frames] factor on the light.
         numbers: of the frames.
+        chart: what it shows in each frame; None: there is none.
     """
     shown = np.linspace(0, len(far), min(MOST_ROWS, len(far)), endpoint=False).astype(int)
-    rows = [_row(rig, far[index], level[index], exposure[index], numbers[index]) for index in shown]
+    rows = [_row(rig, far[index], level[index], exposure[index], numbers[index], None if chart is None else chart.picture(index))
+            for index in shown]
     path = folder / PICTURE_FILE
     write_sheet(path, rows)
     return path
 
 
-def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: int) -> list[tuple[str, np.ndarray]]:
+def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: int,
+         chart: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
     energy = lamp_irradiance(level[None], rig)[0]
     normal, on_ball = _ball()
-    parts = [] if light.environment is None else [environment_samples(light.environment, SAMPLE_ROWS)]
-    directions = [parts[0][0] @ light.rotation.T] if parts else []
-    energies = [parts[0][1] * light.gain] if parts else []
-    for disc in light.discs:
-        samples = disc_light(disc, disc_samples(disc.direction, disc.angle_degrees))
-        directions.append(samples.direction)
-        energies.append(samples.energy)
-    wanted = irradiance_of(np.concatenate(directions), np.concatenate(energies), normal) * exposure
+    wanted = far_irradiance(light, normal, SAMPLE_ROWS) * exposure
     given = irradiance_of(rig.directions, energy, normal)
     scale = GREY / max(float(wanted.mean()), np.finfo(float).tiny)
     reflected = 2 * normal[:, 2:] * normal - np.array([0.0, 0.0, 1.0])
@@ -75,6 +72,8 @@ def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: 
     tiles = [("mirror ball: environment", ball(mirrored * np.pi)), ("mirror ball: lamps", ball(lamps * np.pi)),
              ("matte ball: environment", ball(wanted)), ("matte ball: lamps", ball(given)),
              (f"{ERROR_SCALE:.0f} x difference", ball(np.abs(given - wanted) * ERROR_SCALE))]
+    if chart is not None:
+        tiles.append(("chart: environment, within it lamps", display((chart * scale).astype(np.float32), rig.color_space)))
     if light.environment is not None:
         step = -(-len(light.environment.radiance) // MAP_ROWS)
         shown = light.environment.radiance[::step, ::step] * (light.gain * exposure * scale * np.pi)

@@ -3,10 +3,15 @@
 import json
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from scipy.optimize import nnls
 
+from service.drive.chart_view import ChartView, view_chart
+from service.relight.far_light import FarLight
 from stage.formats import exr
+from stage.rig.chart import read_chart
+from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import write_exr
 from tests.scenes.rigs import NORMALS, SUN, irradiance, lamps_irradiance, read_levels, rms, write_rig, write_sky
@@ -145,6 +150,32 @@ def test_colours_that_the_lamps_lack_are_said_as_a_part_of_the_light(relit, tmp_
     outcome = relit.done("drive", tmp_path / "rig.json", "--environment", tmp_path / "sky.exr", "--exposure", exposure,
                          "--out", tmp_path / "cues")
     assert "miss up to 67%" in outcome.out
+
+
+def test_a_chart_is_shown_and_judged_under_both_lights(drive, tmp_path):
+    """Under a white sky the irradiance is π: readings of the patches follow in closed form, and from the levels for the lamps.
+
+    The green primary is read at half of its colour on the second patch, as narrow emitters are, so that this patch cannot be met.
+    """
+    rig = write_rig(tmp_path / "rig.json", fibonacci_sphere(128), bits=16, irradiance=2.0)
+    write_exr(tmp_path / "sky.exr", np.ones((64, 128, 3), dtype=np.float32))
+    target = np.array([[0.9, 0.9, 0.9], [0.2, 0.4, 0.1], [0.03, 0.03, 0.03]])
+    readings = {name: 2 * target * np.eye(3)[place] for place, name in enumerate(("red", "green", "blue"))}
+    readings["green"][1] /= 2
+    (tmp_path / "chart.json").write_text(json.dumps({"schema": "relit.chart/1", "target": target.tolist(), "primaries": {
+        name: values.tolist() for name, values in readings.items()}}))
+    (levels,), report = drive("--environment", tmp_path / "sky.exr", "--chart", tmp_path / "chart.json")
+    given = sum(levels[lamp["name"], name] * max(lamp["direction"][2], 0) * values
+                for lamp in rig["lights"] for name, values in readings.items())
+    assert report["chart"]["rms_percent"]["largest"] == pytest.approx(100 * rms(given, np.pi * target), rel=0.02)  # 64 rows of the map
+    view = view_chart(read_chart(tmp_path / "chart.json"), read_rig(tmp_path / "rig.json"), [FarLight(None, np.eye(3), 1.0, ())],
+                      np.array([[levels[lamp["name"], name] for lamp in rig["lights"] for name in readings]]), np.ones(1))
+    assert view.given[0] * 0.9 == pytest.approx(given, rel=1e-9) and not view.wanted.any()
+    sheet = ChartView(np.full((1, 3, 3), 0.25), view.given).picture(0)
+    assert (sheet[0, 0] == 0.25).all() and sheet[sheet.shape[0] // 4, 12] == pytest.approx(view.given[0, 0])
+    drive("--environment", tmp_path / "sky.exr", out="plain")
+    shown, plain = (oiio.ImageBuf(str(tmp_path / out / "preview.png")).spec().width for out in ("cues", "plain"))
+    assert shown > plain
 
 
 def test_the_levels_light_the_owl_as_relight_does(relit, drive, tmp_path):
