@@ -55,11 +55,11 @@ def cues_of(rig: Rig, quantised: Quantised, numbers: Sequence[int], rate: float)
 
 def write_table(path: Path, rows: Iterable[tuple[int, str, str, float]]) -> None:
     """Write a table of frame, lamp, primary and level whole or not at all."""
-    lines = [f"{number},{_field(light)},{_field(primary)},{level:.{DECIMALS}g}\n" for number, light, primary, level in rows]
+    lines = [f"{number},{field_of(light)},{field_of(primary)},{level:.{DECIMALS}g}\n" for number, light, primary, level in rows]
     write_text(path, "frame,light,primary,level\n" + "".join(lines))
 
 
-def _field(text: str) -> str:
+def field_of(text: str) -> str:
     """Return a text as a field of CSV."""
     return '"' + text.replace('"', '""') + '"' if any(sign in text for sign in ',"\n') else text
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from kernels import device as devices
 from service.drive.chart_view import view_chart
-from service.drive.cue_files import drive_warnings, report_sections, write_cue_files
+from service.drive.cue_files import WORTH_SAYING, drive_warnings, report_sections, write_cue_files
 from service.drive.dilation import Dilated, dilate
 from service.drive.judgement import Judgement
 from service.drive.light import collect_light, judge_all
@@ -101,7 +101,8 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     sections = report_sections(light, wanted, dilated, quantised, judgement, unrounded, rig, exposure, numbers, shown)
     timings.stage("files", 1)
     cues, report = write_cue_files(request, rig, quantised, numbers, rate, sections, warnings, timings)
-    picture = write_picture(request.out, rig, light.far, quantised.level, factor, numbers, shown)
+    titles = [_title(*frame) for frame in zip(numbers, light.beyond, dilated.radius, strict=True)]
+    picture = write_picture(request.out, rig, light.far, quantised.level, factor, titles, shown)
     if request.capture is not None:
         camera = TwinPicture(rig, TwinRequest(rig=request.rig, capture=request.capture, device=device, cache=request.cache), timings)
         warnings += tuple(camera.warnings)
@@ -111,6 +112,12 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
             timings.advance(index + 1)
     timings.close()
     return DriveResult(cues, picture, report, len(numbers), exposure, judgement, int((dilated.radius > 0).sum()), warnings)
+
+
+def _title(number: int, beyond: float, radius: float) -> str:
+    """Return the title of a frame in the picture: its number, the part `beyond` of its light, and the `radius` of a dilation in radians."""
+    return (f"frame {number}" + (f", {beyond:.0%} from beyond the lamps" if beyond > WORTH_SAYING else "")
+            + (f", limits spread by {np.degrees(radius):.0f} degrees" if radius > 0 else ""))
 
 
 def _greatest(wanted: WantedLevels) -> float:

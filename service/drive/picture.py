@@ -28,7 +28,7 @@ LAMP_COSINE = float(np.cos(np.radians(4.0)))
 """Half the width at which lamps are drawn."""
 
 
-def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, numbers: Sequence[int],
+def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, titles: Sequence[str],
                   chart: ChartView | None) -> Path:
     """Write the picture into a folder and return its path.
 
@@ -38,18 +38,18 @@ def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.nda
         far: the light of each frame.
         level: [frames, emitters] of `rig.emitters`, 0…1.
         exposure: [frames] factor on the light.
-        numbers: of the frames.
+        titles: of the frames.
         chart: what it shows in each frame; None: there is none.
     """
     shown = np.linspace(0, len(far), min(MOST_ROWS, len(far)), endpoint=False).astype(int)
-    rows = [_row(rig, far[index], level[index], exposure[index], numbers[index], None if chart is None else chart.picture(index))
+    rows = [_row(rig, far[index], level[index], exposure[index], titles[index], None if chart is None else chart.picture(index))
             for index in shown]
     path = folder / PICTURE_FILE
     write_sheet(path, rows)
     return path
 
 
-def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: int,
+def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, title: str,
          chart: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
     energy = lamp_irradiance(level[None], rig)[0]
     normal, on_ball = _ball()
@@ -77,8 +77,8 @@ def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, number: 
     if light.environment is not None:
         step = -(-len(light.environment.radiance) // MAP_ROWS)
         shown = light.environment.radiance[::step, ::step] * (light.gain * exposure * scale * np.pi)
-        tiles.insert(0, (f"frame {number}: map", display(shown.astype(np.float32), rig.color_space)))
-    return tiles
+        tiles.insert(0, ("map", display(shown.astype(np.float32), rig.color_space)))
+    return [(f"{title}: {tiles[0][0]}", tiles[0][1]), *tiles[1:]]
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:

@@ -105,6 +105,8 @@ class RigPlanRequest(Options):
     """Lat-long environment maps, .exr or .hdr; may be given several times."""
     lights: Annotated[tuple[Count, ...], FirstFault, Commas, Spelling(metavar="COUNTS")] = (32, 64, 128, 331)
     """Numbers of lamps, with commas between; they are spread evenly over the sphere."""
+    rigs: Annotated[tuple[Path, ...], Role.INPUT, Spelling(flag="--rig", metavar="RIG")] = ()
+    """Rigs to judge beside them, by the directions of their lamps (relit.rig/1); may be given several times."""
     out: Annotated[Path, Role.OUTPUT]
     """Folder of the results: plan.csv and plan.png."""
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from service.drive.cue_files import field_of
 from service.drive.judgement import environment_samples, irradiance_of
 from service.relight.environments import Environments
 from service.relight.sheet import BACKGROUND, write_sheet
@@ -16,14 +17,17 @@ from service.reporting.progress import Progress, Timings
 from service.requests.relight import LightWeights
 from service.requests.rig import RigPlanRequest
 from stage.files import write_text
+from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
 
 SPACE = "lin_rec709_scene"
 NORMALS = 256
 ROUGHNESS = (0.1, 0.3, 0.6)
 """The roughnesses of the highlights; α is the square of each."""
-WIDTH, HEIGHT = 720, 420
+WIDTH, HEIGHT = 1040, 420
 COLOURS = ((0.95, 0.6, 0.2), (0.35, 0.7, 0.95), (0.5, 0.85, 0.45), (0.9, 0.4, 0.75))
+MARK = 4
+"""Half the side of the square of a rig, pixels."""
 BATCH = 64
 
 
@@ -35,17 +39,21 @@ class PlanRow(NamedTuple):
     irradiance: float
     highlights: tuple[float, ...]
     """One for each of ROUGHNESS."""
+    rig: str = ""
+    """The name of the rig; none where lamps are spread evenly."""
 
 
 def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[PlanRow]:
     """Judge domes under environments, and write plan.csv and plan.png.
 
     Raises:
-        StageError: a map cannot be used.
+        StageError: a map or a rig cannot be used.
         StorageError: a file cannot be read or written.
     """
     timings = Timings(progress)
-    timings.stage("plan", len(request.environment) * len(request.lights))
+    given_rigs = [read_rig(path) for path in request.rigs]
+    domes = [("", fibonacci_sphere(count)) for count in request.lights] + [(rig.name, rig.directions) for rig in given_rigs]
+    timings.stage("plan", len(request.environment) * len(domes))
     normals = fibonacci_sphere(NORMALS)
     rows = []
     for path in request.environment:
@@ -54,19 +62,18 @@ def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[
         environment = environments.read(environments.path(1), SPACE)
         direction, energy = environment_samples(environment)
         wanted = [irradiance_of(direction, energy, normals), *(_lobe(direction, energy, normals, roughness) for roughness in ROUGHNESS)]
-        for count in request.lights:
-            lamps = fibonacci_sphere(count)
+        for name, lamps in domes:
             given = integrate(environment.radiance, lamps, np.eye(3)[None], weighting=LightWeights.KERNEL, device="cpu")[0]
             got = [irradiance_of(lamps, given, normals), *(_lobe(lamps, given, normals, roughness) for roughness in ROUGHNESS)]
             errors = [float(np.sqrt(((a - b) ** 2).mean() / max((b**2).mean(), 1e-300))) for a, b in zip(got, wanted, strict=True)]
-            rows.append(PlanRow(path.name, count, errors[0], tuple(errors[1:])))
+            rows.append(PlanRow(path.name, len(lamps), errors[0], tuple(errors[1:]), name))
             timings.advance(len(rows))
     timings.stage("files", 1)
     request.out.mkdir(parents=True, exist_ok=True)
     heads = ",".join(f"highlights_{roughness:g}_percent" for roughness in ROUGHNESS)
     lines = "".join(f"{row.environment},{row.lights},{100 * row.irradiance:.4g},"
-                    f"{','.join(f'{100 * error:.4g}' for error in row.highlights)}\n" for row in rows)
-    write_text(request.out / "plan.csv", f"environment,lights,irradiance_percent,{heads}\n{lines}")
+                    f"{','.join(f'{100 * error:.4g}' for error in row.highlights)},{field_of(row.rig)}\n" for row in rows)
+    write_text(request.out / "plan.csv", f"environment,lights,irradiance_percent,{heads},rig\n{lines}")
     _plot(rows, request.out / "plan.png")
     timings.close()
     return rows
@@ -89,22 +96,25 @@ def _lobe(direction: np.ndarray, energy: np.ndarray, normals: np.ndarray, roughn
 
 
 def _plot(rows: list[PlanRow], path: Path) -> None:
-    """Write a plot of the errors against the number of lamps for each environment, both logarithmic."""
+    """Write a plot of the errors against the number of lamps for each environment, both logarithmic; rigs are squares."""
     tiles = []
     lights = np.log([row.lights for row in rows])
     errors = np.log([[max(row.irradiance, 1e-5), *(max(error, 1e-5) for error in row.highlights)] for row in rows])
     low, high = errors.min(), max(errors.max(), errors.min() + 1)
     for name in dict.fromkeys(row.environment for row in rows):
         picture = np.tile(BACKGROUND, (HEIGHT, WIDTH, 1))
-        chosen = [index for index, row in enumerate(rows) if row.environment == name]
-        x = 20 + (lights[chosen] - lights.min()) / max(float(np.ptp(lights)), 1e-9) * (WIDTH - 40)
+        chosen = [index for index, row in enumerate(rows) if row.environment == name and not row.rig]
+        given = [index for index, row in enumerate(rows) if row.environment == name and row.rig]
+        x = 20 + (lights - lights.min()) / max(float(np.ptp(lights)), 1e-9) * (WIDTH - 40)
         for curve, colour in enumerate(COLOURS):
-            y = 20 + (high - errors[chosen, curve]) / (high - low) * (HEIGHT - 40)
-            order = np.argsort(x)
-            across = np.linspace(x.min(), x.max(), 4 * WIDTH)
+            y = 20 + (high - errors[:, curve]) / (high - low) * (HEIGHT - 40)
+            order = np.array(chosen)[np.argsort(x[chosen])]
+            across = np.linspace(x[chosen].min(), x[chosen].max(), 4 * WIDTH)
             down = np.interp(across, x[order], y[order])
             for shift in (0, 1):
                 picture[np.clip(np.rint(down).astype(int) + shift, 0, HEIGHT - 1), np.rint(across).astype(int)] = colour
+            for row, column in np.rint(np.stack([y, x], axis=1)[given]).astype(int):
+                picture[row - MARK : row + MARK + 1, column - MARK : column + MARK + 1] = colour
         tiles.append([(f"{name}: {np.exp(low):.2%} to {np.exp(high):.2%}, {round(np.exp(lights.min()))} to {round(np.exp(lights.max()))} "
-                       "lamps; orange irradiance, blue, green, pink highlights of roughness .1, .3, .6", picture)])
+                       "lamps; orange irradiance; highlights of roughness .1 blue, .3 green, .6 pink; squares are rigs", picture)])
     write_sheet(path, tiles, height=HEIGHT)

@@ -97,4 +97,5 @@ def _plan(request: RigPlanRequest) -> None:
     print(f"plot     {request.out / 'plan.png'}")
     for row in rows:
         highlights = ", ".join(f"{100 * error:.2g}" for error in row.highlights)
-        print(f"{row.lights:>6} lamps under {row.environment}: irradiance {100 * row.irradiance:.2g} %, highlights {highlights} %")
+        of = f" of {row.rig}" if row.rig else ""
+        print(f"{row.lights:>6} lamps{of} under {row.environment}: irradiance {100 * row.irradiance:.2g} %, highlights {highlights} %")

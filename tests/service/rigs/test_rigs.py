@@ -64,10 +64,13 @@ def test_a_wrong_table_is_one_sentence(relit, tmp_path, text, named):
 
 def test_more_lamps_plan_a_smaller_error(relit, tmp_path):
     write_sky(tmp_path / "sky.exr", "sun", rows=32)
-    outcome = relit("rig", "plan", "--environment", tmp_path / "sky.exr", "--lights", "16,64,256", "--out", tmp_path / "plan")
+    write_rig(tmp_path / "rig.json", fibonacci_sphere(64), name='the "new" dome')
+    outcome = relit("rig", "plan", "--environment", tmp_path / "sky.exr", "--lights", "16,64,256", "--rig", tmp_path / "rig.json",
+                    "--out", tmp_path / "plan")
     assert outcome.code == 0, outcome.err
     with open(tmp_path / "plan" / "plan.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+        *rows, given = csv.DictReader(file)
+    assert given == {**rows[1], "rig": 'the "new" dome'}  # the same directions
     for column in ("irradiance_percent", "highlights_0.6_percent"):
         errors = [float(row[column]) for row in rows]
         assert errors == sorted(errors, reverse=True) and errors[-1] < 0.5 * errors[0]
