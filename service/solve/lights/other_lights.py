@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from kernels.photometric.model.samples import evenly
 from service.light_estimation.explanations import grey_readings
-from service.light_estimation.lambertian import SHADOW, median_of
+from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
 from service.solve.base.solution import SolveInput
 from service.solve.height.distance import NOISE, SQUARES, SURE, Lamps, NearFit, fit_near
 from stage.capture.point_lights import DistantLights
@@ -39,6 +39,10 @@ LEAST_FACTOR = 1.2
 """Least factor of the strength of one light: less turns normals by a few degrees."""
 STRENGTH_ROUNDS = 4
 """Fits with the strength of one light, each found from the one before."""
+MOST_STRENGTHS = 4
+"""The most lights whose strength is fitted: those of which the readings are farthest from what the other lights predict."""
+MOST_LEVERAGE = 0.9
+"""A reading with more leverage is not predicted by the others."""
 NEIGHBOURS = 8
 """Compared pixels from which the error of a pixel between them is taken."""
 
@@ -119,10 +123,11 @@ def _near(sample: _Sample, directions: np.ndarray) -> Iterator[_Trial]:
 
 
 def _one_strength(sample: _Sample, directions: np.ndarray, start: NearFit, images: tuple[str, ...]) -> Iterator[_Trial]:
-    """Yield a fit for each light, with the strength that the readings ask for."""
+    """Yield a fit for each light that stands out among the others, with the strength that the readings ask for."""
     place = _at_infinity(directions)
-    for light, image in enumerate(images[: len(directions)]):
-        factor = 1.0
+    off = np.abs(np.log(_left_out(sample, directions, start.lit)))
+    for light in np.argsort(-off)[:MOST_STRENGTHS]:
+        image, factor = images[light], 1.0
         for number in range(STRENGTH_ROUNDS):
             # without this light first: the others say what it should be
             readings, usable = sample.readings.copy(), sample.usable
@@ -142,6 +147,20 @@ def _one_strength(sample: _Sample, directions: np.ndarray, start: NearFit, image
             if max(factor, 1 / factor) >= LEAST_FACTOR:
                 yield _Trial(fit, f"frames[].light.irradiance: {image} looks {factor:.2g} times as bright as declared beside the others; "
                                   "check its irradiance and exposure_s, or leave it out")
+
+
+def _left_out(sample: _Sample, directions: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Return by which factor each light [lights] reads more than the other lights predict by least squares; 1 where nothing tells."""
+    inverse = np.linalg.pinv(normal_equations(lit.astype(np.float64), directions), rcond=1e-6, hermitian=True)
+    vector = np.einsum("pab,lb,lp->pa", inverse, directions, np.where(lit, sample.readings, 0))
+    leverage = np.einsum("la,pab,lb->lp", directions, inverse, directions)
+    # the prediction without a reading, by its leverage: Cook and Weisberg, Residuals and Influence in Regression, 1982, equation 2.2.9
+    predicted = (directions @ vector.T - leverage * sample.readings) / np.maximum(1 - leverage, 1e-6)
+    found = np.ones(len(directions))
+    for light, told in enumerate(lit & (predicted > 0) & (leverage < MOST_LEVERAGE)):
+        if told.sum() >= LEAST_PIXELS:
+            found[light] = np.median(sample.readings[light, told] / predicted[light, told])
+    return found
 
 
 def _at_infinity(directions: np.ndarray) -> np.ndarray:
