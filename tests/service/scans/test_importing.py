@@ -62,6 +62,7 @@ def _moved(shift: np.ndarray) -> np.ndarray:
     return pose
 
 
+@pytest.mark.long
 def test_the_direction_to_the_scanner(views):
     scans = [points_of(view) for view in views]
     towards = np.array([(SHIFT - points.mean(axis=0)) / np.linalg.norm(SHIFT - points.mean(axis=0)) for points in scans])

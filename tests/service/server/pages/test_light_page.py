@@ -24,6 +24,7 @@ def opened(page, solved):
     return page
 
 
+@pytest.mark.long
 def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     opened.get_by_label("Size of the light in degrees").fill("10")
     shown = picture(opened)
