@@ -1,79 +1,144 @@
-"""Import of scans as they come, as a scan set: a folder of PLY files, with the poses of a Stanford .conf file where there is one, or the
+"""Import of scans as they come, as a scan set: a folder of point files, with the poses of a Stanford .conf file where there is one, or the
 frames of a depth camera."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.requests.imports.scans import ScansImport
 from service.scans.points.ply_points import read_ply_points
+from service.scans.points.point_files import read_point_scans
 from service.scans.points.rigid import nearest_rigid
 from service.scans.rgbd import DEPTH, depth_names, write_frames
 from service.scans.viewpoints import find_viewpoints
 from stage.errors import ManifestError, storage
+from stage.formats.ply import PointCloud, write_ply
+from stage.importers.guess import POINT_FILES
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, write_scan_set
 
+FAR_AWAY = 100.0
+"""Coordinates of more than so many times the size of a scan are counted from another origin."""
+GREY = 128
+"""The colour of points without one, of 255."""
+
+
+class _Scan(NamedTuple):
+    """A scan of the set, in metres."""
+
+    name: str
+    path: str
+    points: np.ndarray  # [n, 3]
+    normals: np.ndarray | None
+    viewpoint: np.ndarray | None  # [3] as its file says it
+    pose: np.ndarray | None  # [4, 4] world from scan
+
 
 def import_scans(request: ScansImport) -> Imported:
-    """Write a scan-set.json for the PLY files of a folder, and find out where the scanner stood; or for the frames of a depth camera.
+    """Write a scan-set.json for the point files of a folder, and find out where the scanner stood; or for the frames of a depth camera.
+
+    Files other than PLY are written as PLY.
 
     Raises:
         ManifestError: there are no scans, or the file of poses is wrong; names it.
-        ResultError: a file is no PLY file, or holds no points.
+        ResultError: a file is not what its ending says, or holds no points.
         StorageError: a file cannot be read or written.
     """
     source, folder = request.source, request.folder
     with storage("read", source):
-        names = natural_order(path.name for path in source.iterdir() if path.suffix.lower() == ".ply" and not path.name.startswith("."))
-        tables = sorted(path for path in source.iterdir() if path.suffix.lower() == ".conf")
-        images = depth_names(natural_order(path.name for path in source.iterdir()))
+        listed = natural_order(path.name for path in source.iterdir() if not path.name.startswith("."))
+    names = [name for name in listed if name.lower().endswith(POINT_FILES)]
+    images, tables = depth_names(listed), [source / name for name in listed if name.lower().endswith(".conf")]
     path = folder / SCAN_SET_FILE
+    converted = [name for name in names if not name.lower().endswith(".ply")]
+    if folder == source and (converted or (images and not names)):
+        raise ManifestError(f"{source}: {converted[0] if converted else 'depth images'} are converted: give another folder for the scans")
     if images and not names:
-        if folder == source:
-            raise ManifestError(f"{source}: depth images are converted: give another folder for the scans")
         frames, said = write_frames(request, images)
         write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=tuple(frames)), path)
         return Imported(path, tuple(said))
     if not names:
-        raise ManifestError(f"{source}: holds neither PLY files nor images named *{DEPTH}")
+        raise ManifestError(f"{source}: holds neither point files ({', '.join(POINT_FILES)}) nor images named *{DEPTH}")
     table = request.poses or (tables[0] if len(tables) == 1 else None)
-    if table is not None:
-        poses = _conf_poses(table)
-        names = [name for name in names if name in poses] or names
-    else:
-        poses = {}
-    unit = UNITS_M[request.unit.value]
-    files = [read_ply_points(source / name) for name in names]
-    points = [each.points * unit for each in files]
-    placed = [poses.get(name) for name in names]
-    for number, pose in enumerate(placed):
-        if pose is not None:
-            placed[number] = pose = pose.copy()
-            pose[:3, 3] *= unit
-    facts = [("scans", f"{len(names)} PLY files of {min(map(len, points))} to {max(map(len, points))} points"),
-             ("size", f"{max(float(np.ptp(each, axis=0).max()) for each in points):.3g} m is the widest at --unit {request.unit}"),
-             ("poses", "not known" if table is None else f"{sum(pose is not None for pose in placed)} from {table}")]
-    if request.viewpoint_m is not None:
-        places: list[tuple[float, ...] | None] = [request.viewpoint_m] * len(names)
-        facts.append(("viewpoint", f"{','.join(f'{x:g}' for x in request.viewpoint_m)} m in the frame of each scan, as given"))
-    else:
-        found = find_viewpoints(points, [each.normals for each in files])
-        if found.place is None:
-            places = [None] * len(names)
-            facts.append(("viewpoint", f"is missing: {found.reason}: give --viewpoint, or relit fuse cannot use the scans"))
-        else:
-            places = [tuple(float(f"{x:.4g}") for x in place) for place in found.place]
-            facts.append(("viewpoint", f"estimated{f' to about {found.spread_degrees:.0f} degrees' if found.spread_degrees else ''}: "
-                                       f"{found.reason}"))
+    poses = {} if table is None else _conf_poses(table)
+    scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
+    placed = sum(scan.pose is not None for scan in scans)
+    counts = [len(scan.points) for scan in scans]
+    facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
+             ("size", f"{max(float(np.ptp(scan.points, axis=0).max()) for scan in scans):.3g} m is the widest at --unit {request.unit}"),
+             ("poses", "not known" if not placed else f"{placed} from {'their files' if table is None else table}")]
+    if moved is not None:
+        facts.append(("origin", f"is moved to {','.join(f'{x:.0f}' for x in moved)} of the files, from which the points lie far away"))
+    places = _viewpoints(request, scans, facts)
     entries = tuple(ScanEntry.model_validate({
-        "name": Path(name).stem, "path": name, "unit": request.unit.value, **({} if place is None else {"viewpoint_m": place}),
-        **({} if pose is None else {"scan_to_world": pose.tolist()})}) for name, place, pose in zip(names, places, placed, strict=True))
+        "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.path in names else "m",
+        **({} if place is None else {"viewpoint_m": place}),
+        **({} if scan.pose is None else {"scan_to_world": scan.pose.tolist()})}) for scan, place in zip(scans, places, strict=True))
     if folder != source:
-        place_images(source, folder, names)
+        place_images(source, folder, [name for name in names if name not in converted and any(scan.path == name for scan in scans)])
     write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=entries), path)
     return Imported(path, tuple(facts))
+
+
+def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) -> tuple[list[_Scan], np.ndarray | None]:
+    """Return the scans, of which those of other files than PLY are written, and the place in the files that becomes the origin, or None.
+
+    Coordinates on a map are too large for the floats of a PLY file.
+    """
+    unit, moved, stems = UNITS_M[request.unit.value], None, {Path(name).stem for name in names if name.lower().endswith(".ply")}
+    found = []
+    for name in names:
+        stem = Path(name).stem
+        if name.lower().endswith(".ply"):
+            cloud = read_ply_points(request.source / name)
+            pose = None if name not in poses else _in_metres(poses[name], unit)
+            found.append(_Scan(stem, name, cloud.points * unit, cloud.normals, None, pose))
+            continue
+        parts = read_point_scans(request.source / name)
+        for number, part in enumerate(parts, start=1):
+            if moved is None and part.pose is None and np.abs(part.points).max() > FAR_AWAY * np.ptp(part.points, axis=0).max():
+                moved = np.rint(part.points.mean(axis=0))
+            shift = np.zeros(3) if moved is None or part.pose is not None else moved
+            points = (part.points - shift) * unit
+            unique = stem if len(parts) == 1 else f"{stem}-{number}"
+            while unique in stems:
+                unique += "-" + Path(name).suffix[1:].lower()
+            stems.add(unique)
+            pose = None if part.pose is None else _in_metres(part.pose, unit)
+            place = None if part.viewpoint is None else (part.viewpoint - shift) * unit
+            request.folder.mkdir(parents=True, exist_ok=True)
+            grey = np.full(points.shape, GREY, np.uint8) if part.colours is None else part.colours
+            write_ply(PointCloud(points.astype(np.float32), grey, part.normals), request.folder / f"{unique}.ply")
+            found.append(_Scan(unique, f"{unique}.ply", points, part.normals, place, pose))
+    return found, moved
+
+
+def _in_metres(pose: np.ndarray, unit: float) -> np.ndarray:
+    """Return a pose [4, 4] whose translation is in a unit of so many metres."""
+    found = pose.copy()
+    found[:3, 3] *= unit
+    return found
+
+
+def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str, str]]) -> list[tuple[float, ...] | None]:
+    """Return where the scanner of each scan stood, metres in the frame of the scan, or None, and add what is said of it to the facts."""
+    if request.viewpoint_m is not None:
+        facts.append(("viewpoint", f"{','.join(f'{x:g}' for x in request.viewpoint_m)} m in the frame of each scan, as given"))
+        return [request.viewpoint_m] * len(scans)
+    said = [scan.viewpoint for scan in scans]
+    if all(place is not None for place in said):
+        facts.append(("viewpoint", "as the files say"))
+    else:
+        found = find_viewpoints([scan.points for scan in scans], [scan.normals for scan in scans])
+        if found.place is None:
+            facts.append(("viewpoint", f"is missing: {found.reason}: give --viewpoint, or relit fuse cannot use the scans"))
+        else:
+            said = [place if own is None else own for own, place in zip(said, found.place, strict=True)]
+            facts.append(("viewpoint", f"estimated{f' to about {found.spread_degrees:.0f} degrees' if found.spread_degrees else ''}: "
+                                       f"{found.reason}"))
+    return [None if place is None else tuple(float(f"{x:.4g}") for x in place) for place in said]
 
 
 def _conf_poses(path: Path) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Writing of the point cloud of a scan as LAS 1.4 with laspy, which `pip install 'relit[las]'` installs."""
+"""LAS 1.4 with laspy, which `pip install 'relit[las]'` installs: point clouds of scans are written, and any are read."""
 
 import json
 from importlib.util import find_spec
@@ -97,3 +97,29 @@ def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.nda
     number = np.empty(len(shot), dtype=np.int64)
     number[order] = np.arange(len(shot)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
     return number, counts[group]
+
+
+def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read the points of a LAS or LAZ file.
+
+    Returns:
+        points: [n, 3] float64, in the unit of the file.
+        colours: [n, 3] uint8, or None.
+
+    Raises:
+        ResultError: laspy is not installed, or the file is no LAS file.
+    """
+    if not las_is_installed():
+        raise ResultError(f"{path}: LAS files need laspy: pip install 'relit[las]'")
+    import laspy
+
+    try:
+        cloud = laspy.read(path)
+    except (laspy.errors.LaspyException, ValueError, EOFError) as error:
+        raise ResultError(f"{path}: is no LAS file that laspy reads: {' '.join(str(error).split())}") from error
+    points = np.stack([np.asarray(cloud[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    names = set(cloud.point_format.dimension_names)
+    if not {"red", "green", "blue"} <= names:
+        return points, None
+    colours = np.stack([np.asarray(cloud[name]) for name in ("red", "green", "blue")], axis=1)
+    return points, (colours >> (8 if colours.max(initial=0) > 255 else 0)).astype(np.uint8)

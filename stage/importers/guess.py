@@ -27,6 +27,9 @@ from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.tof.raw_frames import read_array
 
+POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz")
+"""The endings of files of points."""
+
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
 """Words in the names of files that hold planes, and of images of a stripe."""
 
@@ -109,11 +112,13 @@ def _scans(folder: Folder) -> Guess | None:
         return made("frames of a depth camera", f"it has {len(depths)} depth images, as {depths[0]}", ["scans", folder.path], folder.path,
                     solve=False, assumed=("depths are in millimetres: else --depth-unit-m",))._replace(
                         then="relit register SCAN_SET --out registered")
-    clouds = [name for name in folder.names if name.lower().endswith(".ply")]
+    clouds = [name for name in folder.names if name.lower().endswith(POINT_FILES)]
     if not clouds or folder.pictures:
         return None
-    found = made("scans of one object", f"it has {len(clouds)} PLY files, as {clouds[0]}", ["scans", folder.path], folder.path, solve=False,
-                 assumed=("coordinates are in metres: else --unit mm",))
+    found = made("scans of one object", f"it has {len(clouds)} files of points, as {clouds[0]}", ["scans", folder.path], folder.path,
+                 solve=False, assumed=("coordinates are in metres: else --unit mm",))
+    if not all(name.lower().endswith(".ply") for name in clouds):  # they are converted
+        return found._replace(then="relit register SCAN_SET --out registered")
     return found._replace(then=shlex.join(["relit", "register", str(folder.path), "--out", f"{folder.path.resolve().name}-registered"]))
 
 
