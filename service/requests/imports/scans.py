@@ -19,8 +19,8 @@ class ScanUnit(Choice):
 
 
 class ScansImport(ImportRequest):
-    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS) of one object scanned from several places, whose scanner is found, or the frames of a depth
-    camera, as a scan set."""
+    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS) of one object scanned from several places, whose scanner is found, or the frames of a
+    depth camera, as a scan set."""
 
     unit: ScanUnit = ScanUnit.M
     """The unit of the coordinates."""

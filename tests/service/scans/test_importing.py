@@ -238,7 +238,8 @@ def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path):
 @pytest.mark.parametrize(("name", "content", "named"), [
     ("a.xyz", b"1 2\n3 4\n", "x, y and z"), ("a.xyz", b"1 2 3\n4 5\n", "rows of as many"), ("a.xyz", b"", "without points"),
     ("a.pts", b"3\n1 2 3\n", "1 of 3"), ("a.pts", b"x y\n1 2 3\n", "whole number"), ("a.ptx", b"1\n1\n0 0 0\n", "header"),
-    ("a.ptx", ptx(CORNER, np.diag([2.0, 2, 2, 1])).encode(), "no rotation"), ("a.ptx", ptx(CORNER, POSE).rsplit("\n", 2)[0].encode(), "truncated"),
+    ("a.ptx", ptx(CORNER, np.diag([2.0, 2, 2, 1])).encode(), "no rotation"),
+    ("a.ptx", ptx(CORNER, POSE).rsplit("\n", 2)[0].encode(), "truncated"),
     ("a.pcd", b"DATA binary\n", "header"), ("a.pcd", pcd(CORNER, "binary_compressed", "0 0 0"), "ascii or binary"),
     ("a.pcd", pcd(CORNER, "binary", "0 0 0")[:-4], "truncated"), ("a.las", b"LAS?", "LAS")])
 def test_what_is_wrong_with_points_is_said(relit, tmp_path, name, content, named):
