@@ -52,7 +52,7 @@ class Stage:
             + self.random.normal(0, 1e-3, self.scene.images[0].shape)
         if fault is FaultKind.CLIPPED:
             pixels = np.minimum(50 * pixels, 1)
-        pixels = self.last if fault is FaultKind.DOUBLED else pixels
+        pixels = self.last if fault is FaultKind.DOUBLED else np.maximum(pixels, 0)
         self.last = pixels
         if fault is FaultKind.LATE:
             threading.Timer(0.5, write_exr, [path, pixels]).start()
