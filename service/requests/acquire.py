@@ -37,6 +37,9 @@ class AcquireRequest(DeviceRequest):
     person or another program releases it."""
     retakes: Annotated[int, Field(ge=0, le=20)] = 2
     """How often a picture with a fault is taken again."""
+    preview: Annotated[bool, Role.RUN] = False
+    """Take no capture, and meter the light: the share of the object that lamps clip, its focus, and a proposed exposure, in meter.json and
+    meter.png."""
     then: Annotated[tuple[Then, ...], FirstFault, Commas, Role.RUN, Spelling(metavar="STEPS")] = ()
     """What is made of the capture when its last picture is there: solve, or solve,export; not where a picture has a fault."""
     timeout: Positive = 30.0

@@ -1,8 +1,9 @@
 """relit capture: a capture taken on the set."""
 
+import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import typer
 
@@ -26,8 +27,12 @@ def register(app: typer.Typer) -> None:
 def _capture(request: AcquireRequest) -> None:
     from service.acquisition.acquire import acquire, refuse_to_ask
 
+    ask = _ask if sys.stdin.isatty() else refuse_to_ask
+    if request.preview:
+        _meter(request, ask)
+        return
     with ProgressBar() as bar:
-        result = acquire(request, _ask if sys.stdin.isatty() else refuse_to_ask, _tell, bar)
+        result = acquire(request, ask, _tell, bar)
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
@@ -44,6 +49,26 @@ def _capture(request: AcquireRequest) -> None:
             print(f"then     not done, because of the faults; if they do no harm: {_commands(request, request.then)}")
     if result.faults or result.there < result.shots:
         raise typer.Exit(1)
+
+
+def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
+    """Meter the light, and print what to set."""
+    from service.acquisition.meter import SHARE, meter
+
+    with ProgressBar() as bar:
+        found = meter(request, ask, bar)
+    for reading in found.readings:
+        print(f"lamp     {reading.lamp}: {100 * reading.clipped:.2g} % of the object clipped, {100 * (1 - SHARE):g} % of it below "
+              f"{100 * reading.bright:.3g} % of full scale, focus {reading.focus:.3g}")
+    proposed = f"{found.factor:.3g} times the present exposure ({math.log2(found.factor):+.2g} stops)"
+    if not found.sure:
+        print(f"exposure {proposed} or less, since {found.brightest.lamp} clips: set it, and meter again")
+    elif found.exposure_s is None:
+        print(f"exposure {proposed}")
+    else:
+        held = "" if found.clipped is None else f": {100 * found.clipped:.2g} % of the object clip under {found.brightest.lamp}"
+        print(f"exposure {found.exposure_s:.4g} s, {proposed}{held}")
+    print(f"meter    {found.path}, {found.picture}; the lamps are dark")
 
 
 def _preview(request: AcquireRequest, taken: int) -> None:
