@@ -207,6 +207,8 @@ class Judge:
             return [moved]
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
+        if shot.lamp is not None and len(others) < LEAST_LAMPS:  # a mean of so few may be darker everywhere than the lamp between them
+            return []
         if shot.lamp is None:
             more = light / should - 1 if light > AMBIENT_GAIN * should else 0.0
         else:
