@@ -11,7 +11,7 @@ from kernels import device as devices
 from service.errors import RequestError
 from service.export.export import export
 from service.relight.relight import relight
-from service.relight.sheet import BACKGROUND, display, read_frame, write_sheet
+from service.relight.sheet import BACKGROUND, display, exposure_of, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.demo import DemoRequest
 from service.requests.export import ExportRequest
@@ -68,15 +68,10 @@ def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:
     return DemoResult(solved, asset, relit.frames, preview)
 
 
-EXPOSURE_PERCENTILE = 99.0
-"""This percentile of the object's luminance becomes EXPOSURE_TARGET before the display transform."""
-EXPOSURE_TARGET = 0.8
-
-
 def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: Sequence[Path]) -> None:
     """Write the preview of a solve: its maps, a captured image [rows, cols, 3] scene-linear, and two rows of frames, evenly chosen."""
     mask = maps.mask
-    top = [("captured, one light", display(captured * _exposure(captured[None], mask), maps.color_space))]
+    top = [("captured, one light", display(captured * exposure_of(captured[None], mask), maps.color_space))]
     if maps.normal is not None:
         top.append(("normals", np.where(mask[..., None], 0.5 + 0.5 * maps.normal, BACKGROUND)))
     if maps.diffuse_albedo is not None:
@@ -90,15 +85,10 @@ def write_preview(path: Path, maps: SurfaceMaps, captured: np.ndarray, frames: S
     count = min(2 * len(top), len(frames))
     shown = [frames[i] for i in np.linspace(0, len(frames), count, endpoint=False).astype(int)]
     relit = np.stack([read_frame(frame)[0] for frame in shown])
-    together = (relit * _exposure(relit, mask)).reshape(-1, *relit.shape[2:])  # the transform is made once for all
+    together = (relit * exposure_of(relit, mask)).reshape(-1, *relit.shape[2:])  # the transform is made once for all
     bottom = [(f"relit, {frame.stem}", pixels)
               for frame, pixels in zip(shown, display(together, maps.color_space).reshape(relit.shape), strict=True)]
     write_sheet(path, [row for row in (top, bottom[: len(top)], bottom[len(top) :]) if row])
-
-
-def _exposure(images: np.ndarray, mask: np.ndarray) -> float:
-    level = float(np.percentile(images[:, mask].mean(axis=-1), EXPOSURE_PERCENTILE))
-    return EXPOSURE_TARGET / level if level > 0 else 1.0
 
 
 def _relief(height: np.ndarray, mask: np.ndarray) -> np.ndarray:

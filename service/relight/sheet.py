@@ -22,6 +22,9 @@ GAP, TITLE, MARGIN = 12, 26, 20
 """Pixels between two pictures, above each picture for its title, and around all pictures."""
 BACKGROUND = np.array([0.055, 0.058, 0.065], dtype=np.float32)
 INK = (0.82, 0.84, 0.87)
+EXPOSURE_PERCENTILE = 99.0
+"""This percentile of the object's luminance becomes EXPOSURE_TARGET before the display transform."""
+EXPOSURE_TARGET = 0.8
 DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
 """Display and view, by their names in OpenColorIO's built-in configuration."""
 
@@ -66,6 +69,14 @@ def display(pixels: np.ndarray, space: str) -> np.ndarray:
             raise ValueError(f"cannot show {space}: {buffer.geterror()}")
         shown[lit] = pixels_of(buffer)[0]
     return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
+
+
+def exposure_of(images: np.ndarray, mask: np.ndarray) -> float:
+    """Return the factor that makes the object of pictures [pictures, rows, cols, 3], where the mask [rows, cols] is true, bright."""
+    if not mask.any():
+        return 1.0
+    level = float(np.percentile(images[:, mask].mean(axis=-1), EXPOSURE_PERCENTILE))
+    return EXPOSURE_TARGET / level if level > 0 else 1.0
 
 
 def fit(image: np.ndarray, height: int = TILE, *, kernel: str = "") -> np.ndarray:

@@ -3,12 +3,19 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from service.requests.base.base import DeviceRequest, Role, Spelling, WidthHeight
+from service.requests.base.base import Choice, Commas, DeviceRequest, Role, Spelling, WidthHeight
 from service.requests.patterns import Side
 from stage.colour.colour_spaces import ColorSpaceName
-from stage.model import Line, Positive
+from stage.model import FirstFault, Line, Positive
+
+
+class Then(Choice):
+    """What is made of a capture when its last picture is there."""
+
+    SOLVE = "solve", "its maps, in the folder maps of the capture"
+    EXPORT = "export", "of these an asset, asset.usdz in the capture"
 
 
 class AcquireRequest(DeviceRequest):
@@ -30,6 +37,11 @@ class AcquireRequest(DeviceRequest):
     person or another program releases it."""
     retakes: Annotated[int, Field(ge=0, le=20)] = 2
     """How often a picture with a fault is taken again."""
+    preview: Annotated[bool, Role.RUN] = False
+    """Take no capture, and meter the light: the share of the object that lamps clip, its focus, and a proposed exposure, in meter.json and
+    meter.png."""
+    then: Annotated[tuple[Then, ...], FirstFault, Commas, Role.RUN, Spelling(metavar="STEPS")] = ()
+    """What is made of the capture when its last picture is there: solve, or solve,export; not where a picture has a fault."""
     timeout: Positive = 30.0
     """Seconds until a picture counts as missing, beside its exposure."""
     projector: Annotated[tuple[Side, Side] | None, WidthHeight, Spelling(metavar="WxH")] = None
@@ -42,3 +54,10 @@ class AcquireRequest(DeviceRequest):
     """The colour space of the pictures; None: srgb_texture for integers of 8 bits, else scene-linear."""
     saturation: Positive | None = None
     """The recorded value from which readings are clipped, which the manifest has too; None: full scale."""
+
+    @field_validator("then")
+    @classmethod
+    def _in_order(cls, then: tuple[Then, ...]) -> tuple[Then, ...]:
+        if then != tuple(Then)[:len(then)]:
+            raise ValueError("give solve, or solve,export")
+        return then

@@ -32,8 +32,8 @@ class WatchedFolder:
 
     def take(self, exposure_s: float | None) -> Picture:
         """Release the camera, where a program does it, and wait for the next file."""
-        if exposure_s is not None and not self._setup.trigger:
-            raise RequestError("exposures_s: a watched folder without --trigger cannot set an exposure time")
+        if exposure_s is not None and not any("{exposure_s}" in part for part in self._setup.trigger):
+            raise RequestError("exposures_s: a watched folder without {exposure_s} in --trigger cannot set an exposure time")
         self._release(exposure_s)
         until = time.monotonic() + self._setup.timeout_s + (exposure_s or 0.0)
         sizes: dict[str, int] = {}

@@ -1,18 +1,27 @@
 """The pictures of a capture, judged as they come and once more when all are there.
 
-A picture is compared with what it should be: under one lamp, the prediction from the lamps around it; under several, the median of those of
-the same levels. Lamps that light next to nothing of the object, as those behind it, show no fault and are not judged.
+A picture is compared with what it should be, which `expectation` says. Lamps that light next to nothing of the object, as those behind it,
+show no fault and are not judged.
 """
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from service.acquisition.checks.expectation import (
+    Expectation,
+    Seen,
+    comparable,
+    expected_bands,
+    expected_blocks,
+    lower_quartile,
+    same_kind,
+    unit_root,
+)
 from service.acquisition.checks.fault import Fault, FaultKind
-from service.acquisition.checks.motion import Bands, Motion, bands_of, motion_between
-from service.acquisition.checks.prediction import LEAST_LAMPS, prediction_weights, rough_weights
-from service.acquisition.checks.sample import Sample, place_of_tile, sample_of
+from service.acquisition.checks.motion import Motion, bands_of, motion_between
+from service.acquisition.checks.prediction import LEAST_LAMPS
+from service.acquisition.checks.sample import place_of_tile, sample_of
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig
 
@@ -49,32 +58,20 @@ EXPECTED_GAIN = 0.02
 prediction is like the usual picture, and the two parts could stand for one another."""
 SHADE_PART = 0.1
 """The reading, as a part of the mean one, below which errors of the prediction count no less."""
-LEAST_WEIGHT = 1e-3
-"""Pictures with less weight are left out of a prediction."""
 
 CERTAIN = (FaultKind.DOUBLED, FaultKind.CLIPPED, FaultKind.DARK)
 """What a picture shows by itself."""
-
-
-class _Seen(NamedTuple):
-    """A picture that a shot has."""
-
-    shot: Shot
-    sample: Sample
-    root: np.ndarray  # [blocks] the square roots of the sample's blocks, of unit length: highlights count little
-    bands: Bands
-    faults: tuple[Fault, ...]
 
 
 class Judge:
     """Judges pictures against those that were taken before."""
 
     def __init__(self, rig: Rig) -> None:
-        self._directions = rig.directions
+        self._expectation = Expectation(rig.directions)
         self._place: tuple[int, int] | None = None
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, Seen] = {}
         self._digests: dict[bytes, str] = {}
-        self._latest: tuple[np.ndarray, _Seen] | None = None
+        self._latest: tuple[np.ndarray, Seen] | None = None
 
     def judge(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> list[Fault]:
         """Return the faults of a picture that has just come.
@@ -131,7 +128,7 @@ class Judge:
                 others = self._others(seen, kept)
                 doubtful.pop(key, None)
                 if faults := self._faults(seen, others):
-                    doubtful[key] = self._misfit(seen, others), faults[0]
+                    doubtful[key] = self._expectation.misfit(seen, others), faults[0]
             if not doubtful:
                 break
             worst = max(doubtful, key=lambda key: doubtful[key][0])
@@ -143,11 +140,11 @@ class Judge:
                 others = self._others(seen, [other for other in keys if other not in found])
                 if faults := self._faults(seen, others):
                     found[key] = faults[0]
-                elif self._weights(seen, others) is not None:
+                elif self._expectation.weights(seen, others) is not None:
                     del found[key]
         return [*certain.values(), *found.values()]
 
-    def _look(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> _Seen:
+    def _look(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> Seen:
         """Return a picture as it is judged."""
         if self._latest is not None and self._latest[0] is pixels and self._latest[1].shot is shot:
             return self._latest[1]
@@ -157,11 +154,11 @@ class Judge:
             if pixels.max() > LEAST_BRIGHT * full_scale:  # of a dark picture the place of detail is that of noise
                 self._place = place
         sample = sample_of(pixels, place, space, full_scale)
-        seen = _Seen(shot, sample, _root(sample.blocks), bands_of(sample.tile), ())
+        seen = Seen(shot, sample, unit_root(sample.blocks), bands_of(sample.tile), ())
         self._latest = pixels, seen
         return seen
 
-    def _exposure_faults(self, seen: _Seen) -> Iterator[Fault]:
+    def _exposure_faults(self, seen: Seen) -> Iterator[Fault]:
         shot, sample = seen.shot, seen.sample
         if sample.clipped > CLIPPED_SHARE:
             yield Fault(shot.key, FaultKind.CLIPPED, f"{100 * sample.clipped:.2g} % of the lit pixels are clipped")
@@ -171,9 +168,9 @@ class Judge:
             yield Fault(shot.key, kind, f"the brightest readings are {100 * sample.bright:.2g} % of full scale: check the lamps, or expose "
                         "longer")
 
-    def _dark_faults(self, seen: _Seen, others: list[_Seen]) -> list[Fault]:
+    def _dark_faults(self, seen: Seen, others: list[Seen]) -> list[Fault]:
         """Return the faults of a picture without any lamp: it can read no more anywhere than the others do."""
-        lamps = [each.sample.blocks for each in others if each.shot.lamp is not None and _comparable(each.shot, seen.shot)]
+        lamps = [each.sample.blocks for each in others if each.shot.lamp is not None and comparable(each.shot, seen.shot)]
         if not _is_dark(seen.shot) or len(lamps) < LEAST_LAMPS:
             return []
         usual = np.mean(lamps, axis=0)
@@ -182,21 +179,21 @@ class Judge:
         return [Fault(seen.shot.key, FaultKind.AMBIENT, f"reads {100 * above:.2g} % of the light of a lamp more than pictures under lamps "
                       "do in the shade")] if above > DARK_PART else []
 
-    def _faults(self, seen: _Seen, others: list[_Seen]) -> list[Fault]:
+    def _faults(self, seen: Seen, others: list[Seen]) -> list[Fault]:
         """Return the fault that a picture shows against others, if it shows one."""
         shot, sample = seen.shot, seen.sample
         if not shot.levels.any() or not others:
             return []
-        used = self._weights(seen, others)
+        used = self._expectation.weights(seen, others)
         usual = np.mean([each.sample.blocks for each in others], axis=0)
         dark = self._dark(shot)
         if used is None:
             return self._few_faults(seen, others, dark) if len(others) + 1 < LEAST_LAMPS else []
-        expected = _blocks(used)
+        expected = expected_blocks(used)
         light, should = float((sample.blocks - dark).mean()), float((expected - dark).mean())
         least = LEAST_LIGHT * float((usual - dark).mean())
         if shot.lamp is not None:
-            should = min(should, _lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
+            should = min(should, lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
         if should < least:
             return []
         if light < UNLIT_PART * should:
@@ -205,22 +202,24 @@ class Judge:
             return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
         if light < least:
             return []
-        motion = motion_between(seen.bands, _bands(used))
+        motion = motion_between(seen.bands, expected_bands(used))
         if (moved := _moved(shot, motion)) is not None:
             return [moved]
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
+        if shot.lamp is not None and len(others) < LEAST_LAMPS:  # a mean of so few may be darker everywhere than the lamp between them
+            return []
         if shot.lamp is None:
             more = light / should - 1 if light > AMBIENT_GAIN * should else 0.0
         else:
             more = _added(sample.blocks, expected, usual)
         gain = sum(abs(float(weight)) for weight, _ in used)
-        inside = shot.lamp is not None and gain < INSIDE_GAIN and self._interpolated(seen, others)
+        inside = shot.lamp is not None and gain < INSIDE_GAIN and self._expectation.interpolated(seen, others)
         if more > (0.0 if shot.lamp is None else AMBIENT_PART if inside else BORDER_AMBIENT_PART):
             return [Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")]
         return []
 
-    def _few_faults(self, seen: _Seen, others: list[_Seen], dark: np.ndarray | float) -> list[Fault]:
+    def _few_faults(self, seen: Seen, others: list[Seen], dark: np.ndarray | float) -> list[Fault]:
         """Return the fault of a picture under one of a few lamps, of which none is predicted."""
         light = float((seen.sample.blocks - dark).mean())
         usual = float(np.median([(each.sample.blocks - dark).mean() for each in others]))
@@ -228,7 +227,7 @@ class Judge:
             return [Fault(seen.shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / usual):.2g} % of the light of the others")]
         return []
 
-    def _twin(self, seen: _Seen, others: list[_Seen]) -> str | None:
+    def _twin(self, seen: Seen, others: list[Seen]) -> str | None:
         """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.
 
         The farther apart two lamps are, the more their pictures differ; so the picture's differences from the other pictures tell which of
@@ -242,84 +241,33 @@ class Judge:
             return None
         other, rest = others[order[0]], order[1:]
         remaining = [others[index] for index in rest]
-        towards = self._towards(remaining)
-        here, there = (self._misfit(each, remaining) for each in (seen, other))
-        own, its = (_agreement(differ[rest], towards @ self._directions[lamp]) for lamp in (seen.shot.lamp, other.shot.lamp))
+        towards = self._expectation.towards(remaining)
+        here, there = (self._expectation.misfit(each, remaining) for each in (seen, other))
+        own, its = (_agreement(differ[rest], towards @ self._expectation.directions[lamp]) for lamp in (seen.shot.lamp, other.shot.lamp))
         evidence = np.log(max(here, LEAST_MISFIT) / max(there, LEAST_MISFIT)) + AGREEMENT_WEIGHT * (its - own)
         return other.shot.key if evidence > 0 else None
-
-    def _towards(self, pictures: list[_Seen]) -> np.ndarray:
-        """Return the directions of the lamps of pictures, [pictures, 3]."""
-        return np.asarray(self._directions[np.array([each.shot.lamp for each in pictures], dtype=np.intp)])
-
-    def _interpolated(self, seen: _Seen, others: list[_Seen]) -> bool:
-        """Return whether other lamps stand all around that of a picture."""
-        assert seen.shot.lamp is not None
-        return prediction_weights(self._directions[seen.shot.lamp], self._towards(others)) is not None
-
-    def _misfit(self, seen: _Seen, others: list[_Seen]) -> float:
-        """Return how far a picture is from what is expected of it, 0 to 1."""
-        used = self._weights(seen, others)
-        return 0.0 if used is None else 1 - float(seen.root @ _root(_blocks(used)))
-
-    def _weights(self, seen: _Seen, others: list[_Seen]) -> "list[tuple[np.float32, _Seen]] | None":
-        """Return the weights of those pictures whose sum is expected under a lamp, or None."""
-        if seen.shot.lamp is None:
-            return [(np.float32(1 / len(others)), each) for each in others] or None
-        wanted, directions = self._directions[seen.shot.lamp], self._towards(others)
-        weights = prediction_weights(wanted, directions)
-        if weights is None:
-            weights = rough_weights(wanted, directions)
-        if weights is None:
-            return None
-        return [(np.float32(weight), each) for weight, each in zip(weights, others, strict=True) if abs(weight) > LEAST_WEIGHT]
 
     def _sound(self) -> list[str]:
         return [key for key, each in self._seen.items() if not each.faults]
 
-    def _others(self, seen: _Seen, keys: Collection[str]) -> list[_Seen]:
+    def _others(self, seen: Seen, keys: Collection[str]) -> list[Seen]:
         """Return the pictures that say what another one should be: of other lamps, or of the same levels."""
-        return [each for key in keys if key != seen.shot.key and _same_kind((each := self._seen[key]).shot, seen.shot)]
+        return [each for key in keys if key != seen.shot.key and same_kind((each := self._seen[key]).shot, seen.shot)]
 
     def _leans_on(self, key: str, other: str, keys: Collection[str]) -> bool:
         """Return whether what is expected of a picture depends on another one."""
         seen = self._seen[key]
-        if not _same_kind(seen.shot, self._seen[other].shot):
+        if not same_kind(seen.shot, self._seen[other].shot):
             return False
-        used = self._weights(seen, self._others(seen, keys))
+        used = self._expectation.weights(seen, self._others(seen, keys))
         return used is None or any(each.shot.key == other for _, each in used)
 
     def _dark(self, shot: Shot) -> np.ndarray | float:
         """Return the mean picture without any lamp, [blocks]; 0 where there is none."""
         dark = [each.sample.blocks for each in self._seen.values()
-                if not each.faults and _is_dark(each.shot) and _comparable(each.shot, shot)]
+                if not each.faults and _is_dark(each.shot) and comparable(each.shot, shot)]
         found: np.ndarray | float = np.mean(dark, axis=0) if dark else 0.0
         return found
-
-
-def _blocks(used: list[tuple[np.float32, _Seen]]) -> np.ndarray:
-    """Return the expected means of blocks; of equal pictures the median, which one with a fault does not mislead."""
-    if used[0][1].shot.lamp is None:
-        return np.asarray(np.median([each.sample.blocks for _, each in used], axis=0))
-    return np.maximum(np.sum([weight * each.sample.blocks for weight, each in used], axis=0), 0)
-
-
-def _bands(used: list[tuple[np.float32, _Seen]]) -> Bands:
-    """Return the expected details."""
-    if used[0][1].shot.lamp is None:
-        return Bands(*(np.median([each.bands[band] for _, each in used], axis=0) for band in (0, 1)))
-    return Bands(*(np.sum([weight * each.bands[band] for weight, each in used], axis=0) for band in (0, 1)))
-
-
-def _lower_quartile(weighted: list[tuple[np.float32, float]]) -> float:
-    """Return the value below which a quarter of the weight is."""
-    weights, values = (np.array(column)[np.argsort([value for _, value in weighted])] for column in zip(*weighted, strict=True))
-    return float(values[np.searchsorted(weights.cumsum(), 0.25 * weights.sum())])
-
-
-def _root(blocks: np.ndarray) -> np.ndarray:
-    found = np.sqrt(np.maximum(blocks, 0))
-    return np.asarray(found / max(float(np.linalg.norm(found)), 1e-30))
 
 
 def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
@@ -332,18 +280,6 @@ def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
 
 def _is_dark(shot: Shot) -> bool:
     return shot.pattern is None and not shot.levels.any()
-
-
-def _comparable(shot: Shot, other: Shot) -> bool:
-    """Return whether two shots are of the same object at the same exposure."""
-    return shot.folder == other.folder and shot.exposure_s == other.exposure_s
-
-
-def _same_kind(shot: Shot, other: Shot) -> bool:
-    """Return whether the picture of a shot says what that of another one should be."""
-    if not _comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.pattern is not None:
-        return False
-    return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)
 
 
 def _moved(shot: Shot, motion: Motion | None) -> Fault | None:

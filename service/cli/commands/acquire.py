@@ -1,12 +1,22 @@
 """relit capture: a capture taken on the set."""
 
+import math
+import shlex
 import sys
+from collections.abc import Callable, Sequence
 
 import typer
 
-from service.cli.progress import ProgressBar
+from service.cli.printing import counted, print_warnings
+from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import local_command
-from service.requests.acquire import AcquireRequest
+from service.errors import USER_ERRORS, sentence
+from service.requests.acquire import AcquireRequest, Then
+from service.requests.export import ExportRequest
+from service.requests.solve import SolveRequest
+
+MAPS, ASSET = "maps", "asset.usdz"
+"""Where the results of --then lie in the capture."""
 
 
 def register(app: typer.Typer) -> None:
@@ -17,8 +27,12 @@ def register(app: typer.Typer) -> None:
 def _capture(request: AcquireRequest) -> None:
     from service.acquisition.acquire import acquire, refuse_to_ask
 
+    ask = _ask if sys.stdin.isatty() else refuse_to_ask
+    if request.preview:
+        _meter(request, ask)
+        return
     with ProgressBar() as bar:
-        result = acquire(request, _ask if sys.stdin.isatty() else refuse_to_ask, _tell, bar)
+        result = acquire(request, ask, _tell, bar)
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
@@ -27,8 +41,77 @@ def _capture(request: AcquireRequest) -> None:
     print(f"pictures {result.there} of {result.shots}, {result.taken} taken now; the lamps are dark")
     if result.there < result.shots:
         print("ended    before the last picture: run the same command again to go on")
+    else:
+        _preview(request, result.taken)
+        if request.then and not result.faults:
+            _follow(request)
+        elif request.then:
+            print(f"then     not done, because of the faults; if they do no harm: {_commands(request, request.then)}")
     if result.faults or result.there < result.shots:
         raise typer.Exit(1)
+
+
+def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
+    """Meter the light, and print what to set."""
+    from service.acquisition.meter import SHARE, meter
+
+    with ProgressBar() as bar:
+        found = meter(request, ask, bar)
+    for reading in found.readings:
+        print(f"lamp     {reading.lamp}: {100 * reading.clipped:.2g} % of the object clipped, {100 * (1 - SHARE):g} % of it below "
+              f"{100 * reading.bright:.3g} % of full scale, focus {reading.focus:.3g}")
+    proposed = f"{found.factor:.3g} times the present exposure ({math.log2(found.factor):+.2g} stops)"
+    if not found.sure:
+        print(f"exposure {proposed} or less, since {found.brightest.lamp} clips: set it, and meter again")
+    elif found.exposure_s is None:
+        print(f"exposure {proposed}")
+    else:
+        held = "" if found.clipped is None else f": {100 * found.clipped:.2g} % of the object clip under {found.brightest.lamp}"
+        print(f"exposure {found.exposure_s:.4g} s, {proposed}{held}")
+    print(f"meter    {found.path}, {found.picture}; the lamps are dark")
+
+
+def _preview(request: AcquireRequest, taken: int) -> None:
+    """Write the preview, unless there is one of the same pictures; a capture that has none is as good as others."""
+    from service.acquisition.preview import PREVIEW_FILE, write_preview
+
+    if taken == 0 and (request.out / PREVIEW_FILE).exists():
+        return
+    try:
+        print(f"preview  {write_preview(request.out, request.device)}", flush=True)
+    except USER_ERRORS as error:
+        print(f"preview  none: {sentence(error)}", flush=True)
+
+
+def _follow(request: AcquireRequest) -> None:
+    """Do what is to be done with the capture; where that fails, say how to go on without the stage."""
+    from service.export.export import export
+    from service.solve.solve import solve
+
+    left = list(request.then)
+    try:
+        while left:
+            if left[0] is Then.SOLVE:
+                solved = with_bar(solve, SolveRequest(capture=request.out, out=request.out / MAPS, device=request.device))
+                print(f"maps     {solved.maps_path}", flush=True)
+                print(f"pixels   {counted(solved.counts)}")
+                print_warnings(solved.warnings)
+            else:
+                exported = with_bar(export, ExportRequest(maps=request.out / MAPS, out=request.out / ASSET))
+                print(f"asset    {exported.path}")
+                print_warnings(exported.warnings)
+            left.pop(0)
+    except BaseException:
+        print(f"go on    the capture is whole: {_commands(request, left)}", file=sys.stderr, flush=True)
+        raise
+
+
+def _commands(request: AcquireRequest, steps: Sequence[Then]) -> str:
+    """Return the line for a shell that does steps."""
+    maps = request.out / MAPS
+    words = {Then.SOLVE: ["relit", "solve", request.out, "--out", maps],
+             Then.EXPORT: ["relit", "export", maps, "--out", request.out / ASSET]}
+    return " && ".join(shlex.join(map(str, words[step])) for step in steps)
 
 
 def _ask(what: str) -> None:

@@ -7,6 +7,8 @@ import sys
 import threading
 import time
 import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -50,7 +52,7 @@ class Stage:
             + self.random.normal(0, 1e-3, self.scene.images[0].shape)
         if fault is FaultKind.CLIPPED:
             pixels = np.minimum(50 * pixels, 1)
-        pixels = self.last if fault is FaultKind.DOUBLED else pixels
+        pixels = self.last if fault is FaultKind.DOUBLED else np.maximum(pixels, 0)
         self.last = pixels
         if fault is FaultKind.LATE:
             threading.Timer(0.5, write_exr, [path, pixels]).start()
@@ -87,6 +89,29 @@ def by_hand(folder: Path, stage: Stage) -> tuple[Path, object]:
         stage.asked.append(what)
         stage.on = {index for index in range(LAMPS) if f"L{index} " in what}
     return write_rig(folder / "rig.json", stage, "manual"), ask
+
+
+@contextmanager
+def controller(folder: Path, stage: Stage) -> Iterator[tuple[Path, str]]:
+    """Yield a rig whose lamps a server switches, and the address of the server, at whose /shoot the camera is released."""
+    class Controller(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            word = self.path.strip("/").replace("/", " ")
+            stage.release() if word == "shoot" else stage.command(word)
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *what: object) -> None:
+            """Say nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}"
+        try:
+            requests = {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}
+            yield write_rig(folder / "rig.json", stage, "http", {"http": requests}), url
+        finally:
+            server.shutdown()
 
 
 def check(folder: Path, stage: Stage) -> None:
@@ -138,19 +163,7 @@ def test_a_serial_board_is_told_and_answers_and_is_dark_at_the_end(tmp_path, sta
 
 
 def test_http_lamps_are_dark_however_a_capture_ends(tmp_path, stage):
-    class Controller(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            stage.command(self.path.strip("/").replace("/", " "))
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *what: object) -> None:
-            """Say nothing."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        url = f"http://127.0.0.1:{server.server_port}"
-        rig = write_rig(tmp_path / "rig.json", stage, "http", {"http": {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}})
+    with controller(tmp_path, stage) as (rig, _):
         stop = threading.Event()
         release = stage.release
 
@@ -174,7 +187,6 @@ def test_http_lamps_are_dark_however_a_capture_ends(tmp_path, stage):
         assert stage.on == set() and not list((tmp_path / "full").glob("*.exr"))
         assert acquire(request(tmp_path, stage, rig), refuse_to_ask).there == LAMPS + 1
         check(tmp_path / "capture", stage)
-        server.shutdown()
     with pytest.raises(RequestError, match="no answer"):
         acquire(request(tmp_path, stage, rig, out=tmp_path / "third"), refuse_to_ask)
 
@@ -210,21 +222,7 @@ def test_a_capture_goes_on_after_it_was_cut_off_at_any_picture(tmp_path, stage, 
 @pytest.mark.long
 def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
     stage = Stage(tmp_path / "watch")
-
-    class Controller(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            word = self.path.strip("/").replace("/", " ")
-            stage.release() if word == "shoot" else stage.command(word)
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *what: object) -> None:
-            """Say nothing."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        url = f"http://127.0.0.1:{server.server_port}"
-        rig = write_rig(tmp_path / "rig.json", stage, "http", {"http": {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}})
+    with controller(tmp_path, stage) as (rig, url):
         given = request(tmp_path, stage, rig)
         shoot = f"{sys.executable} -S -c \"import urllib.request as u; u.urlopen('{url}/shoot')\""
         command = [sys.executable, "-m", "service.cli.main", "capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out",
@@ -239,7 +237,6 @@ def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
             program.kill()
             program.wait()
         subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)
-        server.shutdown()
     assert kills and stage.on == set()
     check(tmp_path / "capture", stage)
 

@@ -5,6 +5,7 @@ import pytest
 
 from service.acquisition.checks.fault import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
+from tests.scenes.captures import make_scene
 from tests.service.acquisition.scenes import NoisyCamera, Scene, owl, relief, rig_of, shots_on
 
 KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
@@ -49,3 +50,11 @@ def test_each_fault_is_named_over_random_seeds(scene):
     for seed in range(6):
         made, found = named(pictures, seed, KINDS if seed else ())
         assert found == made, seed
+
+
+def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
+    """Of seven lamps none is predicted: the one beside the camera is brighter than the mean of those around it."""
+    ring = make_scene(size=64, lights=7)
+    scene = Scene(ring.images.astype(np.float32), ring.directions)
+    made, found = named(scene, 1, ())
+    assert made == found == {}
