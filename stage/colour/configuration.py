@@ -222,7 +222,8 @@ def _read(place: str, changed: int) -> Configuration:
     """Read a configuration of a file that was changed at a time."""
     config = oiio.ColorConfig(place)
     if fault := config.geterror():
-        raise ColourError(f"--ocio or ${VARIABLE}: {place}: {' '.join(fault.split()).rstrip('.')}")
+        reason = re.sub(r'^Error reading OCIO config "[^"]*": (Error: Loading the OCIO profile .* failed. )?', "", " ".join(fault.split()))
+        raise ColourError(f"--ocio or ${VARIABLE}: {place}: is no OpenColorIO configuration that can be read: {reason.rstrip('.')}")
     spaces = config.getColorSpaceNames()
     names = {alias.lower(): name for name in spaces for alias in config.getAliases(name)}
     names |= {role.lower(): str(config.getColorSpaceNameByRole(role)) for role in config.getRoles()}

@@ -16,7 +16,7 @@ from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import require_current
 from service.server.storage.objects import open_storage
 from stage.colour.configuration import current
-from stage.errors import StorageError
+from stage.errors import ColourError, StorageError
 
 LIBRARIES = ("dbos", "fastapi", "sqlalchemy", "uvicorn", "psycopg")
 GIB = 1024**3
@@ -33,7 +33,10 @@ class Finding(NamedTuple):
 def look(settings: Settings) -> Iterator[Finding]:
     """Yield what is found about the service of these settings."""
     yield Finding("service", ", ".join(f"{name} {version(name)}" for name in LIBRARIES))
-    yield Finding("colours", current().label)
+    try:
+        yield Finding("colours", current().label)
+    except ColourError as error:
+        yield Finding("colours", str(error), True)
     for name, near in unknown_variables(os.environ).items():
         yield Finding("settings", f"{name} is no setting" + (f": is {near} meant?" if near else ""), True)
     yield from _storage(settings)
