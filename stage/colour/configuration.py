@@ -26,6 +26,8 @@ INTERCHANGE, ACES = "aces_interchange", "lin_ap0_scene"
 """The role by which configurations are joined, and the name of its space, ACES2065-1."""
 STANDARD_VIEW = ("sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)")
 """The display and the view of pictures for review, by their names in the built-in configurations."""
+FEWEST_LETTERS = 4
+"""The letters and digits that a part of a name needs to stand for it: three lie in names by chance."""
 NEAREST = 3
 """The most names that an error proposes."""
 ROUNDING, CROSSTALK = 1e-5, 1e-4
@@ -132,7 +134,7 @@ class Configuration(NamedTuple):
     def _alike(self, name: str) -> list[str]:
         """Return the spaces with a name that has the letters and digits of another within it."""
         plain = re.sub(r"\W|_", "", name.lower())
-        return list(dict.fromkeys(space for alias, space in self.names.items() if plain and plain in re.sub(r"\W|_", "", alias)))
+        return list(dict.fromkeys(space for alias, space in self.names.items() if len(plain) >= FEWEST_LETTERS and plain in re.sub(r"\W|_", "", alias)))
 
 
 def current() -> Configuration:
