@@ -3,6 +3,7 @@
 StageError
 ├── ManifestError    capture.json or another JSON description is wrong; the message names file and field
 ├── ImageError       a file does not hold the pixels that it should hold; the message names the file
+├── ColourError      a colour space or an OpenColorIO configuration cannot be used; the message names it
 ├── CalibrationError images do not show what is measured in them, as a spot on a ball; the message names frame, ball or field
 ├── BoardError       the tiles of a board do not fit together, or a board does not fit its design; the message names them
 ├── ScanError        scans of one object cannot be placed; the message names them
@@ -36,6 +37,10 @@ class ManifestError(StageError, ValueError):
 
 class ImageError(StageError, ValueError):
     """An image cannot be used; the message names the file."""
+
+
+class ColourError(StageError, ValueError):
+    """A colour space or a configuration of colours cannot be used; the message names it."""
 
 
 class CalibrationError(StageError, ValueError):

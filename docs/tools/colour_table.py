@@ -1,10 +1,9 @@
 """The colour spaces that pages convert between, as the module that they load: `make colour-table` writes it, and a test compares it."""
 
 import json
-from typing import get_args
 
 from stage.colour.colour import rgb_matrix
-from stage.colour.colour_spaces import ColorSpaceName, is_linear, linear_space
+from stage.colour.colour_spaces import NAMES, is_linear, linear_space
 from stage.formats import exr
 
 DIGITS = 6
@@ -18,7 +17,7 @@ def colour_table() -> str:
     its name alone.
     """
     spaces = {}
-    for space in filter(is_linear, get_args(ColorSpaceName)):
+    for space in filter(is_linear, NAMES):
         chromaticities = exr.chromaticities(space) if space in exr.PRIMARIES else None
         spaces[space] = {"toRec709": [round(float(value), DIGITS) for value in rgb_matrix(space, linear_space("srgb_texture")).ravel()],
                          "chromaticities": None if chromaticities is None else [round(float(value), DIGITS) for value in chromaticities]}

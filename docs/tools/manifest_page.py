@@ -20,6 +20,7 @@ from pydantic.fields import FieldInfo
 
 from docs.tools.manifest_examples import EXAMPLES
 from stage.capture.manifest import Frame, Manifest
+from stage.colour.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.model import Direction, LitRgb, Resolution, Rgb, Strict, Text
 from stage.transforms import Transform
@@ -34,6 +35,7 @@ SPECIAL: tuple[tuple[Any, str], ...] = (
     (Resolution, "width and height, whole numbers, 1 or more"),
     (Transform, "4×4 matrix by rows: a rotation and a translation"),
     (Text, "text"),
+    (ColorSpaceName, "a [colour space](colour.md)"),
 )
 """The types whose values are not numbers, lists or choices alone, and their words."""
 SCALARS: dict[type, str] = {float: "number", int: "whole number", bool: "`true` or `false`", str: "text"}

@@ -20,6 +20,8 @@ from stage.capture.lighting import MEASURED_BY, check_solvable, has_placeholders
 from stage.capture.manifest import FILE_NAME, Frame
 from stage.capture.point_lights import PlacedLights, distance_is_missing, place_lights
 from stage.capture.projector import Projector
+from stage.colour.colour_spaces import linear_space
+from stage.colour.configuration import current
 from stage.colour.radiance import clipping_sentences
 from stage.errors import StageError, StorageError
 from stage.formats import images
@@ -153,7 +155,9 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "folder", str(capture.folder)
     scale = f"{camera.pixel_size_m:g} m a pixel" if camera.pixel_size_m else "metric" if camera.metric else "no scale"
     yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
-    yield "colour", manifest.color_space
+    working = linear_space(manifest.color_space)
+    yield "colour", manifest.color_space + ("" if working == manifest.color_space else f", worked on in {working}")
+    yield "colours of", current().label
     with suppress(StageError):
         orientation = images.read_header(capture.file(manifest.frames[0].image)).orientation
         if orientation != UPRIGHT:

@@ -4,13 +4,17 @@ import os
 import resource
 import sys
 
-KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH")
+from stage.colour.colour_spaces import VARIABLE, location
+
+KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH", VARIABLE)
 """Variables of the environment that such a process inherits."""
 
 
 def bare_environment() -> dict[str, str]:
     """Return an environment without the settings of the service, in which Python finds the same modules."""
     kept = {name: os.environ[name] for name in KEPT if name in os.environ}
+    if VARIABLE in kept:
+        kept[VARIABLE] = location()
     path = os.pathsep.join(os.path.abspath(entry) for entry in sys.path)
     return kept | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1"}
 

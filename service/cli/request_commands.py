@@ -32,6 +32,7 @@ from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 import typer
 from pydantic import BeforeValidator, ValidationError
 
+from service.cli.colours import OcioOption, colours
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
 
@@ -72,17 +73,17 @@ class Given(Generic[Model]):
 
 
 def local_command(group: typer.Typer, name: str, function: Callable[..., None]) -> None:
-    """Add a command that works on this machine: where its request has no device, it takes --device all the same."""
-    command(group, name, function, device=True)
+    """Add a command that works on this machine: where its request has no device, it takes --device all the same, and --ocio."""
+    command(group, name, function, local=True)
 
 
 def command(group: typer.Typer, name: str, function: Callable[..., None], *, without: frozenset[Role] = frozenset(),
-            device: bool = False, words: Callable[[Option, Any], str] = help_text) -> None:
+            local: bool = False, words: Callable[[Option, Any], str] = help_text) -> None:
     """Add a command that is made from a function, as the docstring of this module says.
 
     Args:
         without: roles of options that the command does not have.
-        device: whether it takes --device also where no model asks for it.
+        local: whether it takes --ocio, and --device also where no model asks for it.
         words: gives the help of an option of a model.
     """
     parameters = inspect.signature(function).parameters.values()
@@ -91,16 +92,20 @@ def command(group: typer.Typer, name: str, function: Callable[..., None], *, wit
     own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters if parameter.name not in models]
 
     def run(context: typer.Context, **values: Any) -> None:
+        place = values.pop("ocio", None)
         was_typed = {name for name in values if (source := context.get_parameter_source(name)) and not source.name.startswith("DEFAULT")}
         arguments = {parameter.name: values[parameter.name] for parameter in own}
-        for name, model in models.items():
-            given = Given(model, {option.name: values[option.name] for option in options_of(model) if option.name in was_typed})
-            arguments[name] = given if name in lazy else given.build()
-        function(**arguments)
+        with colours(place):
+            for name, model in models.items():
+                given = Given(model, {option.name: values[option.name] for option in options_of(model) if option.name in was_typed})
+                arguments[name] = given if name in lazy else given.build()
+            function(**arguments)
 
     signature = [inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context),
                  *_parameters(list(models.values()), without, own, words)]
-    if device and "device" not in {parameter.name for parameter in signature}:
+    if local:
+        signature.append(inspect.Parameter("ocio", inspect.Parameter.KEYWORD_ONLY, annotation=OcioOption, default=None))
+    if local and "device" not in {parameter.name for parameter in signature}:
         signature.append(inspect.Parameter("device", inspect.Parameter.KEYWORD_ONLY, annotation=HostOption, default=None))
     run.__signature__ = inspect.Signature(signature)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in signature}

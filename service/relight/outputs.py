@@ -19,6 +19,8 @@ from service.reporting.provenance import choices
 from service.requests.light.frame_range import numbered
 from service.requests.light.picture_options import FrameMatte, Layer
 from service.requests.relight import RelightRequest
+from stage.colour.colour_spaces import BUILT_IN, location
+from stage.colour.configuration import current
 from stage.errors import StageError, StorageError
 from stage.formats import exr, exr_checksum
 from stage.stack import fingerprint
@@ -86,6 +88,7 @@ def frame_hashes(opened: OpenedCapture, request: RelightRequest, frames: Sequenc
         layers=sorted(request.aov), camera=opened.capture.camera.model_dump_json(), rate=rate,
         maps=None if opened.maps is None else fingerprint.digest(opened.maps),
         mask=fingerprint.digest(opened.capture.file(mask)) if mask is not None and _has_mask(request) else None,
+        **({"ocio": current().label} if location() != BUILT_IN else {}),
         **{name: value for name, value in choices(request).items() if name not in RESOLVED})
     return [_hash(
         scene=scene, stops=frame.exposure_stops, captured=frame.captured,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from stage.colour.colour import CONFIG, pixels_of
+from stage.colour.colour import pixels_of, through_view
 from stage.files import replacing
 from stage.formats import exr
 from stage.formats.images import write_png
@@ -25,18 +25,16 @@ INK = (0.82, 0.84, 0.87)
 EXPOSURE_PERCENTILE = 99.0
 """This percentile of the object's luminance becomes EXPOSURE_TARGET before the display transform."""
 EXPOSURE_TARGET = 0.8
-DISPLAY, VIEW = "sRGB - Display", "ACES 2.0 - SDR 100 nits (Rec.709)"
-"""Display and view, by their names in OpenColorIO's built-in configuration."""
 
 
-def contact_sheet(path: Path, frames: Sequence[Path]) -> None:
-    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with."""
+def contact_sheet(path: Path, frames: Sequence[Path], view: str | None = None) -> None:
+    """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with, through a view of OpenColorIO."""
     shown = [frames[i] for i in np.linspace(0, len(frames), min(MOST_FRAMES, len(frames)), endpoint=False).astype(int)]
     tiles = []
     for frame in shown:
         pixels, space = read_frame(frame)
         # in linear light, and before the display transform: that is the slow part
-        tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space)))
+        tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space, view)))
     across = max(1, math.ceil(math.sqrt(len(tiles) * FRAME_TILE / max(tiles[0][1].shape[1], 1) * 16 / 9)))  # as wide as a screen
     write_sheet(path, [tiles[begin : begin + across] for begin in range(0, len(tiles), across)], height=FRAME_TILE)
 
@@ -54,20 +52,16 @@ def read_frame(path: Path) -> tuple[np.ndarray, str]:
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
 
 
-def display(pixels: np.ndarray, space: str) -> np.ndarray:
-    """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through OpenColorIO's ACES view.
+def display(pixels: np.ndarray, space: str, view: str | None = None) -> np.ndarray:
+    """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through a view of OpenColorIO.
 
-    Black becomes the background of a sheet.
+    `view` is DISPLAY/VIEW or VIEW, as `Configuration.view` takes it. Black becomes the background of a sheet.
     """
     lit = pixels.any(axis=-1)
     shown = np.empty(pixels.shape, dtype=np.float32)
     shown[~lit] = BACKGROUND
     if lit.any():  # the transform takes a microsecond a pixel, and most of an object's picture is black
-        source = oiio.ImageBuf(np.ascontiguousarray(pixels[lit][None], dtype=np.float32))
-        buffer = oiio.ImageBufAlgo.ociodisplay(source, DISPLAY, VIEW, space, colorconfig=CONFIG)
-        if buffer.has_error:
-            raise ValueError(f"cannot show {space}: {buffer.geterror()}")
-        shown[lit] = pixels_of(buffer)[0]
+        shown[lit] = through_view(pixels[lit][None], space, view)[0]
     return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
 
 

@@ -12,12 +12,15 @@ from typing import Any
 from service import __version__
 from service.requests.base.base import Options, Role
 from service.requests.base.options import role_of
+from stage.colour.configuration import current
 from stage.errors import ResultError
 from stage.stack.ingest import LAYOUT
 
 REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""
 REPORT_FILE = "report.json"
+COLOURS = "OpenColorIO configuration"
+"""The entry of a report with the name of the configuration of colours, and the version or the hash that tells its content."""
 HASHING = "relit:hashing"
 """Attribute of maps with the version of the stack cache by which `relit:inputs` was hashed: each version hashes otherwise."""
 
@@ -28,14 +31,14 @@ UNREPORTED = (Role.OUTPUT, Role.MACHINE, Role.PART)
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this program and of the libraries that its results depend on."""
+    """Return the versions of this program and of the libraries that its results depend on, and the configuration of colours."""
     found = {"python": platform.python_version()}
     for name in REPORTED:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             found[name] = __version__ if name == "relit" else "not installed"
-    return found
+    return found | {COLOURS: current().label}
 
 
 def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0,
@@ -53,7 +56,7 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
         options["method"] = str(method)
     options.update(contents or {})
     found = {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
-             "relit:options": json.dumps(options, sort_keys=True)}
+             "relit:options": json.dumps(options, sort_keys=True), "relit:ocio": current().label}
     if near_lights:
         found["relit:lights"] = f"{near_lights} near lights taken as distant, as the object's centre sees them"
     return found

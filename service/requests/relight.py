@@ -56,6 +56,9 @@ class RelightRequest(RelightOptions, Request):
     """Make every frame again. Without it, frames are kept that an earlier run made from the same inputs and options."""
     sheet: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
     """Write a contact sheet of the frames, for review."""
+    view: Annotated[Line | None, Role.RUN, Spelling(metavar="DISPLAY/VIEW")] = None
+    """View of the OpenColorIO configuration through which `sheet` shows the frames, such as "sRGB - Display/Un-tone-mapped" or the view
+    alone; None: ACES 2.0 at 100 nits, or the default view of a configuration without it."""
     report: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.json")] = None
     """Write a report: what was made, and how long each part of the work took."""
 

@@ -27,7 +27,8 @@ from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.lighting import lights_from_centre
 from stage.capture.point_lights import DistantLights, PlacedLights, place_lights
-from stage.colour.colour_spaces import linear_space
+from stage.colour.colour import rgb_matrix
+from stage.colour.colour_spaces import NAMES, linear_space
 from stage.colour.radiance import clipping_sentences
 from stage.errors import ResultError, StageError, StorageError, storage
 from stage.files import replacing, write_text
@@ -145,6 +146,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     contents = {} if result is None else {"maps": digest(result.path)}
     write_text(target, json.dumps({
         "schema": SCHEMA, "name": capture.name, "rows": capture.camera.height, "cols": capture.camera.width, "color_space": space,
+        "to_rec709": None if space in NAMES else numbers(rgb_matrix(space, "lin_rec709_scene").ravel()),
         "camera": capture.camera.model_dump(mode="json", exclude_none=True),
         "exposure": numbers(1 / images.white) if images.white > 0 else 1.0,
         "codes": status_codes(),

@@ -1,6 +1,6 @@
 """Conversion of pixels between colour spaces.
 
-The arithmetic is OpenColorIO's, through OpenImageIO, with the built-in ACES configuration.
+The arithmetic is OpenColorIO's, through OpenImageIO, with the configuration of `stage.colour.configuration`.
 """
 
 from functools import cache
@@ -8,11 +8,10 @@ from functools import cache
 import numpy as np
 import OpenImageIO as oiio
 
-from stage.colour.colour_spaces import is_linear, linear_space
+from stage.colour.colour_spaces import channels_apart, is_linear, linear_space, location
+from stage.colour.configuration import current
+from stage.errors import ColourError
 from stage.formats.images import fractions
-
-CONFIG = "ocio://default"
-"""The OpenColorIO configuration: the newest ACES configuration that is built into the library."""
 
 LARGEST_INTEGER = 65535
 """The full scale of 16-bit images."""
@@ -24,7 +23,7 @@ GREY_WEIGHTS = (0.299, 0.587, 0.114)
 
 
 def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
-    """Convert recorded values to scene-linear values with the same primaries.
+    """Convert recorded values to scene-linear values, in the space that `linear_space` names.
 
     Args:
         pixels: [rows, cols, channels], encoded in `space`: float32, or uint8 or uint16 as `images.read_recorded` returns them.
@@ -33,11 +32,16 @@ def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
     Returns:
         [rows, cols, channels] float32; `pixels` without a copy when they are float32 and `space` is linear already.
     """
+    apart = channels_apart(space)
     if pixels.dtype.kind == "u":
-        return np.take(_linear_of_codes(space, pixels.dtype), pixels)
+        if not apart:
+            return convert(np.take(fractions(pixels.dtype), pixels), space, linear_space(space))
+        return np.take(_linear_of_codes(space, pixels.dtype, location()), pixels)
     if is_linear(space):
         return pixels
-    steps, linear = _linear_of_integers(space)
+    if not apart:
+        return convert(pixels, space, linear_space(space))
+    steps, linear = _linear_of_integers(space, location())
     with np.errstate(invalid="ignore"):
         nearest = (np.clip(pixels, 0, 1) * np.float32(LARGEST_INTEGER) + np.float32(0.5)).astype(np.uint16)
     if np.abs(steps[nearest] - pixels).max(initial=0) <= ROUNDING:  # as in every integer image: a table is ten times as fast
@@ -46,13 +50,13 @@ def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
 
 
 @cache
-def _linear_of_codes(space: str, kind: np.dtype) -> np.ndarray:
+def _linear_of_codes(space: str, kind: np.dtype, configuration: str) -> np.ndarray:
     """Return the scene-linear value of each integer of an image: [256] or [65536] float32."""
     return linearise(fractions(kind)[None, :, None], space).reshape(-1)
 
 
 @cache
-def _linear_of_integers(space: str) -> tuple[np.ndarray, np.ndarray]:
+def _linear_of_integers(space: str, configuration: str) -> tuple[np.ndarray, np.ndarray]:
     """Return [65536] float32, the fractions of full scale that 16-bit integers stand for, and their scene-linear values.
 
     Fractions of 255 are among them: 65535 is a multiple of it. The primaries stay, so that each channel is converted alone.
@@ -69,17 +73,43 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
 
     Returns:
         Float32 in the shape of `pixels`; of one channel, the red channel of the converted grey.
+
+    Raises:
+        ColourError: the configuration lacks a space, or cannot convert.
     """
     if source == target:
         return pixels
     grey = pixels.shape[2] == 1
-    rgb = np.repeat(pixels, 3, axis=2) if grey else pixels
-    buffer = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(np.ascontiguousarray(rgb, dtype=np.float32)), source, target,
-                                            colorconfig=CONFIG)
-    if buffer.has_error:
-        raise ValueError(f"cannot convert {source} to {target}: {buffer.geterror()}")
-    converted = pixels_of(buffer)
+    converted = np.ascontiguousarray(np.repeat(pixels, 3, axis=2) if grey else pixels, dtype=np.float32)
+    for configuration, begin, end in current().steps(source, target):
+        buffer = oiio.ImageBufAlgo.colorconvert(oiio.ImageBuf(converted), begin, end, colorconfig=configuration)
+        if buffer.has_error:
+            raise ColourError(f"cannot convert {source} to {target}: {' '.join(buffer.geterror().split())}")
+        converted = pixels_of(buffer)
     return converted[..., :1] if grey else converted
+
+
+def through_view(pixels: np.ndarray, space: str, view: str | None) -> np.ndarray:
+    """Convert pixels to those of a display, through a view.
+
+    Args:
+        pixels: [rows, cols, 3] float32, encoded in `space`.
+        view: as `Configuration.view` takes it.
+
+    Returns:
+        [rows, cols, 3] float32, 0…1.
+    """
+    found = current()
+    chosen = found.view(view)
+    if chosen is None:
+        return convert(pixels, space, "srgb_texture")
+    if found.find(space) is None:
+        pixels, space = convert(pixels, space, found.aces(space)), found.aces(space)
+    source = oiio.ImageBuf(np.ascontiguousarray(pixels, dtype=np.float32))
+    buffer = oiio.ImageBufAlgo.ociodisplay(source, *chosen, space, colorconfig=found.location)
+    if buffer.has_error:
+        raise ColourError(f"cannot show {space}: {' '.join(buffer.geterror().split())}")
+    return pixels_of(buffer)
 
 
 def rgb_matrix(source: str, target: str) -> np.ndarray:

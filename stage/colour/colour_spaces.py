@@ -1,18 +1,26 @@
 """The names of the colour spaces that a capture may declare, and the scene-linear space that belongs to each.
 
-The names are those of the Color Interop Forum. Pixels are converted in `stage.colour.colour`; this module imports no image library, so
-that requests and the command line can check a name without loading one.
+The names listed here are those of the Color Interop Forum; others are those of the OpenColorIO configuration. Pixels are converted in
+`stage.colour.colour`; this module imports no image library for the listed names, so that requests and the command line can check them
+without loading one.
 """
 
-from typing import Annotated, Literal, get_args
+import os
+from typing import Annotated
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
-ColorSpaceName = Literal[
+VARIABLE = "OCIO"
+"""The variable of the environment that names an OpenColorIO configuration, as in other programs."""
+BUILT_IN = "ocio://default"
+"""The newest ACES configuration for computer graphics that is built into the library."""
+STUDIO = "ocio://studio-config-latest"
+"""The built-in configuration with the spaces of cameras."""
+NAMES = (
     "lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene", "lin_adobergb_scene",
     "srgb_texture", "srgb_rec709_scene", "g22_rec709_scene", "g18_rec709_scene", "srgb_p3d65_scene", "g22_adobergb_scene",
-]
-"""The values that `color_space` may have: scene-linear spaces, and the display-encoded spaces of 8-bit cameras and textures."""
+)
+"""The names that are known under every configuration: scene-linear spaces, and the display-encoded spaces of 8-bit cameras and textures."""
 
 _LINEAR_OF: dict[str, str] = {
     "srgb_texture": "lin_rec709_scene",
@@ -24,23 +32,56 @@ _LINEAR_OF: dict[str, str] = {
 }
 
 
+def location() -> str:
+    """Return where the configuration of this process lies: the absolute path of a file, or ocio:// and a built-in name."""
+    place = os.environ.get(VARIABLE) or BUILT_IN
+    return place if place.startswith("ocio://") else os.path.abspath(place)
+
+
 def is_linear(space: str) -> bool:
     """Return whether the values of a colour space are proportional to radiance."""
-    return space not in _LINEAR_OF
+    if space in NAMES:
+        return space not in _LINEAR_OF
+    from stage.colour.configuration import current  # which loads an image library
+
+    return current().checked(space) in current().linear
+
+
+def linear_space(space: str) -> str:
+    """Return the scene-linear space that belongs to a space, the working space of a capture: that with its primaries where there is one.
+
+    Raises:
+        ColourError: the configuration does not have the space.
+    """
+    return _linear_of(space)[0]
+
+
+def channels_apart(space: str) -> bool:
+    """Return whether a channel of the linear space depends on the same channel of the encoded space alone."""
+    return _linear_of(space)[1]
+
+
+def _linear_of(space: str) -> tuple[str, bool]:
+    if space in NAMES:
+        return _LINEAR_OF.get(space, space), True
+    from stage.colour.configuration import linear_of
+
+    return linear_of(location(), space)
+
+
+def _known(space: str) -> str:
+    is_linear(space)
+    return space
 
 
 def _of_light(space: str) -> str:
     if not is_linear(space):
-        raise ValueError(f"is {space}: a light has a scene-linear colour, such as lin_rec709_scene")
+        raise ValueError(f"is {space}: give a scene-linear colour space, such as lin_rec709_scene")
     return space
 
 
-LightSpaceName = Annotated[ColorSpaceName, AfterValidator(_of_light)]
-"""The values that `color_space` of a light may have: scene-linear spaces alone."""
-
-
-def linear_space(space: str) -> str:
-    """Return the name of the scene-linear space that has the primaries of `space`: the working space of a capture."""
-    if space not in get_args(ColorSpaceName):
-        raise ValueError(f"{space} is not a colour space that relit knows")
-    return _LINEAR_OF.get(space, space)
+ColorSpaceName = Annotated[str, AfterValidator(_known), Field(min_length=1, max_length=200, examples=list(NAMES))]
+"""The values that `color_space` may have: NAMES, and the names, aliases and roles of the OpenColorIO configuration."""
+LightSpaceName = Annotated[str, AfterValidator(_of_light), Field(min_length=1, max_length=200,
+                                                                 examples=[name for name in NAMES if name not in _LINEAR_OF])]
+"""The values that `color_space` of a light or a relit frame may have: scene-linear spaces alone."""

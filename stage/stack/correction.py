@@ -9,7 +9,7 @@ from stage.capture.capture import Capture
 from stage.capture.light import OffLight
 from stage.capture.manifest import Frame
 from stage.colour.colour import linearise
-from stage.colour.colour_spaces import is_linear
+from stage.colour.colour_spaces import channels_apart, is_linear
 from stage.errors import ImageError
 from stage.formats import exr, images
 
@@ -115,8 +115,9 @@ class Correction:
 
     @property
     def _is_pointwise(self) -> bool:
-        """Return whether no dark, flat or ambient frame tells pixels apart, and no matrix mixes their channels."""
-        return self.capture.manifest.color_matrix is None and self.dark is None and self.flat is None and self.ambient is None
+        """Return whether no dark, flat or ambient frame tells pixels apart, and no matrix or colour space mixes their channels."""
+        apart = self.capture.manifest.color_matrix is None and channels_apart(self.capture.manifest.color_space)
+        return apart and self.dark is None and self.flat is None and self.ambient is None
 
     def at(self, pixels: np.ndarray) -> "Correction":
         """Return the correction of single pixels.

@@ -16,6 +16,8 @@ import numpy as np
 from stage.capture.capture import Capture
 from stage.capture.light import OffLight
 from stage.capture.manifest import Frame
+from stage.colour.colour_spaces import BUILT_IN, is_linear, location
+from stage.colour.configuration import current
 from stage.errors import ManifestError, storage
 from stage.files import replacing
 from stage.motion.tracking import Tracking
@@ -138,6 +140,8 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
         inputs["saturation"] = "largest integer"
     if manifest.color_matrix is not None:
         inputs["color_matrix"] = manifest.color_matrix
+    if location() != BUILT_IN and not is_linear(manifest.color_space):
+        inputs["ocio"] = current().label
     if capture.pixels.clip_negative:
         inputs["negative"] = "clipped"
     if capture.pixels.crop is not None:

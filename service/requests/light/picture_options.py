@@ -5,6 +5,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base.base import Choice, Commas, Options, Spelling
+from stage.colour.colour_spaces import LightSpaceName
 from stage.model import FirstFault, Positive
 
 MAX_STOPS = 32.0
@@ -28,13 +29,6 @@ class Layer(Choice):
     DEPTH = "depth", "their distances along the view axis"
     ALBEDO = "albedo", "the diffuse albedo of the solved maps"
     CONFIDENCE = "confidence", "the confidence of the solved maps"
-
-
-class FrameSpace(Choice):
-    """Colour spaces that relit frames can be written in, beside the capture's own."""
-
-    REC709 = "lin_rec709_scene"
-    ACESCG = "lin_ap1_scene", "ACEScg"
 
 
 class FrameCompression(Choice):
@@ -69,8 +63,8 @@ class PictureOptions(Options):
     """Layers of a picture, as text with commas between; all but beauty, lights and mask need solved maps."""
     matte: FrameMatte = FrameMatte.SOFT
     """The alpha channel A of the pictures, by which they are premultiplied."""
-    color_space: FrameSpace | None = None
-    """Colour space of the pictures; None: the scene-linear space of the capture or the maps."""
+    color_space: LightSpaceName | None = None
+    """Scene-linear colour space of the pictures, such as lin_rec709_scene or ACEScg; None: that of the capture or the maps."""
     compression: FrameCompression = FrameCompression.ZIP
     """Compression of the EXR files."""
     parts: FrameParts | None = None

@@ -15,7 +15,8 @@ from service.server.database import jobs, keys, workers
 from service.server.database.engine import Database, DatabaseError, connect
 from service.server.database.schema import require_current
 from service.server.storage.objects import open_storage
-from stage.errors import StorageError
+from stage.colour.configuration import current
+from stage.errors import ColourError, StorageError
 
 LIBRARIES = ("dbos", "fastapi", "sqlalchemy", "uvicorn", "psycopg")
 GIB = 1024**3
@@ -32,6 +33,10 @@ class Finding(NamedTuple):
 def look(settings: Settings) -> Iterator[Finding]:
     """Yield what is found about the service of these settings."""
     yield Finding("service", ", ".join(f"{name} {version(name)}" for name in LIBRARIES))
+    try:
+        yield Finding("colours", current().label)
+    except ColourError as error:
+        yield Finding("colours", str(error), True)
     for name, near in unknown_variables(os.environ).items():
         yield Finding("settings", f"{name} is no setting" + (f": is {near} meant?" if near else ""), True)
     yield from _storage(settings)

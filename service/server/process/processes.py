@@ -12,6 +12,7 @@ from service.server.database.engine import Database, open_database
 from service.server.database.schema import is_current
 from service.server.jobs.supervisor import Supervisor
 from service.server.process import devices
+from stage.colour.colour_spaces import VARIABLE, location
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 PRIVATE = 0o027
@@ -46,6 +47,8 @@ def configure(settings: Settings) -> None:
     log.configure(settings.log_level, settings.log_format)
     for name, near in unknown_variables(os.environ).items():
         logger.warning("a variable of the environment is no setting", variable=name, **({"meant": near} if near else {}))
+    if not location().startswith("ocio://") and not os.path.isfile(location()):
+        logger.warning("the configuration of colours is no file", variable=VARIABLE, file=location())
     for root in (*settings.roots, *(root.folder for root in settings.project_roots)):
         if not root.is_dir():
             logger.warning("a root is no folder", root=str(root))

@@ -152,7 +152,7 @@ BAD_RELIGHT = {
     "an unknown layer": ({}, {"aov": "beauty,shadow"}, 'relit: --aov, value 2: is "shadow": '),
     "maps for nothing": ({}, {"maps": "cap"}, "cap/maps.exr is not there: run `relit solve` first"),
     "no maps there": ({}, {"maps": "cap", "aov": "normal"}, "cap/maps.exr is not there: run `relit solve` first"),
-    "another colour space": ({}, {"color-space": "srgb_texture"}, "is not one of 'lin_rec709_scene', 'lin_ap1_scene'"),
+    "another colour space": ({}, {"color-space": "srgb_texture"}, "--color-space: is srgb_texture: give a scene-linear colour space"),
     "another compression": ({}, {"compression": "jpeg"}, "'jpeg' is not one of 'zip', 'piz', 'dwaa'"),
     "other weights": ({}, {"weights": "even"}, "'even' is not one of 'kernel', 'cells', 'smooth'"),
     "smooth weights in one plane": ({"plane": True}, {"weights": "smooth"}, "smooth weighting needs lights that are not all in one plane"),

@@ -130,7 +130,7 @@ def test_a_command_has_the_options_of_its_models_and_its_own(name):
     models, left_out = COMMANDS[name], {Role.PART, Role.RUN} if name.startswith("farm") else set()
     found = parameters(name)
     options = {option.name: option for model in reversed(models) for option in options_of(model) if option.role not in left_out}
-    extra = OWN.get(name, set()) | ({"device"} if not name.startswith(("submit", "farm", "keys")) else set())
+    extra = OWN.get(name, set()) | ({"device", "ocio"} if not name.startswith(("submit", "farm", "keys")) else set())
     assert found.keys() == options.keys() | extra
     for option in options.values():
         parameter = found[option.name]

@@ -129,7 +129,7 @@ BAD_KEYS = {
     "opposite axes": ({"environment": [{"frame": 1, "axis": [0, 1, 0]}, {"frame": 2, "axis": [0, -1, 0]}]},
                       "keys.json: environment: key 1: its axis is opposite"),
     "display colours": (light(KEY, color_space="srgb_texture"), "keys.json: lights[0].color_space: is srgb_texture"),
-    "unknown colours": (light(KEY, color_space="red"), 'keys.json: lights[0].color_space: is "red"'),
+    "unknown colours": (light(KEY, color_space="red"), 'keys.json: lights[0].color_space: red is no colour space of'),
     "another image": ({"captured": [{"image": "9.exr", "keys": [{"frame": 1, "weight": 1}]}]}, "keys.json: captured: 9.exr is no image of"),
     "negative weight": ({"captured": [{"image": "001.exr", "keys": [{"frame": 1, "weight": -1}]}]},
                         "keys.json: captured[0].keys[0].weight: is -1"),

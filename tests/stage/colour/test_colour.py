@@ -53,7 +53,7 @@ def test_the_working_space_keeps_the_primaries():
     assert linear_space("srgb_texture") == "lin_rec709_scene"
     assert linear_space("srgb_p3d65_scene") == "lin_p3d65_scene"
     assert linear_space("lin_ap0_scene") == "lin_ap0_scene"
-    with pytest.raises(ValueError, match="rgb is not a colour space"):
+    with pytest.raises(ValueError, match="rgb is no colour space"):
         linear_space("rgb")
 
 

@@ -37,6 +37,11 @@ export function declaredSpace(header) {
   throw new Error("has chromaticities of no known colour space: convert it to Rec.709, Rec.2020, P3-D65, ACEScg or ACES2065-1");
 }
 
+/** Add a space of an OpenColorIO configuration, with its matrix to linear Rec.709, row by row. */
+export function addSpace(name, toRec709) {
+  spaces[name] = { toRec709, chromaticities: null };
+}
+
 function matrixOf(space) {
   if (!(space in spaces)) throw new Error(`${space} is not a scene-linear colour space that these pages know`);
   return spaces[space].toRec709;

@@ -2,6 +2,8 @@
  * The files that `relit view` writes (docs/view.md): view.json, and blocks of view.bin, which are read piece by piece.
  */
 
+import { addSpace } from "./colour_spaces.js";
+
 const KEPT_TILES = 192; // of 256 × 256 × 3 floats: 150 MB
 
 /** A tile of a layer. @typedef {{rows: number, cols: number, planes: Float32Array[]}} Tile */
@@ -18,6 +20,7 @@ export class ViewFile {
   static async open(files) {
     const info = await files.json("view.json");
     if (info.schema !== "relit.view/1") throw new Error(`the view has the schema ${info.schema}, these pages know relit.view/1`);
+    if (info.to_rec709) addSpace(info.color_space, info.to_rec709);
     return new ViewFile(info, files);
   }
 

@@ -1,0 +1,76 @@
+"""Captures and frames in the colour spaces of an OpenColorIO configuration, through the commands."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stage.colour.colour_spaces import STUDIO, VARIABLE
+from stage.formats import exr
+from tests.reference.colour import ACES_TO_ACESCG, AWG4_TO_ACES, logc4_to_linear
+from tests.scenes.captures import edit_frame, make_scene, rgb, write_capture, write_image
+
+SCENE = make_scene(size=12, lights=5)
+KEYS = {"schema": "relit.keys/1", "captured": [{"image": "000.png", "keys": [{"frame": 1, "weight": 2}]}]}
+
+
+@pytest.fixture
+def logged(tmp_path):
+    """A capture of 16-bit images in LogC4, and what they record as fractions [lights, rows, cols, 3]."""
+    folder = write_capture(tmp_path / "cap", SCENE, color_space="ARRI LogC4", mask=None)
+    codes = np.rint(np.random.default_rng(5).uniform(0.15, 0.6, SCENE.images.shape) * 65535).astype(np.uint16)
+    for index, image in enumerate(codes):
+        write_image(folder / f"{index:03d}.png", image)
+        edit_frame(folder, index, image=f"{index:03d}.png")
+    (tmp_path / "keys.json").write_text(json.dumps(KEYS))
+    return folder, codes / 65535
+
+
+def relight(relit, tmp_path, *options, space="lin_ap1_scene"):
+    return relit.done("relight", tmp_path / "cap", "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", "--matte", "none",
+                      "--color-space", space, *options)
+
+
+def test_logc4_in_and_acescg_out(relit, logged, tmp_path):
+    folder, fractions = logged
+    told = relight(relit, tmp_path, "--ocio", STUDIO, "--report", tmp_path / "r.json", "--sheet", tmp_path / "s.png", "--view",
+                   "Un-tone-mapped", space="ACEScg").out
+    expected = 2 * logc4_to_linear(fractions[0]) @ (ACES_TO_ACESCG @ AWG4_TO_ACES).T
+    # halves of the stack and of the frame: 2 × 2^-11
+    assert np.allclose(rgb(tmp_path / "f" / "a.1.exr"), expected, rtol=1e-3, atol=1e-3 * expected.max()), told
+    _, metadata = exr.read(tmp_path / "f" / "a.1.exr")
+    label = json.loads((tmp_path / "r.json").read_text())["versions"]["OpenColorIO configuration"]
+    assert label.startswith(f"{STUDIO} OpenColorIO ") and metadata["relit:ocio"] == label
+    assert metadata["colorInteropID"] == "lin_ap1_scene"
+    shown = relit.done("info", folder, "--ocio", STUDIO).out
+    assert "ARRI LogC4, worked on in ocio:lin_awg4_scene" in shown and label in shown
+
+
+def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, logged, tmp_path, monkeypatch):
+    """The same name in a configuration with another curve: neither the stack nor the frame is taken again."""
+    from tests.stage.colour.test_configuration import minimal
+
+    folder, _ = logged
+    data = json.loads((folder / "capture.json").read_text())
+    (folder / "capture.json").write_text(json.dumps({**data, "color_space": "house gamma"}))
+    minimal(tmp_path / "one.ocio")
+    (tmp_path / "two.ocio").write_text((tmp_path / "one.ocio").read_text().replace("2.5", "2.0"))
+    frames = []
+    for name in ("one.ocio", "two.ocio", "two.ocio"):
+        monkeypatch.setenv(VARIABLE, str(tmp_path / name))
+        out = relight(relit, tmp_path).out
+        frames.append(rgb(tmp_path / "f" / "a.1.exr"))
+    assert not np.allclose(frames[0], frames[1], rtol=0.1) and np.array_equal(frames[1], frames[2]) and "skipped  1 of 1" in out
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (("--ocio", "no.ocio"), "no.ocio: no such OpenColorIO configuration"),
+    (("--color-space", "ACESgc", "--ocio", STUDIO), "--color-space: ACESgc is no colour space of the OpenColorIO configuration"),
+    (("--color-space", "ACEScct", "--ocio", STUDIO), "--color-space: is ACEScct: give a scene-linear colour space"),
+    (("--view", "Nice", "--sheet", "s.png", "--ocio", STUDIO), "--view Nice: is no view of"),
+    (("--view", "Un-tone-mapped", "--ocio", STUDIO), "give --sheet too"),
+    ((), f"color_space: ARRI LogC4 is no colour space of the OpenColorIO configuration ocio://default: {STUDIO} has ARRI LogC4"),
+])
+def test_what_is_wrong_is_one_sentence(relit, logged, tmp_path, options, words):
+    told = relit.refused("relight", tmp_path / "cap", "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", *options)
+    assert words in told and not (tmp_path / "f").exists()
