@@ -32,9 +32,10 @@ LEAST_GAIN, LEAST_GAIN_NEAR, NEAR = 0.3, 0.1, 8.0
 """Least part of the cost that other lights take away: where the declared ones are right, at most 0.02 goes in scenes, of bare metal, and
 0.05 of real objects; lights within so many half widths take 0.14 away of a glossy object, and 0.7 to 0.9 of matt ones, and the right
 strength 0.5 to 0.99. The lights of a real rig 12 to 16 half widths away, which is far enough, take 0.08 to 0.15."""
-EXPLAINED = 3.3
-"""Largest cost of half of the pixels under other lights, that of a residual of five times the noise: on bare metal, which no Lambertian fit
-explains, it is 4.8 and more, and near lights then take a tenth or two away of what they do not explain; on glossy objects at most 2."""
+EXPLAINED = 2.5
+"""Largest cost of half of the pixels under other lights, that of a residual of three times the noise: on bare metal, which no
+Lambertian fit explains, it is 3.2 and more, and near lights then take up to a quarter away of what they do not explain; on glossy objects
+at most 2."""
 LEAST_FACTOR = 1.2
 """Least factor of the strength of one light: less turns normals by a few degrees."""
 STRENGTH_ROUNDS = 4
@@ -108,18 +109,23 @@ def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights |
 
 
 def _near(sample: _Sample, directions: np.ndarray) -> Iterator[_Trial]:
-    """Yield a fit for each distance, of lights on a sphere about the object and on a plane in front of it."""
+    """Yield the best fit of lights on a sphere about the object, and of lights on a plane in front of it.
+
+    One at the nearest distance that is tried is none: something else than a distance makes up for what the model lacks.
+    """
     ways = [directions]
     if (directions[:, 2] > LEAST_SLANT).all():
         ways.append(directions / directions[:, 2:])
     for way in ways:
-        for distance in DISTANCES:
-            place = np.concatenate([distance * way, np.ones((len(way), 1))], axis=1)
-            median = float(np.median(np.linalg.norm(place[:, :3], axis=1)))
-            yield _Trial(_fit(sample, place), (
-                f"frames[].light.type: the lights look near, {median:.2g} half widths of the object away, and distant ones are declared: "
-                "their light falls off over the image; declare point lights (relit calibrate light-positions measures them)"),
-                LEAST_GAIN_NEAR if median < NEAR else LEAST_GAIN)
+        fits = [_fit(sample, np.concatenate([distance * way, np.ones((len(way), 1))], axis=1)) for distance in DISTANCES]
+        best = int(np.argmin([_cost(fit).sum() for fit in fits]))
+        if best == 0:
+            continue
+        median = DISTANCES[best] * float(np.median(np.linalg.norm(way, axis=1)))
+        yield _Trial(fits[best], (
+            f"frames[].light.type: the lights look near, {median:.2g} half widths of the object away, and distant ones are declared: "
+            "their light falls off over the image; declare point lights (relit calibrate light-positions measures them)"),
+            LEAST_GAIN_NEAR if median < NEAR else LEAST_GAIN)
 
 
 def _one_strength(sample: _Sample, directions: np.ndarray, start: NearFit, images: tuple[str, ...]) -> Iterator[_Trial]:
