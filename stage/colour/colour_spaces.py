@@ -77,7 +77,7 @@ def _known(space: str) -> str:
 def _of_light(space: str) -> str:
     if not is_linear(space):
         raise ValueError(f"is {space}: give a scene-linear colour space, such as lin_rec709_scene")
-    return space
+    return linear_space(space)  # one name for a space, by which lights and captures are compared
 
 
 ColorSpaceName = Annotated[str, AfterValidator(_known), Field(min_length=1, max_length=200, examples=list(NAMES))]
