@@ -30,7 +30,6 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
 from service.requests.light.picture_options import Layer
 from service.requests.relight import CHUNK_FRAMES, RelightRequest
-from stage.colour.colour_spaces import linear_space
 from stage.files import write_text
 from stage.stack.brackets import merge_brackets
 from stage.stack.stack import Stack
@@ -123,7 +122,7 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
                      writer: FrameWriter, findings: FrameFindings, mattes: MatteFindings, device: str, timings: Timings) -> None:
     """Make frames of one capture; `todo` holds each frame with the hash of its request."""
     maps = None if opened.maps is None else read_maps(opened.maps, opened.capture)
-    written = linear_space(request.color_space or opened.space)
+    written = request.color_space or opened.space
     layers = still_layers(request.aov, opened.capture, maps, opened.maps, written)
     environment = todo[0][0].scheduled.environment
     if environment is not None and plan.environments is not None:

@@ -34,7 +34,6 @@ from service.requests.relight import LightWeights
 from service.requests.shade import ShadeRequest
 from stage.capture.capture import Capture
 from stage.capture.lighting import lights_from_centre
-from stage.colour.colour_spaces import linear_space
 from stage.colour.radiance import clipping_sentences
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from stage.results.matte import Matte
@@ -87,7 +86,7 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
         maps = read_maps(path, capture)
         frame, specular, matte, warnings = _shade_capture(capture, request, maps, path, lighting, environments, near, device, timings)
     timings.stage("write", 1)
-    written = linear_space(request.color_space or maps.color_space)
+    written = request.color_space or maps.color_space
     form = FrameFormat.of(request, maps.camera, maps.color_space, written, still_layers(request.aov, None, maps, path, written), matte)
     facts = metadata(request, capture=maps.provenance.get("relit:capture", ""), inputs=maps.provenance.get("relit:inputs", ""))
     with FrameWriter(lambda _: timings.advance(1)) as writer:

@@ -10,6 +10,8 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from stage.model import Line
+
 VARIABLE = "OCIO"
 """The variable of the environment that names an OpenColorIO configuration, as in other programs."""
 BUILT_IN = "ocio://default"
@@ -77,11 +79,11 @@ def _known(space: str) -> str:
 def _of_light(space: str) -> str:
     if not is_linear(space):
         raise ValueError(f"is {space}: give a scene-linear colour space, such as lin_rec709_scene")
-    return space
+    return linear_space(space)  # one name for a space, by which lights and captures are compared
 
 
-ColorSpaceName = Annotated[str, AfterValidator(_known), Field(min_length=1, max_length=200, examples=list(NAMES))]
+ColorSpaceName = Annotated[Line, AfterValidator(_known), Field(min_length=1, max_length=200, examples=list(NAMES))]
 """The values that `color_space` may have: NAMES, and the names, aliases and roles of the OpenColorIO configuration."""
-LightSpaceName = Annotated[str, AfterValidator(_of_light), Field(min_length=1, max_length=200,
+LightSpaceName = Annotated[Line, AfterValidator(_of_light), Field(min_length=1, max_length=200,
                                                                  examples=[name for name in NAMES if name not in _LINEAR_OF])]
 """The values that `color_space` of a light or a relit frame may have: scene-linear spaces alone."""

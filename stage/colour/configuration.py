@@ -134,8 +134,8 @@ class Configuration(NamedTuple):
     def _alike(self, name: str) -> list[str]:
         """Return the spaces with a name that has the letters and digits of another within it."""
         plain = re.sub(r"\W|_", "", name.lower())
-        return list(dict.fromkeys(space for alias, space in self.names.items()
-                                  if len(plain) >= FEWEST_LETTERS and plain in re.sub(r"\W|_", "", alias)))
+        within = {alias: re.sub(r"\W|_", "", alias) for alias in self.names} if len(plain) >= FEWEST_LETTERS else {}
+        return list(dict.fromkeys(self.names[alias] for alias, letters in within.items() if plain in letters))
 
 
 def current() -> Configuration:

@@ -5,10 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from service.captures.check_process import check_in_process
+from service.errors import RequestError
 from stage.colour.colour_spaces import STUDIO, VARIABLE
 from stage.formats import exr
-from tests.reference.colour import ACES_TO_ACESCG, AWG4_TO_ACES, logc4_to_linear
+from tests.reference.colour import ACES_TO_ACESCG, ACES_TO_REC709, AWG4_TO_ACES, logc4_to_linear
 from tests.scenes.captures import edit_frame, make_scene, rgb, write_capture, write_image
+from tests.service.captures.test_check_process import Told
 
 SCENE = make_scene(size=12, lights=5)
 KEYS = {"schema": "relit.keys/1", "captured": [{"image": "000.png", "keys": [{"frame": 1, "weight": 2}]}]}
@@ -74,3 +77,19 @@ def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, l
 def test_what_is_wrong_is_one_sentence(relit, logged, tmp_path, options, words):
     told = relit.refused("relight", tmp_path / "cap", "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", *options)
     assert words in told and not (tmp_path / "f").exists()
+
+
+def test_the_process_that_checks_uploads_has_the_configuration_of_the_service(logged, monkeypatch):
+    monkeypatch.setenv(VARIABLE, STUDIO)
+    facts = check_in_process(logged[0], environment=False, root=None, max_pixels=10**6, progress=Told())
+    assert facts["color_space"] == "ARRI LogC4"
+    monkeypatch.delenv(VARIABLE)
+    with pytest.raises(RequestError, match="color_space: ARRI LogC4 is no colour space of"):
+        check_in_process(logged[0], environment=False, root=None, max_pixels=10**6, progress=Told())
+
+
+def test_a_view_has_the_matrix_of_a_space_that_the_pages_do_not_know(relit, logged, tmp_path):
+    relit("view", logged[0], "--out", tmp_path / "view", "--ocio", STUDIO)
+    view = json.loads((tmp_path / "view" / "view.json").read_text())
+    assert view["color_space"] == "ocio:lin_awg4_scene"
+    assert np.allclose(np.reshape(view["to_rec709"], (3, 3)), ACES_TO_REC709 @ AWG4_TO_ACES, atol=1e-4)  # CAT02 and Bradford meet at ACES

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from stage.colour.colour import convert, linearise, rgb_matrix, through_view
-from stage.colour.colour_spaces import STUDIO, VARIABLE, channels_apart, is_linear, linear_space
+from stage.colour.colour_spaces import STUDIO, VARIABLE, LightSpaceName, channels_apart, is_linear, linear_space
 from stage.colour.configuration import current, used
 from stage.colour.environment_maps import read_environment
 from stage.errors import ColourError
@@ -89,6 +90,12 @@ def test_a_log_has_the_linear_space_of_its_primaries(monkeypatch):
     assert list(found.values()) == ["Linear ARRI Wide Gamut 4", "Linear S-Gamut3.Cine", "Linear Venice S-Gamut3.Cine",
                                     "Linear REDWideGamutRGB", "ACEScg", "Linear Rec.709 (sRGB)"]
     assert linear_space("ACEScct") == "lin_ap1_scene"  # by the name that files declare
+
+
+def test_a_light_has_one_name_for_a_space():
+    """Captures, rigs and keys are compared by it."""
+    names = TypeAdapter(LightSpaceName)
+    assert {names.validate_python(name) for name in ("ACEScg", "lin_ap1", "scene_linear", "lin_ap1_scene")} == {"lin_ap1_scene"}
 
 
 def test_a_space_that_mixes_its_channels_is_converted_whole(monkeypatch):
