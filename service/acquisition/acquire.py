@@ -107,6 +107,7 @@ class Acquisition:
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
                 self._open_projector()
                 self._adopt()
+                self._withdraw()
                 if 0 < len(self.journal.taken) < len(self.shots):
                     self._compare(lights)
                 self._timings.stage("capture", len(self.shots))
@@ -160,6 +161,17 @@ class Acquisition:
             self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, released["attempt"]), **_said(faults)})
         else:
             self._accept(shot, picture, [])
+
+    def _withdraw(self) -> None:
+        """Take the pictures away that are to be taken again."""
+        shots = {shot.key: shot for shot in self.shots}
+        for key in self._request.retake:
+            if key not in shots:
+                raise RequestError(f"--retake {key}: the plan has no such picture: its last one is {self.shots[-1].key}")
+            if key in self.journal.taken:
+                self.journal.picture(key, "rejected", {**self._files.withdraw(shots[key], self.journal.taken[key], 0), "faults": []})
+                self.judge.forget(shots[key])
+                self.faults.pop(key, None)
 
     def _compare(self, lights: Lights) -> None:
         """Take the last tracking picture of an earlier run again, or else its last picture, and refuse to go on if something has moved."""

@@ -42,6 +42,8 @@ class AcquireRequest(DeviceRequest):
     meter.png."""
     then: Annotated[tuple[Then, ...], FirstFault, Commas, Role.RUN, Spelling(metavar="STEPS")] = ()
     """What is made of the capture when its last picture is there: solve, or solve,export; not where a picture has a fault."""
+    retake: Annotated[tuple[Line, ...], FirstFault, Role.RUN, Spelling(metavar="SHOT")] = ()
+    """A picture that is taken again, though it is there, such as 0017_light_016. May be repeated."""
     timeout: Positive = 30.0
     """Seconds until a picture counts as missing, beside its exposure."""
     projector: Annotated[tuple[Side, Side] | None, WidthHeight, Spelling(metavar="WxH")] = None

@@ -30,11 +30,33 @@ def serve(
     device: Annotated[list[str] | None, typer.Option(
         "--device", help="Start a worker on this device; may be repeated; none: no worker. Without it one on every GPU, else on the CPU.",
         show_default=False)] = None,
+    rig: Annotated[Path | None, typer.Option(
+        "--set", metavar="RIG.json", show_default=False,
+        help="Take captures at this machine, with the lamps of a rig, on the page /set; only on loopback addresses.")] = None,
+    camera: Annotated[str | None, typer.Option(
+        "--camera", help="The camera of --set, as relit capture takes it.", show_default=False)] = None,
+    trigger: Annotated[str | None, typer.Option(
+        "--trigger", metavar="COMMAND", help="The program that releases the camera of --set, as relit capture takes it.",
+        show_default=False)] = None,
 ) -> None:
     """Run the service: the API, and a worker on each device."""
     from service.server.process.serve import serve as run
 
-    run(settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None))
+    settings = settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None)
+    if (rig is None) != (camera is None) or (trigger is not None and rig is None):
+        from service.errors import RequestError
+
+        raise RequestError("--set and --camera go together, and --trigger with them: give the lamps and the camera")
+    if rig is None or camera is None:
+        run(settings)
+        return
+    from service.acquisition.remote_control import RemoteControl
+
+    stage = RemoteControl(rig, camera, trigger, settings.data / "set")
+    try:
+        run(settings, set_stage=stage)
+    finally:
+        stage.close()
 
 
 def worker(

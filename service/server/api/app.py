@@ -7,7 +7,7 @@ from fastapi.telemetry import TelemetryConfig
 from opentelemetry.trace import TracerProvider
 
 from service import __version__
-from service.server.api import document, events, intakes, jobs, middleware, operations, problems, results, tus, uploads
+from service.server.api import document, events, intakes, jobs, middleware, operations, problems, results, stage, tus, uploads
 from service.server.api.context import Service
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
@@ -23,8 +23,10 @@ from service.server.storage.upload_parts import open_upload_parts
 DESCRIPTION = """Captures in, durable jobs, USD assets and relit frames out. docs/service.md has a walk through it."""
 
 
-def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None, *, max_streams: int = MAX_STREAMS) -> FastAPI:
-    """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams."""
+def create_app(settings: Settings, database: Database, tracing: TracerProvider | None = None, *, max_streams: int = MAX_STREAMS,
+               set_stage: stage.Stage | None = None) -> FastAPI:
+    """Create the app over a prepared database; `tracing` makes the spans of requests, `max_streams` bounds the event streams, `set_stage`
+    takes captures at this machine."""
     app = FastAPI(title="Relit", version=__version__, description=DESCRIPTION, openapi_url="/v1/openapi.json",
                   docs_url=None, redoc_url=None,  # these pages would load scripts from elsewhere
                   telemetry=_telemetry(tracing), generate_unique_id_function=lambda route: route.name)
@@ -45,6 +47,10 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
                    jobs.router, events.router, results.router, operations.router):
         app.include_router(router)
     pages.install(app)
+    if set_stage is not None:
+        app.state.stage = set_stage
+        app.include_router(stage.router)
+        app.include_router(pages.set_router)
     app.add_middleware(middleware.Bodies)
     app.add_middleware(tus.TusHeaders)
     app.add_middleware(middleware.RequestLog, metrics=app.state.metrics)

@@ -34,6 +34,8 @@ HEADERS = {
 """Headers of every page. Loaders of three.js read textures through blob: addresses, which they make themselves."""
 
 router = APIRouter(include_in_schema=False)
+set_router = APIRouter(include_in_schema=False)
+"""The page of the stage at this machine, where there is one."""
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
 templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP)
@@ -107,6 +109,12 @@ async def asset(job: JobId) -> Response:
 async def drive(job: JobId) -> Response:
     """Show the levels of the lamps that a job has driven."""
     return _page("drive.html", identifier=job)
+
+
+@set_router.get("/set")
+async def stage() -> Response:
+    """Take captures at the stage of this machine."""
+    return _page("set.html")
 
 
 @router.get("/favicon.ico")

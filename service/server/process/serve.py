@@ -18,9 +18,10 @@ from anyio import to_thread
 
 from service.errors import RequestError
 from service.server.api.app import create_app
+from service.server.api.stage import Stage
 from service.server.base import telemetry
 from service.server.base.log import logger
-from service.server.base.settings import Settings
+from service.server.base.settings import Settings, is_loopback
 from service.server.database.engine import Database, open_database
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
@@ -36,8 +37,19 @@ THREADS = 20
 go as it happens, and take 60 KB each."""
 
 
-def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None) -> None:
-    """Serve until SIGTERM or SIGINT, then let steps and requests end; `before_answering` gets the address and the parts of the service."""
+def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None,
+          set_stage: Stage | None = None) -> None:
+    """Serve until SIGTERM or SIGINT, then let steps and requests end.
+
+    Args:
+        before_answering: gets the address and the parts of the service.
+        set_stage: takes captures at this machine, for the page /set; loopback alone.
+
+    Raises:
+        RequestError: the service cannot listen, or would show the stage to other machines.
+    """
+    if set_stage is not None and not is_loopback(settings.host):
+        raise RequestError(f"--set: the page of the stage is for this machine alone, and host is {settings.host}: take a loopback address")
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
     configure(settings)
@@ -47,7 +59,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     supervisor = Supervisor(settings, devices.of_workers(settings))
     supervisors.append(supervisor)
     tracing = telemetry.provider(settings)
-    app = create_app(settings, database, tracing, max_streams=limits.connections // 2)
+    app = create_app(settings, database, tracing, max_streams=limits.connections // 2, set_stage=set_stage)
     server = http_server(app, settings, limits)
     housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
     address = _address(settings.host, listening.getsockname()[1])

@@ -114,7 +114,7 @@ def controller(folder: Path, stage: Stage) -> Iterator[tuple[Path, str]]:
             server.shutdown()
 
 
-def check(folder: Path, stage: Stage) -> None:
+def check(folder: Path, stage: Stage, taken_twice: int = 0) -> None:
     """Compare each frame with the light that its entry names, and each file with the one that came."""
     capture, lines = Capture.open(folder), [json.loads(line) for line in (folder / "acquisition.jsonl").read_text().splitlines()]
     sources = {line["file"]: line["source"] for line in lines if line.get("event") == "taken"}
@@ -124,7 +124,7 @@ def check(folder: Path, stage: Stage) -> None:
     lights = [frame.light.direction for frame in capture.manifest.frames if frame.light.type == "distant"]
     assert np.allclose(lights, stage.scene.directions, atol=1e-6)
     pictures = [line["shot"] for line in lines if line.get("event") == "taken"]
-    assert len(pictures) == len(set(pictures))
+    assert len(pictures) == len(set(pictures)) + taken_twice
 
 
 def test_by_hand_each_lamp_is_asked_for_and_a_capture_that_is_there_is_not_taken_again(tmp_path, stage):
@@ -217,6 +217,19 @@ def test_a_capture_goes_on_after_it_was_cut_off_at_any_picture(tmp_path, stage, 
     acquire(request(tmp_path, stage, rig), ask)
     check(tmp_path / "capture", stage)
     assert stage.released <= LAMPS + 2  # those of the plan, and one that shows that nothing moved
+
+
+def test_a_picture_that_is_there_is_taken_again_on_request(tmp_path, stage):
+    rig, ask = by_hand(tmp_path, stage)
+    acquire(request(tmp_path, stage, rig), ask)
+    released, key = stage.released, "0004_light_003"
+    earlier = (tmp_path / "capture" / f"{key}.exr").read_bytes()
+    result = acquire(request(tmp_path, stage, rig, retake=(key,)), ask)
+    assert (result.taken, result.faults, stage.released) == (1, (), released + 2)  # one shows that nothing moved
+    assert (tmp_path / "capture" / "rejected" / f"{key}.0.exr").read_bytes() == earlier
+    check(tmp_path / "capture", stage, taken_twice=1)
+    with pytest.raises(RequestError, match="its last one is 0007_light_006"):
+        acquire(request(tmp_path, stage, rig, retake=("0009_light_008",)), ask)
 
 
 @pytest.mark.long

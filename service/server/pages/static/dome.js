@@ -50,8 +50,8 @@ export function mountDome(parent, frames, choose) {
  * Show the lamps of a rig.
  * @param {HTMLElement} parent Takes the diagram.
  * @param {{name: string, direction: number[]}[]} lamps With the direction to each.
- * @returns {function({colours: number[][], levels: number[][]}): void} Colours the lamps by linear red, green and blue, 0 to 1; the levels of
- *   the primaries of each lamp, 0 to 1, are said of it.
+ * @returns {function({colours: number[][], levels: number[][], words?: string[]}): void} Colours the lamps by linear red, green and blue, 0 to 1; the levels of
+ *   the primaries of each lamp, 0 to 1, are said of it, or words.
  */
 export function mountLamps(parent, lamps) {
   const places = lamps.map((lamp) => placeOf(lamp.direction));
@@ -64,10 +64,10 @@ export function mountLamps(parent, lamps) {
   dots.forEach((dot, index) => dot.append(titles[index]));
   svg.append(...dots);
   parent.replaceChildren(svg);
-  return ({ colours, levels }) => colours.forEach((colour, index) => {
+  return ({ colours, levels, words = null }) => colours.forEach((colour, index) => {
     const code = colour.map((value) => Math.round(255 * Math.min(1, Math.max(0, value)) ** (1 / 2.2)));
     dots[index].setAttribute("fill", `rgb(${code})`);
-    titles[index].textContent = `${lamps[index].name}: ${levels[index].map((level) => `${(100 * level).toFixed(1)} %`).join(", ")}`;
+    titles[index].textContent = `${lamps[index].name}: ${words?.[index] ?? levels[index].map((level) => `${(100 * level).toFixed(1)} %`).join(", ")}`;
   });
 }
 
