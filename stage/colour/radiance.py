@@ -15,8 +15,11 @@ from stage.errors import ImageError
 
 NOISE_SIGMAS = 6.0
 """Standard deviations below zero down to which a value counts as noise: normal noise falls below in one of 10^9 readings."""
-MIN_TRIPLES = 500
-"""Least number of triples of neighbours near zero from which noise is measured; its standard error is then below a tenth."""
+MANY_TRIPLES, MIN_TRIPLES = 500, 30
+"""From the first number of triples of neighbours near zero on, the standard error of the noise is below a tenth. From fewer, as a small
+shadow has, down to the second, the noise is taken larger by two of its standard errors."""
+TRIPLES_ERROR = 1.2
+"""The standard error, as a part of the noise, over 1 / √triples, which overlap: 0.9 of 50 to 1.2 of 900, of 400 images of noise."""
 KEPT_PART, MEAN_OF_KEPT = 0.9, 0.6573
 """Part of the second differences, the smallest, from which noise is measured, so that edges do not count; and the mean absolute value of
 this part of normal ones in standard deviations: sqrt(2 / pi) (1 - exp(-z² / 2)) / 0.9 with z = 1.645."""
@@ -130,7 +133,7 @@ def _noise_near_zero(values: np.ndarray, most: float) -> float:
         kept = int(KEPT_PART * len(differences))
         noise = float(np.partition(differences, kept)[:kept].mean(dtype=np.float64)) / MEAN_OF_KEPT / math.sqrt(6)
         if not 0 < NOISE_SIGMAS * noise < SHRINKS * most:
-            return noise
+            return noise if len(differences) >= MANY_TRIPLES else noise * (1 + 2 * TRIPLES_ERROR / math.sqrt(len(differences)))
         most = NOISE_SIGMAS * noise
 
 

@@ -59,6 +59,21 @@ def test_noise_around_zero_is_kept(seed, filtered):
     np.testing.assert_allclose(noise_floor(pixels), -6 * SIGMA, rtol=0.15)
 
 
+@pytest.mark.parametrize("size", [12, 20])
+def test_noise_in_one_small_shadow_is_kept_and_a_pedestal_is_not(size):
+    """The floor is 6 σ and two standard errors of few triples; of ten shadows none is refused, and one 12 σ too dark is."""
+    random = np.random.default_rng(size)
+    for _ in range(10):
+        pixels = np.full((200, 200, 3), 0.5, np.float32)
+        pixels[40 : 40 + size, 60 : 60 + size] = 0
+        pixels += random.normal(scale=SIGMA, size=pixels.shape).astype(np.float32)
+        check_radiance("a.exr", pixels)
+        assert (noise_floor(pixels) < -5 * SIGMA).all() and (noise_floor(pixels) > -10 * SIGMA).all()
+    pixels[40 : 40 + size, 60 : 60 + size] -= 12 * SIGMA
+    with pytest.raises(ImageError, match="negative"):
+        check_radiance("a.exr", pixels)
+
+
 @pytest.mark.parametrize("spoil", ["pedestal", "hot pixel", "ringing"])
 def test_what_no_noise_explains_is_refused_and_counted(spoil):
     pixels = dark_subtracted()
