@@ -48,12 +48,12 @@ class Contradiction(NamedTuple):
                 "measure it again with relit calibrate procam; the standard deviations hold the error that this makes")
 
 
-def _image(projector: Projector, q: np.ndarray, zoom: float = 0.0) -> np.ndarray:
+def _image(projector: Projector, q: np.ndarray) -> np.ndarray:
     """Return the place [2, pixels] in the projector of points [3, pixels] in its frame, from the principal point."""
     x, y = q[0] / q[2], q[1] / q[2]
     if projector.distortion is not None:
         x, y = projector.distortion.apply(x, y)
-    return (1 + zoom) * np.stack([projector.focal_px[0] * x, projector.focal_px[1] * y])
+    return np.stack([projector.focal_px[0] * x, projector.focal_px[1] * y])
 
 
 def _derivatives(projector: Projector, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
