@@ -43,6 +43,10 @@ CODES: dict[str, Sequence[Pattern]] = {
 BENT = {"phase 16/18/21, 3 steps": CODES["phase 16/18/21, 3 steps"],
         "phase 16, 3 steps, Gray": (*phase_patterns("column", (16,), 3), *binary_patterns(WIDTH, "column", stripe_px=8)),
         "k-ary, reflected": CODES["k-ary, reflected"]}
+PHASE_BOTH = (*phase_patterns("column", (16, 18, 21), 4), *phase_patterns("row", (16, 18, 21), 4))
+PROJECTORS = {"": (0.0, 0.0, 1.0), ", projector declared 1° aside": (1.0, 0.0, 1.0), ", projector declared 1° tilted": (0.0, 1.0, 1.0),
+              ", focal length declared 4 % longer": (0.0, 0.0, 1.04)}
+"""Yaw and roll in degrees and the factor of the focal length by which the projector is declared wrongly."""
 GAMMA = 2.2
 NOISES = {"": (0.003, 10000.0), ", weak light": (0.006, 2500.0)}
 """Read noise as a part of full scale, and electrons at full scale."""
@@ -67,8 +71,20 @@ def trials(data: Path | None) -> Iterator[Trial]:
     seen = trace(World(shapes=MIRRORS))
     for name in ("Gray, inverses", "Gray, both axes", "phase 16, 4 steps, Gray"):
         yield _run(f"{name}, before a mirror ball", False, World(shapes=MIRRORS), CODES[name], seen)
+    for name, (yaw, roll, zoom) in PROJECTORS.items():
+        turn = np.eye(4)
+        turn[:3, :3] = _turn(0, 2, yaw) @ _turn(1, 0, roll)
+        rig = World(shapes=SHELF).rig
+        yield _run(f"phase 16/18/21, both axes{name}", not name, World(shapes=SHELF), PHASE_BOTH, light,
+                   camera_from_projector=(rig.pose @ turn).tolist(), focal_px=[rig.projector_focal * zoom] * 2)
     for name, (patterns, change) in wrong().items():
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
+
+
+def _turn(first: int, second: int, degrees: float) -> np.ndarray:
+    matrix, angle = np.eye(3), np.radians(degrees)
+    matrix[[first, second], [first, second]], matrix[first, second], matrix[second, first] = np.cos(angle), np.sin(angle), -np.sin(angle)
+    return matrix
 
 
 def _changed(**fields: Callable[[Pattern], object]) -> Callable[[Pattern], Pattern]:

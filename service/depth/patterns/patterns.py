@@ -16,8 +16,9 @@ from service.depth.base.triangulation_check import check_projector, missing_cali
 from service.depth.patterns.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
-from service.depth.patterns.coordinates import Coordinates, DecodedSolution
+from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
+from service.depth.patterns.epipolar import contradiction
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
 from service.errors import RequestError
@@ -223,7 +224,24 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
                              amplitude=coordinates.amplitude, facts=facts)
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
+    if u is not None and v is not None:
+        _widen(solution, u, v, capture, projector)
     return solution, right
+
+
+def _widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, capture: Capture, projector: Projector) -> None:
+    """Add to σ by how much depths may be off where columns and rows contradict the calibration, and say so."""
+    solved = np.isin(solution.status, SOLVED)
+    judged = solved & u.solved & v.solved
+    points = capture.camera.points(-solution.depth)
+    found = contradiction(projector, points[judged], np.stack([u.coordinate[judged], v.coordinate[judged]], axis=1),
+                          np.stack([u.sigma[judged], v.sigma[judged]], axis=1))
+    if found is not None and solution.sigma is not None:
+        more = np.where(solved, float(np.median(found.sigma)), 0.0)
+        more[judged] = found.sigma
+        solution.sigma[:] = np.hypot(solution.sigma, more)
+        solution.facts["contradiction_px"] = float(f"{found.size_px:.3g}")
+        solution.warnings.append(found.sentence())
 
 
 def decoded_bands(planes: Planes, decoders: Sequence[AxisDecoder | None], noise: NoiseModel,

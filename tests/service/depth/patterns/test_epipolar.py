@@ -1,0 +1,130 @@
+"""Projectors that are turned or zoomed otherwise than declared: said, and σ holds the error; right ones raise no doubt. The scenes are
+height fields in closed form, seen along the lines of sight of a pinhole camera and projected by a pinhole, in float64."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.depth.patterns.epipolar import contradiction
+from stage.capture.projector import Projector
+from stage.results.depth_maps import DepthMaps
+from tests.scenes.captures import write_image
+
+SIZE, FOCAL, PROJECTED, LENS = (150, 110), 170.0, (200, 150), 230.0
+RIGS = {"right": ((0.25, 0.02, 0.0), 1.2), "left above": ((-0.3, 0.15, 0.05), 1.6), "above": ((0.03, 0.28, -0.02), 1.4)}
+WRONG = {"yaw": ((0.0, 1.0, 0.0), 1.0), "roll": ((0.0, 0.0, 1.0), 1.0), "pitch": ((-0.5, 0.0, 0.0), 1.0), "focal": ((0.0, 0.0, 0.0), 1.04)}
+
+
+def turn(degrees):
+    x, y, z = np.radians(degrees)
+    about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+    about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+    return about_x @ about_y @ np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+
+
+def scene(rig, seed):
+    """Points [rows, cols, 3], the pose of the projector [4, 4], and where it sees the points, [rows, cols, 2]."""
+    place, far = RIGS[rig]
+    random = np.random.default_rng(seed)
+    x = (np.arange(SIZE[0]) + 0.5 - SIZE[0] / 2) / FOCAL
+    x, y = np.meshgrid(x, -(np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2) / FOCAL)
+    depth = far * (1 + random.uniform(-0.2, 0.2) * x + random.uniform(-0.2, 0.2) * y)
+    for _ in range(4):
+        along = random.normal(0, 8, 2)
+        depth += 0.2 / np.hypot(*along) * np.sin(along[0] * x + along[1] * y + random.uniform(0, 6))
+    points = depth[..., None] * np.stack([x, y, -np.ones_like(x)], axis=-1)
+    back = np.array(place) - (0, 0, -far)
+    back /= np.linalg.norm(back)
+    right = np.cross((0, 1, 0), back)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right / np.linalg.norm(right), np.cross(back, right / np.linalg.norm(right)), back], axis=1)
+    pose[:3, 3] = place
+    return points, pose, seen(points, pose)
+
+
+def seen(points, pose):
+    x, y, z = np.moveaxis((points - pose[:3, 3]) @ pose[:3, :3], -1, 0)
+    return np.stack([PROJECTED[0] / 2 - LENS * x / z, PROJECTED[1] / 2 + LENS * y / z], axis=-1)
+
+
+def declared(pose, wrong=None):
+    """The projector of a manifest, turned and zoomed by what WRONG has."""
+    degrees, zoom = WRONG.get(wrong, ((0, 0, 0), 1.0))
+    other = pose.copy()
+    other[:3, :3] = pose[:3, :3] @ turn(degrees)
+    return {"resolution": PROJECTED, "focal_px": [LENS * zoom] * 2, "camera_from_projector": other.tolist()}
+
+
+def triangulated(points, uv, given):
+    """The point of each line of sight whose image is nearest to uv, by a search in float64 of its inverse depth."""
+    projector, guess = Projector.model_validate(given), -1 / points[..., 2]
+    rays = points * guess[..., None]
+    for _ in range(8):
+        at, ahead = (projector.project(rays / (guess + step)[..., None])[0] for step in (0.0, 1e-5))
+        way = (ahead - at) / 1e-5
+        guess = guess + (way * (uv - at)).sum(axis=-1) / (way**2).sum(axis=-1)
+    return rays / guess[..., None]
+
+
+def judged(rig, wrong, noise, *, stripes=0.0, seed=3):
+    points, pose, uv = scene(rig, seed)
+    uv = (np.floor(uv / stripes) + 0.5) * stripes if stripes else uv
+    uv = uv + np.random.default_rng(seed).normal(0, noise, uv.shape)
+    found = triangulated(points, uv, declared(pose, wrong))
+    flat = found.reshape(-1, 3)
+    deviation = np.hypot(noise, stripes / 12**0.5)
+    return (contradiction(Projector.model_validate(declared(pose, wrong)), flat, uv.reshape(-1, 2), np.full((len(flat), 2), deviation)),
+            np.linalg.norm(found - points, axis=-1).ravel())
+
+
+@pytest.mark.parametrize("stripes", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("rig", RIGS)
+def test_right_calibrations_raise_no_doubt(rig, stripes):
+    for seed in range(4):
+        assert judged(rig, None, 0.06, stripes=stripes, seed=seed)[0] is None
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_wrong_projector_is_said_and_covered(rig, wrong):
+    found, error = judged(rig, wrong, 0.05)
+    assert found is not None and "projector: columns and rows contradict" in found.sentence()
+    assert np.median(error / found.sigma) < 1.4 and (error > 5 * found.sigma).mean() < 0.01
+
+
+def written(folder, wrong):
+    """A capture under two periods along both axes on cloth, with shot noise; the true depth."""
+    points, pose, uv = scene("right", 8)
+    random = np.random.default_rng(1)
+    y, x = np.mgrid[:SIZE[1], :SIZE[0]]
+    albedo = 0.55 + 0.2 * np.sin(x / 2.5) * np.sin(y / 3.5) + 0.1 * (np.sin(x / 11 + y / 17) > 0)
+    frames = []
+    for axis, name in enumerate(("column", "row")):
+        for period in (20.0, 23.0):
+            for step in range(4):
+                level = 0.5 + 0.5 * np.cos(2 * np.pi * (uv[..., axis] / period - step / 4))
+                light = albedo * (0.05 + 0.8 * level)
+                light = np.clip(light + 0.02 * np.sqrt(light + 0.01) * 0.3 * random.standard_normal(light.shape), 0, 1)
+                write_image(folder / f"{len(frames):02d}.png", light[..., None] * np.ones(3))
+                frames.append({"image": f"{len(frames):02d}.png", "pattern": {"code": "phase", "axis": name, "period_px": period,
+                                                                              "steps": 4, "step": step}})
+    (folder / "capture.json").write_text(json.dumps({
+        "schema": "relit.capture/1", "name": "waves", "color_space": "lin_rec709_scene", "frames": frames,
+        "camera": {"projection": "perspective", "resolution": SIZE, "focal_px": [FOCAL, FOCAL]}, "projector": declared(pose, wrong)}))
+    return -points[..., 2]
+
+
+@pytest.mark.parametrize("wrong", [None, "yaw", "roll"])
+def test_depth_says_it(relit, tmp_path, wrong):
+    depth = written(tmp_path, wrong)
+    outcome = relit("depth", tmp_path, "--out", tmp_path / "out", "--device", "cpu", "--read-noise", "0.003")
+    assert outcome.code in (0, 1), outcome.err
+    maps = DepthMaps.read(tmp_path / "out" / "depth.exr", unsure=True)
+    warnings = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"]
+    error = np.abs(maps.depth - depth)[maps.depth > 0] / maps.sigma[maps.depth > 0]
+    if wrong is None:
+        assert warnings == [] and maps.mask.mean() > 0.9
+    else:
+        assert any("contradict its calibration" in sentence for sentence in warnings)
+        assert np.median(error) < 1.4 and (error > 5).mean() < 0.02
