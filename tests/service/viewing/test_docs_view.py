@@ -14,7 +14,7 @@ from tests.scenes.glossy import dome, write_dome, write_maps
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "view.md").read_text(encoding="utf-8")
-TABLES = {title: set(re.findall(r"`([a-z_]+)`", " ".join(row.split("|")[1] for row in rows.splitlines())))
+TABLES = {title: set(re.findall(r"`([a-z_0-9]+)`", " ".join(row.split("|")[1] for row in rows.splitlines())))
           for title, rows in re.findall(r"^\| (key[^|]*) \| \|\n\|---\|---\|\n((?:\|.*\n)+)", TEXT, re.MULTILINE)}
 """The keys in the first column of each table."""
 
