@@ -23,6 +23,9 @@ TRIPLES_ERROR = 1.2
 KEPT_PART, MEAN_OF_KEPT = 0.9, 0.6573
 """Part of the second differences, the smallest, from which noise is measured, so that edges do not count; and the mean absolute value of
 this part of normal ones in standard deviations: sqrt(2 / pi) (1 - exp(-z² / 2)) / 0.9 with z = 1.645."""
+FEW_PART = 0.1
+"""Noise of few triples is believed if its floor is at most this part of the brightest value: else nothing tells it from what lies in the
+image."""
 SAMPLE = 1 << 20
 """About as many values of a larger image are looked at in each direction."""
 SHRINKS = 0.9
@@ -133,7 +136,10 @@ def _noise_near_zero(values: np.ndarray, most: float) -> float:
         kept = int(KEPT_PART * len(differences))
         noise = float(np.partition(differences, kept)[:kept].mean(dtype=np.float64)) / MEAN_OF_KEPT / math.sqrt(6)
         if not 0 < NOISE_SIGMAS * noise < SHRINKS * most:
-            return noise if len(differences) >= MANY_TRIPLES else noise * (1 + 2 * TRIPLES_ERROR / math.sqrt(len(differences)))
+            if len(differences) >= MANY_TRIPLES:
+                return noise
+            larger = noise * (1 + 2 * TRIPLES_ERROR / math.sqrt(len(differences)))
+            return larger if NOISE_SIGMAS * larger <= FEW_PART * float(values.max()) else 0.0
         most = NOISE_SIGMAS * noise
 
 
