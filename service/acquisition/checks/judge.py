@@ -43,6 +43,8 @@ NEAR_COSINE = 0.3
 """Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
 MOVED_PX, MOVED_GAIN, MOVED_CORRELATION = 1.5, 1.6, 0.35
 """A picture has moved if it fits better by this factor, and as well as this, at a shift of more pixels."""
+COMPARED = 5
+"""The most pictures whose details are looked at before it is said that one has moved."""
 BLURRED_CONTRAST, BLURRED_MATCH = 0.75, 0.5
 """A picture is out of focus if its details have less contrast, and match the expected ones by less: other light lowers one alone."""
 AMBIENT_PART = 0.1
@@ -203,7 +205,7 @@ class Judge:
         if light < least:
             return []
         motion = motion_between(seen.bands, expected_bands(used))
-        if (moved := _moved(shot, motion)) is not None:
+        if (moved := _moved(shot, motion)) is not None and self._details_stay(used, others):
             return [moved]
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
@@ -226,6 +228,18 @@ class Judge:
         if light < UNLIT_PART * LEAST_LIGHT * usual:
             return [Fault(seen.shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / usual):.2g} % of the light of the others")]
         return []
+
+    def _details_stay(self, used: list[tuple[np.float32, Seen]], others: list[Seen]) -> bool:
+        """Return whether the pictures from which another is predicted fit their own predictions where they are.
+
+        Where most do not, details move with the lamps, as the highlight of a glossy object without texture does.
+        """
+        shifted = []
+        for _, each in sorted(used, key=lambda one: -abs(one[0]))[:COMPARED]:
+            weights = self._expectation.weights(each, [other for other in others if other is not each])
+            if weights is not None and (motion := motion_between(each.bands, expected_bands(weights))) is not None:
+                shifted.append(np.hypot(*motion.shift_px) >= MOVED_PX)
+        return 2 * sum(shifted) <= len(shifted)
 
     def _twin(self, seen: Seen, others: list[Seen]) -> str | None:
         """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.

@@ -5,6 +5,7 @@ import pytest
 
 from service.acquisition.checks.fault import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
+from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene
 from tests.service.acquisition.scenes import NoisyCamera, Scene, owl, relief, rig_of, shots_on
 
@@ -50,6 +51,21 @@ def test_each_fault_is_named_over_random_seeds(scene):
     for seed in range(6):
         made, found = named(pictures, seed, KINDS if seed else ())
         assert found == made, seed
+
+
+def test_the_highlight_of_a_glossy_ball_has_not_moved():
+    """It is at another place under each lamp, and in part where each of the lamps around has its own, as a prediction says."""
+    directions = fibonacci_sphere(160)
+    directions = directions[directions[:, 2] > 0.3]
+    across = (2 * np.arange(96) + 1) / 80 - 1.2
+    x, y = np.meshgrid(across, -across)
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x * x - y * y, 0))], axis=-1)
+    half = directions + [0.0, 0.0, 1.0]
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    lit = np.maximum(np.einsum("lc,rkc->lrk", directions, normal), 0) * (normal[..., 2] > 0)
+    gloss = 5 * np.maximum(np.einsum("lc,rkc->lrk", half, normal), 0) ** 120 * (lit > 0)
+    scene = Scene(np.repeat((0.15 * (lit + gloss))[..., None], 3, axis=-1).astype(np.float32), directions)
+    assert named(scene, 1, ()) == ({}, {})
 
 
 def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
