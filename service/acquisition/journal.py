@@ -72,14 +72,11 @@ class Journal:
     def _take(self, line: dict[str, Any]) -> None:
         if "source" in line:
             self.known = {*(self.known or ()), line["source"]}
-        if line["event"] == "taken":
-            self.taken[line["shot"]] = line
-        elif line["event"] == "rejected" and line.get("was_taken"):
-            self.taken.pop(line["shot"], None)
+        record(self.taken, line)
 
     def _read(self, head: Mapping[str, Any]) -> None:
         content = self._path.read_bytes()
-        whole = content[:content.rfind(b"\n") + 1]
+        whole = _whole(content)
         if len(whole) < len(content):  # the process ended within a line, which nothing follows from
             os.truncate(self._path, len(whole))
         for number, text in enumerate(whole.decode("utf-8", "replace").splitlines(), start=1):
@@ -104,3 +101,22 @@ class Journal:
             if found.get(key) != value:
                 raise RequestError(f"{self._path.parent}: was begun with another {key.replace('_', ' ')}: go on with the same, or give "
                                    "another folder to --out")
+
+
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    """Return the whole lines of the journal of a capture that may be going on; the first is its head."""
+    path = folder / JOURNAL_FILE
+    return [json.loads(line) for line in _whole(path.read_bytes()).splitlines()] if path.exists() else []
+
+
+def record(taken: dict[str, dict[str, Any]], line: dict[str, Any]) -> None:
+    """Bring the lines of the pictures that shots have, by the key of the shot, up to date with a further line."""
+    if line.get("event") == "taken":
+        taken[line["shot"]] = line
+    elif line.get("event") == "rejected" and line.get("was_taken"):
+        taken.pop(line["shot"], None)
+
+
+def _whole(content: bytes) -> bytes:
+    """Return a journal without a last line that is not whole."""
+    return content[:content.rfind(b"\n") + 1]

@@ -139,7 +139,7 @@ class _Meter:
 
     def run(self, shots: list[Shot], timings: Timings) -> Metered:
         """Meter shots; all of one exposure."""
-        first = shots[0].exposure_s or _told_exposure(self._camera)
+        first = shots[0].exposure_s or self._camera.exposure_s
         timings.stage("meter", len(shots))
         taken = []
         for number, shot in enumerate(shots, start=1):
@@ -228,16 +228,6 @@ class _Meter:
 def _thirds(factor: float) -> float:
     """Return a factor of exposures, rounded down to thirds of a stop."""
     return float(STEP ** np.floor(np.log(factor) / np.log(STEP) + 1e-9))
-
-
-def _told_exposure(camera: Camera) -> float | None:
-    """Return the exposure time that a camera tells, of those that can be set to another."""
-    told = camera.settings.get("shutterspeed")
-    if told is None:
-        return None
-    from service.acquisition.cameras.gphoto2_camera import seconds_of  # of which the setting is
-
-    return seconds_of(told)
 
 
 def _bars(counts: np.ndarray) -> np.ndarray:

@@ -8,13 +8,13 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from service.acquisition.journal import JOURNAL_FILE
+from service.acquisition.journal import lines_of, record
+from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.meter import PICTURE_FILE
 from service.acquisition.plans.plan import NAMED, read_plan
 from service.acquisition.plans.shots import Shot, shots_of
@@ -29,8 +29,6 @@ from stage.formats import images
 from stage.importers.layout import color_space_of
 from stage.rig.rig import read_rig
 
-ASK, ANSWERED = "please   ", ", then press Enter"
-"""How a line of `relit capture` begins and ends that asks for something."""
 LINES = 40
 """The last lines of the process that are kept."""
 PICTURE_ROWS = 480
@@ -115,13 +113,10 @@ class RemoteControl:
         """Return how far the capture is: its shots with the faults of their pictures, what it asks for, and what there is of it."""
         taken: dict[str, dict[str, Any]] = {}
         retaken: dict[str, int] = {}
-        for line in self._journal():
-            if line.get("event") == "taken":
-                taken[line["shot"]] = line
-            elif line.get("event") == "rejected":
+        for line in lines_of(self._capture):
+            record(taken, line)
+            if line.get("event") == "rejected":
                 retaken[line["shot"]] = retaken.get(line["shot"], 0) + 1
-                if line.get("was_taken"):
-                    taken.pop(line["shot"], None)
         running = self._running()
         faults = {key: [words for _, words in line.get("faults", [])] for key, line in taken.items()}
         if not running and taken and (report := self._capture / REPORT_FILE).exists():  # all pictures together have been judged
@@ -141,7 +136,7 @@ class RemoteControl:
 
     def picture(self, shot: str, target: Path) -> bool:
         """Write the picture of a shot, as it is displayed, and return whether there is one."""
-        line = next((line for line in reversed(self._journal()) if line.get("shot") == shot and line.get("event") == "taken"), None)
+        line = next((line for line in reversed(lines_of(self._capture)) if line.get("shot") == shot and line.get("event") == "taken"), None)
         if line is None or not (path := self._capture / line["file"]).exists():
             return False
         pixels, space = images.read_pixels(path).astype(np.float32), color_space_of(path)
@@ -154,18 +149,12 @@ class RemoteControl:
     def _running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
-    def _journal(self) -> Sequence[dict[str, Any]]:
-        """Return the whole lines of the journal."""
-        path = self._capture / JOURNAL_FILE
-        content = path.read_bytes() if path.exists() else b""
-        return [json.loads(line) for line in content[:content.rfind(b"\n") + 1].splitlines()]
-
     def _listen(self, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None
         for line in process.stdout:
             text = line.rstrip()
-            if text.startswith(ASK) and text.endswith(ANSWERED):
-                self._prompt = text[len(ASK):-len(ANSWERED)]
+            if text.startswith(PLEASE) and text.endswith(THEN_ENTER):
+                self._prompt = text.removeprefix(PLEASE).removesuffix(THEN_ENTER)
             elif text:
                 self._lines.append(text)
         process.wait()

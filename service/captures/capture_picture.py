@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.relight.sheet import BACKGROUND, display, dome_places, fit, write_sheet
+from service.relight.sheet import BACKGROUND, display, display_gain, dome_places, fit, write_sheet
 from stage.capture.capture import Capture
 from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.manifest import Frame
@@ -32,8 +32,6 @@ MOST_FRAMES = 60
 THUMBNAIL = 160
 """The rows of the small images that are kept of the frames."""
 RED, GREY, DIM = (0.95, 0.2, 0.15), (0.45, 0.47, 0.5), (0.2, 0.21, 0.23)
-EXPOSURE_PERCENTILE, EXPOSURE_TARGET = 99.0, 0.8
-"""This percentile of the readings becomes this value before the display transform, alike in all frames."""
 STOPS = (-16, 8)
 """The range of the histogram, in powers of two of its unit."""
 BINS = 4 * (STOPS[1] - STOPS[0])
@@ -130,8 +128,7 @@ def _shown(images: Sequence[np.ndarray | None], capture: Capture) -> list[np.nda
         low, high = np.percentile(np.stack(there), [1, 99])
         parts = iter([np.clip((image - low) / max(high - low, 1e-12), 0, 1) for image in there])
     else:
-        level = float(np.percentile(np.stack(there), EXPOSURE_PERCENTILE))
-        gain = np.float32(EXPOSURE_TARGET / level if level > 0 else 1.0)
+        gain = np.float32(display_gain(np.stack(there)))
         together = np.concatenate([np.maximum(image, 0) * gain for image in there])
         parts = iter(np.split(display(together, linear_space(capture.manifest.color_space)), len(there)))
     return [_crossed(there[0].shape[1] / there[0].shape[0]) if image is None else next(parts) for image in images]

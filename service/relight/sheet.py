@@ -23,7 +23,7 @@ GAP, TITLE, MARGIN = 12, 26, 20
 BACKGROUND = np.array([0.055, 0.058, 0.065], dtype=np.float32)
 INK = (0.82, 0.84, 0.87)
 EXPOSURE_PERCENTILE = 99.0
-"""This percentile of the object's luminance becomes EXPOSURE_TARGET before the display transform."""
+"""This percentile of what is shown becomes EXPOSURE_TARGET before the display transform."""
 EXPOSURE_TARGET = 0.8
 
 
@@ -69,7 +69,12 @@ def exposure_of(images: np.ndarray, mask: np.ndarray) -> float:
     """Return the factor that makes the object of pictures [pictures, rows, cols, 3], where the mask [rows, cols] is true, bright."""
     if not mask.any():
         return 1.0
-    level = float(np.percentile(images[:, mask].mean(axis=-1), EXPOSURE_PERCENTILE))
+    return display_gain(images[:, mask].mean(axis=-1))
+
+
+def display_gain(readings: np.ndarray) -> float:
+    """Return the factor that makes scene-linear readings, of any shape, bright where they are displayed."""
+    level = float(np.percentile(readings, EXPOSURE_PERCENTILE))
     return EXPOSURE_TARGET / level if level > 0 else 1.0
 
 

@@ -47,6 +47,10 @@ class Camera(Protocol):
     def settings(self) -> dict[str, str]:
         """Return the settings that decide what a picture looks like, by name; those that cannot be read are left out."""
 
+    @property
+    def exposure_s(self) -> float | None:
+        """Return the exposure time; None where the camera does not tell it or cannot be set to another."""
+
     def present(self) -> list[str]:
         """Return the names of the files that are known: those that were there when the camera was opened, or were told then."""
 

@@ -66,6 +66,12 @@ class Gphoto2Camera:
         """Return the settings that the camera tells."""
         return {name: value for name in RECORDED if (value := self._value(name)) is not None}
 
+    @property
+    def exposure_s(self) -> float | None:
+        """Return the exposure time that the camera tells; None for bulb."""
+        told = self._value("shutterspeed")
+        return None if told is None else seconds_of(told)
+
     def present(self) -> list[str]:
         """Return nothing: files come over the cable."""
         return []

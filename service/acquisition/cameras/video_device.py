@@ -39,6 +39,10 @@ class VideoDevice:
         found = {name: self._video.get(number) for name, number in RECORDED.items()}
         return {name: f"{value:g}" for name, value in found.items() if value not in (-1.0, 0.0)}
 
+    @property
+    def exposure_s(self) -> None:
+        """Return nothing: exposure times of devices have no unit."""
+
     def present(self) -> list[str]:
         """Return nothing: pictures are taken from the video."""
         return []

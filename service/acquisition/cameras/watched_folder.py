@@ -25,6 +25,7 @@ class WatchedFolder:
         self._folder, self._pattern, self._setup = folder, pattern, setup
         self._known = {path.name for path in self._files()} if setup.known is None else set(setup.known)
         self.settings: dict[str, str] = {}
+        self.exposure_s: None = None
 
     def present(self) -> list[str]:
         """Return the names of the files that are known."""

@@ -15,6 +15,8 @@ ADAPTERS = {"sacn": "dmx", "artnet": "dmx", "serial": "serial_line", "http": "ht
 
 Ask = Callable[[str], None]
 """Asks a person to do something, and returns when it is done; raises RequestError where nobody can be asked."""
+PLEASE, THEN_ENTER = "please   ", ", then press Enter"
+"""How a line of `relit capture` begins that is for a person, and how it ends where the capture waits until that is done."""
 
 
 class Switch(Protocol):

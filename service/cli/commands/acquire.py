@@ -115,9 +115,13 @@ def _commands(request: AcquireRequest, steps: Sequence[Then]) -> str:
 
 
 def _ask(what: str) -> None:
-    print(f"please   {what}, then press Enter", file=sys.stderr, flush=True)
+    from service.acquisition.lights.lights import THEN_ENTER
+
+    _tell(f"{what}{THEN_ENTER}")
     sys.stdin.readline()
 
 
 def _tell(what: str) -> None:
-    print(f"please   {what}", file=sys.stderr, flush=True)
+    from service.acquisition.lights.lights import PLEASE
+
+    print(f"{PLEASE}{what}", file=sys.stderr, flush=True)

@@ -54,7 +54,7 @@ def test_each_fault_is_named_over_random_seeds(scene):
 
 
 def test_the_highlight_of_a_glossy_ball_has_not_moved():
-    """It is at another place under each lamp, and in part where each of the lamps around has its own, as a prediction says."""
+    """A highlight moves with the lamp, and lies in part where each of the lamps around has its own, as a prediction says."""
     directions = fibonacci_sphere(160)
     directions = directions[directions[:, 2] > 0.3]
     across = (2 * np.arange(96) + 1) / 80 - 1.2
@@ -69,7 +69,7 @@ def test_the_highlight_of_a_glossy_ball_has_not_moved():
 
 
 def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
-    """Of seven lamps none is predicted: the one beside the camera is brighter than the mean of those around it."""
+    """No lamp of seven is predicted, because the one beside the camera is brighter than the mean of those around it."""
     ring = make_scene(size=64, lights=7)
     scene = Scene(ring.images.astype(np.float32), ring.directions)
     made, found = named(scene, 1, ())
