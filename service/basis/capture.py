@@ -11,6 +11,7 @@ from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.reporting.provenance import metadata
 from service.requests.basis import BasisKind, BasisRequest
+from service.requests.publish import PublishRequest
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.lighting import lights_from_centre
@@ -75,7 +76,7 @@ class BasisResult(NamedTuple):
     """Relative error of pictures under key lights from between the captured lights, where the file gives sums of images."""
 
 
-def open_capture(request: BasisRequest, timings: Timings) -> BasisCapture:
+def open_capture(request: BasisRequest | PublishRequest, timings: Timings) -> BasisCapture:
     """Open the capture of a request, none of whose images a result may replace."""
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)

@@ -14,22 +14,17 @@ import numpy as np
 from kernels.errors import ArrayError
 from kernels.packs import Band
 from kernels.relight.basis.basis import squared_residual
-from kernels.relight.basis.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, encode, fit_weights, hemispherical_harmonics, separate
+from kernels.relight.basis.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, fit_weights, hemispherical_harmonics, separate
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
+from service.basis.display import WHITE_PERCENTILE, Display, display_of
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
-from stage.colour.colour import rgb_matrix
 from stage.errors import ManifestError
 from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, quantize, write_hsh, write_ptm
 from stage.results.light_basis import numbers, write_facts
 
-DISPLAY_SPACE = "lin_rec709_scene"
-"""The linear space of an sRGB display."""
-WHITE_PERCENTILE = 99.9
-EXPOSURE_PIXELS = 1 << 16
-"""Most pixels that the exposure is measured on; of more, evenly spread ones are taken."""
 LIGHTS_PER_TERM = 2
 """Least lights for each term of hemispherical harmonics where no count is given: with fewer, values oscillate between the lights."""
 
@@ -38,35 +33,28 @@ class Model(NamedTuple):
     """The functions that are fitted, and the display values that they are fitted to."""
 
     kind: BasisKind
-    front: np.ndarray  # indices of the lights with z > 0
+    display: Display
     functions: np.ndarray  # [lights padded, terms], display value = Σ function · coefficient; 0 for lights left out
     weights: np.ndarray  # [terms, 3, lights padded] float32, coefficient = Σ weight · display value
-    gains: np.ndarray  # [3, lights padded], from stored to exposed scene-linear values; 0 for lights left out
-    display_from_stack: np.ndarray  # [3, 3]
-    exposure: float
 
     @property
     def terms(self) -> int:
         """The number of coefficients of each channel."""
         return int(self.functions.shape[1])
 
-    def shown(self, band: Band) -> Band:
-        """Return the display values of a band."""
-        return encode(band, self.gains, self.display_from_stack)
-
     def fit(self, shown: Band) -> tuple[np.ndarray, np.ndarray | None]:
         """Return coefficients [terms, 3 or 1, pixels padded] float32, and for a luminance its colour [3, pixels padded] uint8."""
         fitted = combine_batch(shown, self.weights).numpy()
         if self.kind != BasisKind.LRGB_PTM:
             return fitted, None
-        luminance = separate(fitted, self.functions[self.front] * WHITE)
+        luminance = separate(fitted, self.functions[self.display.front] * WHITE)
         return luminance.coefficients[:, None], luminance.colour
 
     def squared_difference(self, shown: Band, coefficients: np.ndarray, colour: np.ndarray | None, inside: np.ndarray) -> float:
         """Return Σ (what a viewer shows − display value)² over channels, lights and the pixels inside."""
         in_colour = coefficients if colour is None else coefficients * (colour / np.float32(WHITE))
         functions = np.broadcast_to(self.functions, (3, *self.functions.shape))
-        squares = squared_residual(shown, (self.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0).numpy()
+        squares = squared_residual(shown, (self.display.gains > 0).astype(np.float32), in_colour, functions, low=0.0, high=1.0).numpy()
         return float(squares[:, inside].sum(dtype=np.float64))
 
 
@@ -77,7 +65,7 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
     bytes_per_pixel = (6 + 4) * stack.shape[1] + 8 * 12 * terms  # display values, luminances, and coefficients in their stages
     low, high = np.zeros(terms), np.zeros(terms)
     for each in stack_bands(source, device, bytes_per_pixel, timings, "fit"):
-        inside = model.fit(model.shown(each.band))[0][:, :, each.inside]
+        inside = model.fit(model.display.shown(each.band))[0][:, :, each.inside]
         low, high = np.minimum(low, inside.min(axis=(1, 2))), np.maximum(high, inside.max(axis=(1, 2)))
     quantization = quantization_of_range(low, high)
     channels = 1 if kind == BasisKind.LRGB_PTM else 3
@@ -85,7 +73,7 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
     colours = np.zeros((pixels, 3), dtype=np.uint8)
     loss = np.zeros(3)  # as fitted, as stored, and without anything
     for each in stack_bands(source, device, bytes_per_pixel, timings, "store"):
-        shown = model.shown(each.band)
+        shown = model.display.shown(each.band)
         fitted, colour = model.fit(shown)
         levels = quantize(np.where(each.inside, fitted, 0), quantization)
         width = each.span.stop - each.span.start
@@ -101,28 +89,24 @@ def make_rti(request: BasisRequest, kind: BasisKind, source: BasisCapture, devic
         write_hsh(request.out, Hsh(grid, quantization))
     else:
         write_ptm(request.out, Ptm(grid, quantization, colours.reshape(rows, cols, 3) if channels == 1 else None))
-    readings = 3 * source.pixels * len(model.front)
+    lights = len(model.display.front)
+    readings = 3 * source.pixels * lights
     error = {"relative_rms": np.sqrt(loss[1] / loss[2]), "levels_rms": WHITE * np.sqrt(loss[1] / readings),
              "fit_relative_rms": np.sqrt(loss[0] / loss[2])}
     facts = _write_facts(request, source, model, quantization, {name: numbers(value) for name, value in error.items()})
     timings.close()
-    return BasisResult(request.out, facts, kind, terms, source.pixels, len(model.front), stack.light_count - len(model.front),
-                       source.near, float(error["relative_rms"]), float(error["levels_rms"]), None)
+    return BasisResult(request.out, facts, kind, terms, source.pixels, lights, stack.light_count - lights, source.near,
+                        float(error["relative_rms"]), float(error["levels_rms"]), None)
 
 
 def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Model:
-    directions, irradiance = source.lights
+    directions = source.lights.direction
     front = np.flatnonzero(directions[:, 2] > 0)
     terms = _terms(request.count, kind, len(front))
     if len(front) < terms:
         others = len(directions) - len(front)
         raise ManifestError(f"{source.where}: frames: {len(front)} are lit from in front of the object (z > 0; {others} others are left "
                             f"out): {terms} coefficients of {kind} need {terms} or more")
-    dark = np.argwhere(irradiance[front] <= 0)
-    if len(dark):
-        light, channel = dark[0]
-        raise ManifestError(f"{source.where}: light.irradiance of {source.stack.frames[front[light]]}: is 0 in channel "
-                            f"{'RGB'[channel]}: {kind} shows the object under white light")
     functions = hemispherical_harmonics(directions[front], terms) if kind == BasisKind.HSH else biquadratic(directions[front])
     try:
         fit = fit_weights(functions)
@@ -130,13 +114,10 @@ def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Mode
         raise ManifestError(f"{source.where}: frames[].light.direction: {error}") from error
     lights = source.stack.shape[1]
     white = 1.0 if kind == BasisKind.HSH else WHITE
-    weights, padded, gains = np.zeros((terms, 3, lights), dtype=np.float32), np.zeros((lights, terms)), np.zeros((3, lights))
+    weights, padded = np.zeros((terms, 3, lights), dtype=np.float32), np.zeros((lights, terms))
     weights[:, :, front] = white * fit[:, None]
     padded[front] = functions / white
-    gains[:, front] = (source.stack.scale[front, None] / irradiance[front]).T
-    matrix = rgb_matrix(source.space, DISPLAY_SPACE)
-    exposure = _exposure(source, gains, matrix)
-    return Model(kind, front, padded, weights, gains * exposure, matrix, exposure)
+    return Model(kind, display_of(source, front, kind), padded, weights)
 
 
 def _terms(count: int | None, kind: BasisKind, lights: int) -> int:
@@ -151,26 +132,14 @@ def _terms(count: int | None, kind: BasisKind, lights: int) -> int:
     return count
 
 
-def _exposure(source: BasisCapture, gains: np.ndarray, display_from_stack: np.ndarray) -> float:
-    """Return the factor of radiance under a light of irradiance 1 that makes WHITE_PERCENTILE of the display-linear values 1."""
-    pixels = np.flatnonzero(source.inside)
-    values, _ = source.stack.pick(pixels[:: -(-len(pixels) // EXPOSURE_PIXELS)])
-    lit = gains[0] > 0
-    scene = values[:, lit].astype(np.float32) * gains[:, lit, None].astype(np.float32)
-    white = float(np.quantile(np.tensordot(display_from_stack, scene, axes=1), WHITE_PERCENTILE / 100))
-    if not white > 0:
-        raise ManifestError(f"{source.where}: frames: the object is black under every light in front of it")
-    return 1 / white
-
-
 def _write_facts(request: BasisRequest, source: BasisCapture, model: Model, quantization: Quantization, error: dict[str, float]) -> Path:
     camera = source.capture.camera
-    behind = np.setdiff1d(np.arange(source.stack.light_count), model.front)
+    behind = np.setdiff1d(np.arange(source.stack.light_count), model.display.front)
     return write_facts(request.out, {
         "kind": model.kind, "capture": source.capture.name, "image": request.out.name, "resolution": [camera.width, camera.height],
         "count": model.terms, "color_space": "srgb_texture",
         "convention": f"display values, as under one white light of irradiance 1 times exposure; percentile {WHITE_PERCENTILE} is white",
-        "exposure": numbers(model.exposure), "step": numbers(quantization.step), "zero": quantization.zero.tolist(),
-        "lights": source.described_lights(model.front), "lights_left_out": [source.stack.frames[i] for i in behind],
+        "exposure": numbers(model.display.exposure), "step": numbers(quantization.step), "zero": quantization.zero.tolist(),
+        "lights": source.described_lights(model.display.front), "lights_left_out": [source.stack.frames[i] for i in behind],
         "error": {**error, "pixels": source.pixels}, "provenance": source.provenance,
     })

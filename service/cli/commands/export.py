@@ -1,4 +1,5 @@
-"""relit export, inspect, basis and join: assets and what they hold, coefficient images of a capture, and maps joined with a depth."""
+"""relit export, inspect, basis, publish and join: assets and what they hold, coefficient images and web pages of a capture, and maps joined
+with a depth."""
 
 import json
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
 from service.requests.export import ExportRequest, InspectRequest
+from service.requests.publish import PublishRequest
 from service.requests.solve import JoinRequest
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ def register(app: typer.Typer) -> None:
     local_command(app, "export", _export)
     local_command(app, "inspect", _inspect)
     local_command(app, "basis", _basis)
+    local_command(app, "publish", _publish)
     local_command(app, "join", _join)
 
 
@@ -89,6 +92,21 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         return f"({', '.join(map(_text, value))})"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _publish(request: PublishRequest) -> None:
+    from service.publish.publish import publish
+
+    result = with_bar(publish, request)
+    print(f"{request.kind:<8} {result.path}")
+    print(f"files    {result.files}, {result.size / 1e6:.3g} MB")
+    if result.left_out:
+        print(f"lights   {result.left_out} are not in front of the object, and left out")
+    if result.near_lights:
+        print(f"lights   {result.near_lights} near lights are taken as distant, as the object's centre sees them")
+    if result.levels_rms is not None:
+        print(f"error    {result.levels_rms:.2g} of 255 display levels from the captured images (RMS), before JPEG")
+    print_warnings(result.warnings)
 
 
 def _join(request: JoinRequest) -> None:

@@ -1,0 +1,122 @@
+"""Publish a capture as a folder of static files, whole or not at all."""
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from service import __version__
+from service.basis.capture import open_capture
+from service.basis.display import display_of
+from service.errors import RequestError
+from service.publish.annotations import read_annotations
+from service.publish.iiif import MANIFEST_FILE, write_iiif
+from service.publish.planes import INFO_FILE, write_planes
+from service.publish.web import PAGE_FILE, write_page
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import other_inputs
+from service.requests.publish import PublishedAs, PublishRequest
+from service.viewing.result_layers import ResultLayers
+from service.viewing.view_files import result_file
+from stage.errors import ManifestError, storage
+from stage.files import write_text
+
+PUBLICATION_FILE, SCHEMA = "publication.json", "relit.publication/1"
+"""The file by which a folder is known as one that this command has made."""
+LEAST_LIGHTS = 3
+
+
+class PublishResult(NamedTuple):
+    """What was published."""
+
+    path: Path
+    """The file to open or to name to a viewer."""
+    files: int
+    size: int
+    """Bytes of all files."""
+    near_lights: int
+    left_out: int
+    """Number of lights that are not in front of the object."""
+    levels_rms: float | None
+    """Root mean square difference of the planes from the captured images, in steps of an 8-bit display; None: there are no planes."""
+    warnings: tuple[str, ...]
+
+
+def publish(request: PublishRequest, progress: Progress | None = None) -> PublishResult:
+    """Publish a capture.
+
+    Raises:
+        RequestError: the folder holds something else, or an option does not fit the capture.
+        StageError: capture, maps or annotations cannot be used.
+    """
+    _check(request.out)
+    timings = Timings(progress)
+    device = devices.resolve(request.device)
+    source = open_capture(request, timings)
+    camera = source.capture.camera
+    annotations = read_annotations(request.annotations, camera.width, camera.height)
+    maps = None if request.maps is None else ResultLayers(result_file(request.maps), source.capture)
+    if maps is not None and maps.of_depth:
+        raise RequestError(f"--maps {request.maps}: holds a depth: give a folder with maps.exr")
+    doubt = None if maps is None else other_inputs(maps.provenance, source.stack.key, maps.path)
+    front = np.flatnonzero(source.lights.direction[:, 2] > 0)
+    if len(front) < LEAST_LIGHTS:
+        raise ManifestError(f"{source.where}: frames: {len(front)} are lit from in front of the object (z > 0): relit publish needs "
+                            f"{LEAST_LIGHTS} or more")
+    display = display_of(source, front, "relit publish")
+    loss = None
+    with _replacing(request.out) as folder:
+        if request.kind is PublishedAs.IIIF:
+            write_iiif(folder, source, display, maps, request, annotations, device, timings)
+        else:
+            loss = write_planes(folder, source, display, device, timings, quality=request.quality,
+                                whole=request.kind is PublishedAs.OPENLIME)
+            if request.kind is PublishedAs.WEB:
+                write_page(folder, source, request, annotations)
+        write_text(folder / PUBLICATION_FILE, json.dumps({
+            "schema": SCHEMA, "as": request.kind, "version": __version__, "provenance": source.provenance}, indent=1) + "\n")
+        sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    timings.close()
+    first = {PublishedAs.IIIF: MANIFEST_FILE, PublishedAs.OPENLIME: INFO_FILE, PublishedAs.WEB: PAGE_FILE}[request.kind]
+    return PublishResult(request.out / first, len(sizes), sum(sizes), source.near, source.stack.light_count - len(front),
+                         loss, () if doubt is None else (doubt,))
+
+
+def _check(out: Path) -> None:
+    """Refuse a folder that holds something else than a publication."""
+    with storage("read", out):
+        if out.exists() and not out.is_dir():
+            raise RequestError(f"--to {out}: is a file: give a folder")
+        if out.is_dir() and any(out.iterdir()) and not (out / PUBLICATION_FILE).is_file():
+            raise RequestError(f"--to {out}: holds files that relit publish has not made: give another folder")
+
+
+@contextmanager
+def _replacing(out: Path) -> Iterator[Path]:
+    """Yield a folder beside `out`, which takes its place when the block ends without an error and is removed otherwise."""
+    with storage("write", out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    try:
+        with storage("write", out):
+            yield temporary
+            temporary.chmod(0o755)
+            older = temporary.with_name(f"{temporary.name}.replaced")
+            if out.exists():
+                os.rename(out, older)
+            try:
+                os.rename(temporary, out)
+            except BaseException:
+                if older.exists():
+                    os.rename(older, out)
+                raise
+            shutil.rmtree(older, ignore_errors=True)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

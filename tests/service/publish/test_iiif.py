@@ -1,0 +1,111 @@
+"""relit publish --as iiif: static files that answer what IIIF asks for, and a manifest that names them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.reference.light_basis import srgb
+from tests.scenes.captures import make_scene, write_capture
+from tests.service.publish.published import image
+
+URL = "https://museum.org/cap"
+SIZE = 600
+NOTES = {"type": "AnnotationPage", "items": [
+    {"type": "Annotation", "body": {"type": "TextualBody", "value": "a crack"},
+     "target": {"selector": {"type": "FragmentSelector", "value": "xywh=10,20,30,40"}}},
+    {"type": "Annotation", "body": "a point", "target": {"selector": {"type": "PointSelector", "x": 300, "y": 299.5}}},
+    {"type": "Annotation", "body": {"value": "a corner"}, "target": "https://elsewhere/canvas#xywh=0,0,5,5"}]}
+
+
+@pytest.fixture
+def published(relit, tmp_path):
+    """A cap with maps and notes, published."""
+    write_capture(tmp_path / "cap", make_scene(size=SIZE, lights=5))
+    relit.done("solve", tmp_path / "cap", "--out", tmp_path / "maps", "--method", "lambert")
+    (tmp_path / "notes.json").write_text(json.dumps(NOTES))
+    relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "iiif", "--url", f"{URL}/", "--maps", tmp_path / "maps",
+               "--annotations", tmp_path / "notes.json", "--rights", "https://creativecommons.org/licenses/by/4.0/", "--photographs", "2",
+               "--attribution", "A museum", "--title", "Cap")
+    return tmp_path / "out"
+
+
+def file_of(folder, address):
+    """The file that a plain server gives for an address."""
+    assert address.startswith(f"{URL}/")
+    return folder / address.removeprefix(f"{URL}/")
+
+
+def test_the_manifest_names_pictures_that_are_there(published):
+    manifest = json.loads((published / "manifest.json").read_text())
+    assert manifest["id"] == f"{URL}/manifest.json" and manifest["label"] == {"none": ["Cap"]}
+    assert manifest["rights"] == "http://creativecommons.org/licenses/by/4.0/"
+    assert manifest["requiredStatement"]["value"] == {"none": ["A museum"]}
+    identifiers, labels = [manifest["id"]], []
+    for canvas in manifest["items"]:
+        [painting] = canvas["items"][0]["items"]
+        assert (canvas["width"], canvas["height"], painting["target"]) == (SIZE, SIZE, canvas["id"])
+        identifiers += [canvas["id"], canvas["items"][0]["id"], painting["id"]]
+        assert painting["body"]["type"] == "Choice"
+        for body in painting["body"]["items"]:
+            labels.append(body["label"]["en"][0])
+            identifiers.append(body["id"])
+            assert image(file_of(published, body["id"])).shape == (SIZE, SIZE, 3)
+            assert json.loads((file_of(published, body["service"][0]["id"]) / "info.json").read_text())["id"] == body["service"][0]["id"]
+        thumbnail = canvas["thumbnail"][0]
+        assert image(file_of(published, thumbnail["id"])).shape[:2] == (thumbnail["height"], thumbnail["width"])
+    assert len(set(identifiers)) == len(identifiers)
+    assert labels[-2:] == ["normals", "albedo"] and sum(label.startswith("photograph") for label in labels) == 2 and len(labels) == 9
+
+
+def test_notes_are_on_each_canvas(published):
+    manifest = json.loads((published / "manifest.json").read_text())
+    for canvas in manifest["items"]:
+        [page] = canvas["annotations"]
+        crack, point, corner = page["items"]
+        assert crack["body"]["value"] == "a crack" and crack["target"] == f"{canvas['id']}#xywh=10,20,30,40"
+        assert point["target"]["selector"] == {"type": "PointSelector", "x": 300.0, "y": 299.5}
+        assert corner["target"] == f"{canvas['id']}#xywh=0,0,5,5"
+
+
+def test_every_tile_that_a_viewer_asks_for_is_there(published):
+    """A viewer computes the addresses of tiles as section 5.6 of the Image API tells."""
+    for folder in (published / "relit_0", published / "albedo"):
+        info = json.loads((folder / "info.json").read_text())
+        assert info["profile"] == "level0" and (info["width"], info["height"]) == (SIZE, SIZE)
+        whole = np.zeros((SIZE, SIZE, 3), np.uint8)
+        [tiles] = info["tiles"]
+        for factor in tiles["scaleFactors"]:
+            step = tiles["width"] * factor
+            for y in range(0, SIZE, step):
+                for x in range(0, SIZE, step):
+                    width, height = min(step, SIZE - x), min(step, SIZE - y)
+                    size = -(-width // factor), -(-height // factor)
+                    tile = image(folder / f"{x},{y},{width},{height}" / f"{size[0]},{size[1]}" / "0" / "default.jpg")
+                    assert tile.shape[:2] == size[::-1]
+                    if factor == 1:
+                        whole[y:y + height, x:x + width] = tile
+        for size in info["sizes"]:
+            small = image(folder / "full" / f"{size['width']},{size['height']}" / "0" / "default.jpg")
+            assert small.shape[:2] == (size["height"], size["width"])
+        largest = image(folder / "full" / "max" / "0" / "default.jpg").astype(float)
+        assert largest.shape[:2] == (info["maxHeight"], info["maxWidth"]) == (SIZE, SIZE)
+        assert np.abs(largest - whole).mean() < 1  # two JPEG files of the same pixels
+
+
+def test_pictures_are_what_they_say(published):
+    scene = make_scene(size=SIZE, lights=5)
+    white = scene.images / scene.irradiance[:, None, None]
+    exposure = np.quantile(white[:, scene.mask], 0.999)
+    manifest = json.loads((published / "manifest.json").read_text())
+    bodies = {body["label"]["en"][0]: file_of(published, body["id"])
+              for canvas in manifest["items"] for body in canvas["items"][0]["items"][0]["body"]["items"]}
+    photographs = [path for label, path in bodies.items() if label.startswith("photograph")]
+    for light, path in zip((0, 4), photographs, strict=True):  # two of five are the first and the last
+        got = image(path) / 255
+        assert np.sqrt(np.mean(np.square(got - srgb(np.clip(white[light] / exposure, 0, 1)) * scene.mask[..., None]))) < 2 / 255  # JPEG
+    normals = image(bodies["normals"])[scene.mask] / 127.5 - 1
+    off = np.degrees(np.arccos(np.clip((normals * scene.normal[scene.mask]).sum(axis=-1) / np.linalg.norm(normals, axis=-1), -1, 1)))
+    assert np.median(off) < 1  # a level of 255 is .45 degrees
+    albedo = image(bodies["albedo"])[scene.mask] / 255
+    assert np.abs(albedo - srgb(scene.albedo[scene.mask])).mean() < 2 / 255

@@ -1,0 +1,64 @@
+"""relit publish --as openlime: the pictures that OpenLIME shows of the planes are the captured images."""
+
+import json
+import re
+
+import numpy as np
+
+from tests.reference.light_basis import srgb
+from tests.scenes.captures import edit_manifest, make_scene, render, write_capture
+from tests.service.publish.published import image, shown, tiles_joined
+
+SIZE = 300
+"""More than a tile, and no power of two."""
+
+
+def capture(folder, lights=7):
+    """A cap under white lights in its own space, of which two rows of tiles are needed; returns the scene."""
+    scene = make_scene(size=SIZE, lights=lights)
+    white = np.ones_like(scene.irradiance)
+    scene = scene._replace(irradiance=white, images=render(scene.normal, scene.albedo, scene.directions, white))
+    write_capture(folder, scene)
+    return scene
+
+
+def test_captured_lights_show_the_captured_images(relit, tmp_path):
+    scene = capture(tmp_path / "cap")
+    out = relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "openlime").out
+    exposure = np.quantile(scene.images[:, scene.mask], 0.999)
+    truth = srgb(np.clip(scene.images / exposure, 0, 1)) * scene.mask[..., None]
+    got = shown(tmp_path / "out", scene.directions)
+    # seven lights of three channels have 21 components, which are all there; 2 levels are those of JPEG at the default quality, the limit
+    # that the page of the documentation states for the sample
+    assert 255 * np.sqrt(np.mean(np.square(got - truth))) < 2
+    said = float(re.search(r"error +([\d.]+) of 255", out)[1])
+    assert said < 1  # bytes alone
+    between = shown(tmp_path / "out", np.array([[0.25, 0.0, 0.968]]))[0]  # halfway between the light in front and one beside it
+    ends = truth[[0, int(np.argmax(scene.directions[:, 0]))]]
+    assert np.abs(between - ends.mean(axis=0))[scene.mask].mean() < np.abs(ends[0] - ends[1])[scene.mask].mean()
+
+
+def test_tiles_of_each_level_are_the_whole_image_made_smaller(relit, tmp_path):
+    capture(tmp_path / "cap")
+    relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "openlime", "--quality", "100")
+    whole = image(tmp_path / "out" / "plane_0.jpg")
+    assert (tmp_path / "out" / "plane_0.dzi").read_text().count(f'Width="{SIZE}" Height="{SIZE}"') == 1
+    side, wanted = SIZE, whole.astype(float)
+    for level in range(9, -1, -1):  # 2⁹ is the first power of two from 300 on
+        joined = tiles_joined(tmp_path / "out" / "plane_0_files" / str(level), side, side)
+        # JPEG rounds each file, and each level the one before, by half a step
+        assert np.abs(joined - wanted).mean() < 2
+        side = -(-side // 2)
+        even = np.pad(wanted, [(0, len(wanted) % 2), (0, len(wanted) % 2), (0, 0)], mode="edge")
+        wanted = even.reshape(side, 2, side, 2, 3).mean(axis=(1, 3))
+    assert side == 1 and not (tmp_path / "out" / "plane_0_files" / "10").exists()
+
+
+def test_black_stays_black_and_the_scale_is_told(relit, tmp_path):
+    scene = capture(tmp_path / "cap", lights=4)
+    edit_manifest(tmp_path / "cap", camera={"projection": "orthographic", "resolution": [SIZE, SIZE], "pixel_size_m": 2e-4})
+    relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "openlime", "--quality", "100")
+    info = json.loads((tmp_path / "out" / "info.json").read_text())
+    assert info["pixelSizeInMM"] == 0.2 and info["nplanes"] == 12  # as many as four lights of three channels have
+    corner = shown(tmp_path / "out", scene.directions)[:, :20, :20]
+    assert 255 * corner.max() < 1.5  # a step of JPEG

@@ -1,0 +1,137 @@
+"""The page of relit publish --as web in a browser, from a server of files that knows nothing of Relit."""
+
+import re
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from service.publish.publish import publish
+from service.requests.publish import PublishRequest
+from tests.service.publish.published import shown
+from tests.service.server.pages.axe import violations
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+
+MOST_BYTES = 2_000_000
+"""What the page may weigh until its first picture, tiles included."""
+NOTES = ('[{"body": "The beak", "target": "#xywh=145,70,30,50"},'
+         ' {"body": "An eye", "target": {"selector": {"type": "PointSelector", "x": 128, "y": 80}}}]')
+
+
+class Files(SimpleHTTPRequestHandler):
+    """Serves files, and counts their bytes."""
+
+    sent = 0
+
+    def copyfile(self, source, outputfile):
+        content = source.read()
+        Files.sent += len(content)
+        outputfile.write(content)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def owl(tmp_path_factory):
+    """The sample, published for OpenLIME, and its page's address."""
+    folder = tmp_path_factory.mktemp("published")
+    (folder / "notes.json").write_text(NOTES)
+    common = {"capture": SAMPLES / "owl", "cache": folder / "cache"}
+    publish(PublishRequest(out=folder / "planes", kind="openlime", **common))
+    publish(PublishRequest(out=folder / "page", kind="web", annotations=folder / "notes.json", attribution="Relit's sample", **common))
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=folder / "page")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder / "planes", f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+@pytest.fixture(params=[False])
+def page(browser, request):
+    """A page; its policy refuses scripts of others, as those by which tests wait and look are, unless the parameter lifts it."""
+    context = new_context(browser, viewport={"width": 1200, "height": 800}, bypass_csp=request.param)
+    page, errors = context.new_page(), []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    yield page
+    context.close()
+    assert errors == []
+
+
+def picture(page) -> np.ndarray:
+    """[rows, cols, 3] what the canvas shows, 0 to 1."""
+    page.locator("#picture[data-ready='0']").wait_for()
+    page.wait_for_timeout(300)
+    data = page.evaluate("""async () => {
+      const blob = await new Promise((done) => document.getElementById("picture").toBlob(done));
+      return Array.from(new Uint8Array(await blob.arrayBuffer()));
+    }""")
+    return cv2.imdecode(np.array(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1] / 255
+
+
+@pytest.mark.long
+def test_the_page_shows_the_sample_as_openlime_would(owl, page, tmp_path):
+    planes, address = owl
+    Files.sent = 0
+    page.goto(f"{address}#light=-0.6,0.3")
+    picture(page)
+    assert Files.sent < MOST_BYTES
+    page.screenshot(path=Path(PICTURES or tmp_path) / "page_publish.png")
+    for light in ((0.0, 0.0), (-0.6, 0.3), (0.35, -0.5)):
+        page.goto("about:blank")
+        page.set_viewport_size({"width": 320 + 272, "height": 1000})
+        page.goto(f"{address}?embed#light={light[0]},{light[1]}&zoom=1")
+        page.set_viewport_size({"width": 320, "height": 320})  # a pixel of the canvas is one of the image
+        found = picture(page)
+        assert found.shape == (320, 320, 3)
+        wanted = shown(planes, np.array([[*light, np.sqrt(1 - light[0] ** 2 - light[1] ** 2)]]))[0]
+        # the whole planes and the tiles are JPEG files of their own: twice the 1.5 levels that one costs on the sample
+        assert 255 * np.sqrt(np.mean(np.square(found - wanted))) < 3
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+def test_the_address_keeps_what_is_shown(owl, page):
+    page.goto(owl[1])
+    picture(page)
+    page.locator("#picture").focus()
+    for key in ("ArrowLeft", "ArrowUp", "+", "Shift+ArrowRight"):
+        page.keyboard.press(key)
+    page.wait_for_function("location.hash.includes('zoom=1.25')")
+    assert re.fullmatch(r"#light=0\.4,0\.55&stops=0&centre=1[6-9]\d\.?\d*,160&zoom=1\.25", page.evaluate("location.hash"))
+    first = picture(page)
+    page.reload()
+    assert np.abs(picture(page) - first).max() < 1 / 255  # the same tiles under the same light
+    page.mouse.click(300, 400)
+    page.wait_for_function("!location.hash.includes('light=0.4,0.55')")
+    page.evaluate("location.hash = '#light=0.4,0.55&stops=0&centre=nonsense&zoom=1e99'")
+    page.wait_for_timeout(100)
+    assert page.locator("#light-x").input_value() == "0.4"
+    page.locator("#texts button", has_text="The beak").click()
+    page.wait_for_function("location.hash.includes('centre=160,95')")
+    page.locator("#embed summary").click()
+    page.wait_for_function("document.querySelector('#embed textarea').value.includes('?embed#light')")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+@pytest.mark.parametrize("viewport", [(1200, 800), (390, 800)])
+def test_the_page_can_be_used_by_everybody(owl, page, viewport):
+    page.set_viewport_size({"width": viewport[0], "height": viewport[1]})
+    page.goto(owl[1])
+    picture(page)
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+
+
+def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):
+    context = new_context(browser)
+    page = context.new_page()
+    page.route("**/plane_3_files/**", lambda route: route.fulfill(status=404))
+    page.goto(owl[1])
+    page.locator("#state", has_text="cannot be read (404)").wait_for()
+    context.close()
