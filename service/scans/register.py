@@ -13,6 +13,7 @@ from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report, versions
 from service.requests.register import GivenPoses, RegisterRequest, TableUse
+from service.scans.duplicates import Distinct, distinct
 from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
 from service.scans.points.neighbours import neighbours_are_installed
@@ -81,23 +82,25 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
     if not neighbours_are_installed():
         raise RequestError("scans are registered with small_gicp, which is not installed: pip install 'relit[scans]'")
     timings = Timings(progress)
-    file, listed = read_scan_set(request.scan_set)
+    file, whole = read_scan_set(request.scan_set)
+    listed, same_as = alone = distinct(file, whole)
     target = request.out / SCAN_SET_FILE
     if target.exists() and target.samefile(file):
         raise RequestError(f"--out {request.out}: would replace {file}, which is registered: give another folder")
     with _pieces(request, file, listed, sharing) as pieces:
-        placed = _placed(request, file, listed, pieces, timings)
+        placed = _placed(request, file, alone, pieces, timings)
     scans, poses, covariances, pairs = placed.scans, placed.poses, placed.covariances, placed.pairs
     timings.stage("write", 1)
     spread = {number: _spread(scans[number], poses[number], covariance) for number, covariance in covariances.items()}
-    entries = [_entry(entry, file.parent, request.out, poses.get(number), covariances.get(number))
-               for number, entry in enumerate(listed.scans)]
+    numbers = {entry.name: number for number, entry in enumerate(listed.scans)}
+    entries = [_entry(entry, file.parent, request.out, *(found.get(numbers[same_as.get(entry.name, entry.name)])
+                                                         for found in (poses, covariances))) for entry in whole.scans]
     joined = [pair for pair in pairs if pair.state is PairState.JOINED and pair.fit is not None]
     report_path = request.out / REPORT_FILE
-    write_scan_set(listed.model_copy(update={"scans": tuple(entries)}), target)
+    write_scan_set(whole.model_copy(update={"scans": tuple(entries)}), target)
     write_text(report_path, report(
         request, inputs={"scan_set": str(file), "name": listed.name, "content": {scan.name: scan.content for scan in scans}},
-        timings_s=timings.close(), **placed.facts, scans=[scan_facts(number, scan, poses, spread, placed.alone, joined)
+        timings_s=timings.close(), **placed.facts, duplicates=same_as, scans=[scan_facts(number, scan, poses, spread, placed.alone, joined)
                                                                   for number, scan in enumerate(scans)],
         pairs=[pair_facts(pair, scans) for pair in pairs],
         pairs_not_tried=len(scans) * (len(scans) - 1) // 2 - sum(pair.by is Evidence.SURFACES for pair in pairs), warnings=placed.warnings))
@@ -110,9 +113,10 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
 
 def help_register(request: RegisterRequest, progress: Progress, sharing: SharedPieces) -> None:
     """Do pieces of a registration that another worker leads, and write no result."""
-    file, listed = read_scan_set(request.scan_set)
-    with _pieces(request, file, listed, sharing) as pieces:
-        _placed(request, file, listed, pieces, Timings(progress))
+    file, whole = read_scan_set(request.scan_set)
+    found = distinct(file, whole)
+    with _pieces(request, file, found.scans, sharing) as pieces:
+        _placed(request, file, found, pieces, Timings(progress))
 
 
 @contextmanager
@@ -128,9 +132,9 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
         yield pieces
 
 
-def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: SharedPieces, timings: Timings) -> _Placed:
+def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
     """Return the poses of the scans of a set."""
-    reference = _checked(request, file, listed)
+    listed, reference = alone.scans, _checked(request, file, alone)
     table, threads = listed.turntable, _threads(request)
     timings.stage("read", len(listed.scans))
     if request.turntable is TableUse.FIXED:
@@ -147,7 +151,7 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
         poses = dict(enumerate(fixed.poses))
         places = target_places({number: scan.targets for number, scan in enumerate(known)}, poses, {})
         return _Placed(known, poses, {}, {}, fixed.pairs, fixed_facts(fixed, known) | target_facts(places, known),
-                       missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
+                       alone.warnings() + missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
     kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
     known = kept.facts(request, timings.advance)
     missed = _missed(request, known)
@@ -157,7 +161,7 @@ def _placed(request: RegisterRequest, file: Path, listed: ScanSet, pieces: Share
                         table=table if request.turntable is TableUse.ANGLES else None,
                         targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
     return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, registration_facts(found, known),
-                   missed + _without_viewpoint(listed, known) + registration_warnings(found, known))
+                   alone.warnings() + missed + _without_viewpoint(listed, known) + registration_warnings(found, known))
 
 
 def _without_viewpoint(listed: ScanSet, known: list[ScanFacts]) -> list[str]:
@@ -182,20 +186,23 @@ def _threads(request: RegisterRequest) -> int:
     return request.threads or os.cpu_count() or 1
 
 
-def _checked(request: RegisterRequest, file: Path, listed: ScanSet) -> int | None:
+def _checked(request: RegisterRequest, file: Path, alone: Distinct) -> int | None:
     """Return the number of the reference, and refuse options that do not fit the set."""
+    listed = alone.scans
     if request.turntable is not TableUse.START and listed.turntable is None:
         raise RequestError(f"--turntable {request.turntable}: {file} has no turntable")
     if request.turntable is TableUse.FIXED and listed.turntable is not None and listed.turntable.angles_deg is None:
         raise RequestError(f"--turntable fixed: turntable.angles_deg is missing in {file}")
     if len(listed.scans) < 2:
-        raise ScanError(f"{file}: scans: holds one scan: two or more are registered")
+        beside = f" ({'; '.join(alone.warnings())})" if alone.same_as else ""
+        raise ScanError(f"{file}: scans: holds one scan: two or more are registered{beside}")
     if request.reference is None:
         return None
     names = [entry.name for entry in listed.scans]
-    if request.reference not in names:
+    reference = alone.same_as.get(request.reference, request.reference)
+    if reference not in names:
         raise RequestError(f"--reference {request.reference}: is no scan of {file}: they are {', '.join(names[:10])}")
-    return names.index(request.reference)
+    return names.index(reference)
 
 
 def _starts(request: RegisterRequest, listed: ScanSet, scans: Sequence[ScanFacts]) -> list[np.ndarray | None]:

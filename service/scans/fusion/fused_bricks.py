@@ -18,6 +18,7 @@ from kernels.fusion.bricks import BRICK_VOXELS
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.register import FuseRequest, Misplaced
+from service.scans.duplicates import distinct
 from service.scans.fusion.fused_surface import VERTEX, BrickSurface, Tally, fuse_brick, origin_of, places_near
 from service.scans.fusion.misplaced import LEAST_COMMON, Placing, Readings, place_scans, reach_of, readings_of
 from service.scans.fusion.prepared_scans import PreparedScans, ScanSummary
@@ -52,7 +53,9 @@ class FusedBricks(NamedTuple):
 @contextmanager
 def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces | None = None) -> Iterator[FusedBricks]:
     """Fuse the scans of a set brick by brick. What is kept of scans and bricks lies on the disk until the context ends."""
-    file, scan_set = read_scan_set(request.scan_set)
+    file, whole = read_scan_set(request.scan_set)
+    alone = distinct(file, whole)
+    scan_set = alone.scans
     with ExitStack() as held:
         work = Path(held.enter_context(TemporaryDirectory(prefix="relit-fuse-")))
         pieces = sharing or SharedPieces(FolderPieces(request.cache or work / "pieces"))
@@ -60,8 +63,9 @@ def fused_bricks(request: FuseRequest, timings: Timings, sharing: SharedPieces |
         places = [file.parent / path for entry in scan_set.scans for path in (entry.path, entry.maps) if path is not None]
         pieces.identify(scan_set.model_dump_json(), stamps(places, timed=sharing is None), kind_of_worker(device))
         (work / "scans").mkdir()
-        yield _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m, device=device),
-                      pieces, timings, device)
+        fused = _phases(request, file, PreparedScans(file, scan_set, work / "scans", request.voxel_m, device=device),
+                        pieces, timings, device)
+        yield fused._replace(warnings=alone.warnings() + fused.warnings)
 
 
 def _phases(request: FuseRequest, file: Path, scans: PreparedScans, pieces: SharedPieces, timings: Timings, device: str) -> FusedBricks:

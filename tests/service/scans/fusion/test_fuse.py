@@ -81,6 +81,19 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
 
 
+def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
+    """The mesh is to the last byte that of the set without the second one, its σ with it."""
+    file = write_scans(tmp_path / "once", shots[:3])
+    once = fuse(FuseRequest(scan_set=file, out=tmp_path / "once" / "out", voxel_m=2 * VOXEL, texture=False, device="cpu"))
+    listed = json.loads(file.read_text())
+    listed["scans"].append({**listed["scans"][1], "name": "again"})
+    file.write_text(json.dumps(listed))
+    twice = fuse(FuseRequest(scan_set=file, out=tmp_path / "twice", voxel_m=2 * VOXEL, texture=False, device="cpu"))
+    assert [w for w in twice.warnings if w not in once.warnings] == [
+        "scan again: is the same file as view 1, byte by byte, and counts once"]
+    assert twice.mesh_path.read_bytes() == once.mesh_path.read_bytes()
+
+
 def test_a_scan_without_overlap_is_named(tmp_path, shots):
     poses = [shot.world_from_camera.copy() for shot in shots[:3]]
     poses[2][0, 3] += 3.0
