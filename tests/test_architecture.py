@@ -86,7 +86,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "rawpy"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "pye57", "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -102,7 +102,8 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     ("serial", ["service.acquisition.lights.serial_line"]), ("gphoto2", ["service.acquisition.cameras"]),
     ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),
     ("stupidArtnet", ["service.play.artnet_output"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
-    ("laspy", ["stage.formats.las"]), ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
+    ("laspy", ["stage.formats.las"]), ("pye57", ["stage.formats.e57"]),
+    ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
     ("fast_simplification", ["service.asset.content.levels", "service.asset.content.uv_unwrap"]),
     ("xatlas", ["service.asset.content.uv_unwrap"]),
     ("MaterialX", ["service.asset.content.openpbr"]),

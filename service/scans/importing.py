@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.requests.imports.scans import ScansImport
+from service.requests.imports.scans import ScansImport, ScanUnit
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.point_files import read_point_scans
 from service.scans.points.rigid import nearest_rigid
@@ -50,6 +50,9 @@ def import_scans(request: ScansImport) -> Imported:
     with storage("read", source):
         listed = natural_order(path.name for path in source.iterdir() if not path.name.startswith("."))
     names = [name for name in listed if name.lower().endswith(POINT_FILES)]
+    metric = [name for name in names if name.lower().endswith(".e57")]
+    if metric and request.unit is not ScanUnit.M:
+        raise ManifestError(f"{source / metric[0]}: E57 files are in metres: leave --unit {request.unit} out, and import other files apart")
     images, tables = depth_names(listed), [source / name for name in listed if name.lower().endswith(".conf")]
     path = folder / SCAN_SET_FILE
     converted = [name for name in names if not name.lower().endswith(".ply")]

@@ -27,7 +27,7 @@ from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.tof.raw_frames import read_array
 
-POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz")
+POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz", ".e57")
 """The endings of files of points."""
 
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})

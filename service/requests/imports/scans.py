@@ -19,7 +19,7 @@ class ScanUnit(Choice):
 
 
 class ScansImport(ImportRequest):
-    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS) of one object scanned from several places, whose scanner is found, or the frames of a
+    """Point files (PLY, PTX, PTS, PCD, XYZ, LAS, E57) of one object scanned from several places, whose scanner is found, or the frames of a
     depth camera, as a scan set."""
 
     unit: ScanUnit = ScanUnit.M

@@ -1,4 +1,4 @@
-"""Reading of scans from the point files of other programs: XYZ and ASC, PTS and PTX, PCD, LAS and LAZ."""
+"""Reading of scans from the point files of other programs: XYZ and ASC, PTS and PTX, PCD, LAS and LAZ, E57."""
 
 import io
 import warnings
@@ -11,6 +11,7 @@ import numpy as np
 
 from service.scans.points.rigid import nearest_rigid
 from stage.errors import ResultError, storage
+from stage.formats.e57 import read_e57
 from stage.formats.las import read_las
 
 UNIT_LENGTH = 0.02
@@ -33,7 +34,7 @@ class PointScan(NamedTuple):
 
 
 def read_point_scans(path: Path) -> list[PointScan]:
-    """Read the scans of a file, one or, from PTS and PTX, as many as it holds. Points that are not finite are left out.
+    """Read the scans of a file, one or, from PTS, PTX and E57, as many as it holds. Points that are not finite are left out.
 
     Raises:
         ResultError: the file is not what its ending says, or a scan in it has no points.
@@ -125,8 +126,17 @@ def _las(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
     yield PointScan(points, colours)
 
 
+def _e57(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
+    """Yield the scans of an E57 file; a scanner with a pose stands in the origin of its points."""
+    for points, colours, pose in read_e57(path):
+        finite = np.isfinite(points).all(axis=1)
+        yield PointScan(points[finite], None if colours is None else colours[finite], viewpoint=None if pose is None else np.zeros(3),
+                        pose=None if pose is None else nearest_rigid(pose))
+
+
 READERS: dict[str, Callable[[io.BufferedReader, Path], Iterator[PointScan]]] = {
-    ".xyz": _columns, ".asc": _columns, ".pts": _pts, ".ptx": _ptx, ".pcd": _pcd, ".las": _las, ".laz": _las}
+    ".xyz": _columns, ".asc": _columns, ".pts": _pts, ".ptx": _ptx, ".pcd": _pcd, ".las": _las, ".laz": _las,
+    ".e57": _e57}
 """The reader of each ending."""
 
 

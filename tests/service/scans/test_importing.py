@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pye57
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -219,6 +220,54 @@ def test_scanners_of_ptx_and_pcd_files_keep_their_places(relit, tmp_path):
     assert scans["tower-2"]["viewpoint_m"] == [0, 0, 0]
     assert np.array(scans["tower-2"]["scan_to_world"]) == pytest.approx(POSE, abs=1e-9)  # ten digits in the file
     assert read_ply(tmp_path / "set" / "tower-2.ply").points == pytest.approx(CORNER + 1)
+
+
+def write_e57(path, *scans):
+    """Scans of points, with a quaternion (w first) and a translation each, and colours."""
+    with pye57.E57(str(path), mode="w") as file:
+        for points, quaternion, translation in scans:
+            values = {f"cartesian{axis}": np.ascontiguousarray(points[:, number]) for number, axis in enumerate("XYZ")}
+            values |= {f"color{name}": np.ascontiguousarray(COLOURS[:, number]) for number, name in enumerate(("Red", "Green", "Blue"))}
+            file.write_scan_raw(values, rotation=np.array(quaternion), translation=np.array(translation))
+
+
+def test_scanners_of_e57_files_keep_their_places(relit, tmp_path):
+    folder = tmp_path / "points"
+    folder.mkdir()
+    write_e57(folder / "hall.e57", (CORNER, [1.0, 0, 0, 0], [0.0, 0, 0]), (CORNER + 1, [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], [5.0, 6, 7]))
+    assert f"relit import scans {folder}" in relit.done("import", "guess", folder).out
+    said = relit.done("import", "scans", folder, tmp_path / "set").out
+    assert "as the files say" in said and "2 from their files" in said
+    first, second = json.loads((tmp_path / "set" / "scan-set.json").read_text())["scans"]
+    assert first["viewpoint_m"] == second["viewpoint_m"] == [0, 0, 0]
+    assert np.array(second["scan_to_world"]) == pytest.approx(  # a quarter about z
+        np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]), abs=1e-12)
+    cloud = read_ply(tmp_path / "set" / second["path"])
+    assert cloud.points == pytest.approx(CORNER + 1) and (cloud.colours == COLOURS).all()
+    assert "E57 files are in metres" in relit.refused("import", "scans", folder, tmp_path / "other", "--unit", "mm")
+
+
+def test_spherical_coordinates_of_e57_files_are_those_of_the_standard(relit, tmp_path, monkeypatch):
+    """pye57 writes no spherical coordinates, so what it reads is put in their place: range, azimuth from x, elevation from the plane."""
+    folder = tmp_path / "points"
+    folder.mkdir()
+    write_e57(folder / "a.e57", (CORNER + 1, [1.0, 0, 0, 0], [0.0, 0, 0]))
+    x, y, z = (CORNER + 1).T
+    values = {"sphericalRange": np.sqrt(x * x + y * y + z * z), "sphericalAzimuth": np.arctan2(y, x),
+              "sphericalElevation": np.arctan2(z, np.hypot(x, y)),
+              **{f"color{name}": COLOURS[:, number] for number, name in enumerate(("Red", "Green", "Blue"))}}
+    monkeypatch.setattr(pye57.E57, "read_scan", lambda *_, **__: values)
+    relit.done("import", "scans", folder, tmp_path / "set")
+    assert read_ply(tmp_path / "set" / "a.ply").points == pytest.approx(CORNER + 1, rel=1e-6)
+
+
+def test_without_pye57_the_extra_is_named(relit, tmp_path, monkeypatch):
+    folder = tmp_path / "points"
+    folder.mkdir()
+    (folder / "a.e57").write_bytes(b"ASTM-E57")
+    assert "a.e57: is no E57 file" in relit.refused("import", "scans", folder, tmp_path / "set")
+    monkeypatch.setattr("stage.formats.e57.find_spec", lambda name: None)
+    assert "pip install 'relit[e57]'" in relit.refused("import", "scans", folder, tmp_path / "set")
 
 
 def test_points_on_a_map_are_counted_from_among_them(relit, tmp_path):
