@@ -82,6 +82,13 @@ def make_plan(request: RelightRequest) -> Plan:
         if request.sheet.suffix.lower() != ".png":
             raise RequestError(f"--sheet {request.sheet}: a contact sheet is a PNG: end the name in .png")
         outputs.append((f"--sheet {request.sheet}", request.sheet))
+    if request.nuke is not None:
+        if Layer.LIGHTS not in request.aov:
+            raise RequestError(f"--nuke {request.nuke}: mixes layers of lights: give --aov lights too")
+        if request.only is not None or request.nuke.suffix.lower() != ".nk":
+            raise RequestError(f"--nuke {request.nuke}: " + ("end the name in .nk" if request.only is None else
+                               f"is for the whole range, --only {request.only} makes a part of it: give one of them"))
+        outputs.append((f"--nuke {request.nuke}", request.nuke))
     if request.report is not None:
         outputs.append((f"--report {request.report}", request.report))
     keys = LightKeys.read(request.keys) if request.keys is not None else None

@@ -21,6 +21,7 @@ from service.relight.groups import add_up, in_groups
 from service.relight.guide import Guide
 from service.relight.layers import frame_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, FrameLight, ModelUse
+from service.relight.nuke import write_nuke_script
 from service.relight.opened_capture import OpenedCapture, open_capture
 from service.relight.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
 from service.relight.plan import Plan, PlannedFrame, make_plan
@@ -102,6 +103,9 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     if request.sheet is not None:
         timings.stage("sheet", 1)
         contact_sheet(request.sheet, paths, request.view)
+    if request.nuke is not None:
+        numbered = [(frame.scheduled.number, frame.path) for frame in plan.frames]
+        write_nuke_script(request.nuke, request.out, numbered, plan.groups, plan.rate)
     timings.close()
     result = RelightResult(paths, len(plan.folders), skipped, writer.written.clipped, near_lights, mattes.sentence, findings.sentences)
     if request.report is not None:

@@ -59,6 +59,8 @@ class RelightRequest(RelightOptions, Request):
     view: Annotated[Line | None, Role.RUN, Spelling(metavar="DISPLAY/VIEW")] = None
     """View of the OpenColorIO configuration through which `sheet` shows the frames, such as "sRGB - Display/Un-tone-mapped" or the view
     alone; None: ACES 2.0 at 100 nits, or the default view of a configuration without it."""
+    nuke: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.nk")] = None
+    """Write a script of Nuke that reads the frames and mixes their layers of lights, each with a gain; needs `--aov lights`."""
     report: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.json")] = None
     """Write a report: what was made, and how long each part of the work took."""
 

@@ -29,6 +29,8 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
         print(f"skipped  {result.skipped} of {len(result.frames)} frames were there already, made by an equal run{rest}")
     if request.sheet is not None:
         print(f"sheet    {request.sheet}")
+    if request.nuke is not None:
+        print(f"nuke     {request.nuke}")
     if request.report is not None:
         print(f"report   {request.report}")
     if result.near_lights:
