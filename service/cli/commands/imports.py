@@ -2,11 +2,13 @@
 
 from dataclasses import fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from service.cli.groups import make_group
+from service.cli.remote import KeyOption
 from service.cli.request_commands import local_command
 from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
@@ -38,6 +40,10 @@ FolderArgument = Annotated[Path, typer.Argument(metavar="SRC", help="Folder of t
 DestinationArgument = Annotated[Path | None, typer.Argument(metavar="DST", show_default=False, help=(
     "Folder for the capture, which gets links to the files; without it capture.json is written beside them."))]
 
+ToOption = Annotated[str | None, typer.Option(
+    "--to", metavar="URL", show_default=False, help=(
+        "Send the capture to this service, as relit serve prints its address; DST may be left out."))]
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
@@ -48,9 +54,13 @@ def register(app: typer.Typer) -> None:
     layouts.command("guess")(_guess)
 
     @layouts.command("auto")
-    def auto(folder: FolderArgument, destination: DestinationArgument = None) -> None:
+    def auto(folder: FolderArgument, destination: DestinationArgument = None, to: ToOption = None, key: KeyOption = None) -> None:
         """Import a folder as guess proposes, where the files say all that the command needs; else name the commands to choose from."""
-        _auto(folder, destination, layouts)
+        if to is None:
+            _auto(folder, destination, layouts)
+            return
+        with TemporaryDirectory(prefix="relit-import-") as work:  # of links, so that the files of captures alone are sent
+            _upload(_auto(folder, destination or Path(work) / folder.resolve().name, layouts), to, key)
 
     app.add_typer(layouts)
 
@@ -65,8 +75,8 @@ def _guess(folder: FolderArgument) -> None:
         print(f"then     {found.then}")
 
 
-def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> None:
-    """Run the import of a folder, or of each folder in it, and record in its capture.json what the guess assumed."""
+def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> list[Path]:
+    """Run the import of a folder, or of each folder in it, record in its capture.json what the guess assumed, and return the captures."""
     from stage.capture.manifest import FILE_NAME, read_manifest, write_manifest
     from stage.errors import ManifestError
     from stage.importers.guess import guess_each
@@ -77,7 +87,7 @@ def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> None:
         assumed = "; ".join(unsure[0].assumed)
         raise ManifestError(f"{folder}: looks like {unsure[0].layout}, and the files do not say all that its import needs ({assumed}): "
                             + "; ".join(found.command for found in unsure))
-    command = typer.main.get_command(layouts)
+    command, made = typer.main.get_command(layouts), []
     for found in guesses:
         target = destination if destination is None or len(guesses) == 1 else destination / found.source.name
         layout, source, *options = found.arguments
@@ -88,6 +98,19 @@ def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> None:
         more = tuple(sentence for sentence in found.assumed if sentence not in manifest.assumed)
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), path)
         print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")
+        made.append(path.parent)
+    return made
+
+
+def _upload(captures: list[Path], server: str, key: str | None) -> None:
+    """Send captures to a service, which checks them."""
+    from service.cli.progress import ProgressBar
+    from service.cli.remote import connected
+
+    with connected(server, key) as client:
+        for folder in captures:
+            with ProgressBar() as bar:
+                print(f"sent     {client.captures.upload(folder, progress=bar).id}")
 
 
 def _print_guess(found: "Guess") -> None:

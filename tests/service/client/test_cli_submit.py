@@ -36,6 +36,24 @@ def test_a_folder_becomes_maps(relit, tmp_path: Path):
     assert shown["kind"] == "solve"
 
 
+def test_what_is_imported_is_sent_without_what_lies_beside_it(relit, tmp_path: Path):
+    folder, scene = tmp_path / "dome", make_scene(lights=5)
+    for number, image in enumerate(scene.images):
+        write_exr(folder / f"{number}.exr", image)
+    table = "\n".join(f"{number}.exr {x:.9f} {y:.9f} {z:.9f}" for number, (x, y, z) in enumerate(scene.directions))
+    (folder / "dome.lp").write_text(f"{len(scene.images)}\n{table}\n")
+    (folder / "clip.bin").write_bytes(b"0" * 1_000_000)
+    before = {path.name for path in folder.iterdir()}
+    found = said(relit("import", "auto", folder, "--to", os.environ["RELIT_SERVER"]).well())
+    assert {path.name for path in folder.iterdir()} == before
+    with Client(os.environ["RELIT_SERVER"], os.environ["RELIT_KEY"]) as asking:
+        capture = asking.captures.get(found["sent"])
+    assert (capture.name, capture.state) == ("dome", "ready")
+    kept = relit("import", "auto", folder, tmp_path / "kept" / "dome", "--to", os.environ["RELIT_SERVER"])
+    assert said(kept.well())["sent"] == found["sent"]  # the same files under the same name are one capture
+    assert {path.name for path in (tmp_path / "kept" / "dome").iterdir()} == {"capture.json", *(f"{number}.exr" for number in range(5))}
+
+
 @pytest.mark.long
 def test_a_folder_becomes_maps_frames_and_an_asset(relit, tmp_path: Path):
     found = said(relit(
