@@ -76,6 +76,7 @@ def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> 
     try:
         mean, clipped = _mean(correction, sorted(index for kind in kinds for index in kind.frames), timings)
         corners = find_chart(mean, patches) if request.corners is None else np.reshape(request.corners, (4, 2))
+        place_patches(chart.names, chart.grid, corners, source.camera.resolution)  # checks them
         corners = refine_corners(mean, corners, chart.grid)
         xyz_from_rgb = xyz_from_linear(space)
         reference = chart.xyz @ np.linalg.inv(xyz_from_rgb).T

@@ -111,7 +111,7 @@ def place_patches(names: Sequence[str], grid: tuple[int, int], corners: np.ndarr
     counts = np.bincount(label[label >= 0], minlength=len(names))
     if counts.min() < FEWEST_PIXELS:
         raise CalibrationError(f"the patch {names[int(counts.argmin())]} of the chart has {counts.min()} pixels, {FEWEST_PIXELS} are "
-                               "needed: check --corners and --grid, or go nearer")
+                               "needed: check --corners and the number of patches, or go nearer")
     return PatchPlaces(label, (2 * (off[1] > 0) + (off[0] > 0)).reshape(u.shape), box)
 
 

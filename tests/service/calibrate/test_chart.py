@@ -179,6 +179,20 @@ def test_patches_under_light_of_two_colours_tell_no_matrix(relit, tmp_path):
     assert "differ in fewer than three colours" in refused
 
 
+@pytest.mark.parametrize(("given", "words"), [
+    (("--corners", "10,10,20,20,30,30,40,40"), "three of them lie on a line"),
+    (("--corners", "1e9,0,0,1e9,5,5,1,1"), "lead out of the images, which are 640x480"),
+    (("--corners", "300,200,310,200,310,210,300,210"), "pixels, 9 are needed"),
+    (("--corners", "60,60,580,60,580,420,60,420"), "have not the colours of the chart"),
+    (("--chart", "sg"), "no chart is found"),
+    (("--reflectances", "nowhere.csv"), "nowhere.csv"),
+])
+def test_options_that_lead_nowhere(relit, tmp_path, given, words):
+    folder = shoot(tmp_path / "cap", [picture(seen(), POSE, samples=1).pixels])
+    relit("calibrate", "chart", folder, *given).refused(words)
+    assert {path.name for path in folder.iterdir()} == {"0.exr", "capture.json"}
+
+
 def lamp(irradiance=(1, 1, 1), polarization="none"):
     return {"type": "distant", "direction": [0, 0, 1], "irradiance": irradiance, "polarization": polarization}
 
