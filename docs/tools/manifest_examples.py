@@ -65,6 +65,8 @@ EXAMPLES: dict[type[Strict], tuple[Example, ...]] = {
     UncalibratedProjector: ({"resolution": [1280, 800]}, {"resolution": [1280, 800], "response": [0.0, 0.05, 0.22, 0.53, 1.0],
                                                           "crosstalk": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}),
     Frame: ({"image": "000.png", "exposure_s": 0.0125, "light": _DISTANT}, {"image": "pattern_00.png", "pattern": _WHITE},
+            {"image": "000_cross.exr", "light": _CROSSED,
+             "color_matrix": [[1.7, -0.6, -0.1], [-0.2, 1.6, -0.4], [0.0, -0.5, 1.5]]},
             {"image": "spot_00.png", "laser": _RAY}, {"image": "phase_090.npy", "tof": _CONTINUOUS},
             {"image": "left_0.png", "stereo": _STEREO}),
     OtherCamera: (_OTHER,),

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from service.calibrate.solvers.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
@@ -12,7 +14,7 @@ from service.reporting.provenance import requested, versions, with_names
 from service.requests.base.base import Options
 from service.requests.calibrate import FramesRequest, LightsRequest, ResponseRequest, SaturationRequest
 from stage.capture.capture import Capture
-from stage.capture.manifest import FILE_NAME, Manifest, write_manifest
+from stage.capture.manifest import FILE_NAME, ColorMatrix, Manifest, write_manifest
 from stage.errors import CalibrationError
 from stage.files import write_text
 
@@ -60,7 +62,7 @@ def open_capture(request: FramesRequest | SaturationRequest | ResponseRequest,
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)
-    return capture, _manifest_to_write(capture, request.out), timings
+    return capture, manifest_to_write(capture, request.out), timings
 
 
 def open_captures(request: LightsRequest, progress: Progress | None) -> tuple[LightCaptures, Timings]:
@@ -73,10 +75,10 @@ def open_captures(request: LightsRequest, progress: Progress | None) -> tuple[Li
     if request.apply_to is not None:
         target = Capture.open(request.apply_to)
         check_same_setup(source, target)
-    return LightCaptures(source, target, _manifest_to_write(target, request.out), lit), timings
+    return LightCaptures(source, target, manifest_to_write(target, request.out), lit), timings
 
 
-def _manifest_to_write(capture: Capture, out: Path | None) -> Path:
+def manifest_to_write(capture: Capture, out: Path | None) -> Path:
     """Return the path of the manifest that a calibration writes: `out`, or that of the capture."""
     path = capture.folder / FILE_NAME if out is None else out
     if path.suffix.lower() != ".json" or path.name == CALIBRATION_FILE or path.is_dir():
@@ -150,6 +152,12 @@ def manifests_to_replace(captures: Iterable[Capture], chosen: Sequence[Path] | N
 def digits(values: Iterable[float]) -> list[float]:
     """Return numbers for the report, rounded to the six digits that a measurement may have."""
     return [float(f"{value:.6g}") for value in values]
+
+
+def color_matrix(matrix: np.ndarray) -> ColorMatrix:
+    """Return a matrix [3, 3] for the manifest, rounded to eight digits."""
+    red, green, blue = ((float(f"{r:.8g}"), float(f"{g:.8g}"), float(f"{b:.8g}")) for r, g, b in matrix)
+    return red, green, blue
 
 
 def three_numbers(values: Iterable[float]) -> str:

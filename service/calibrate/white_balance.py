@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.calibrate.images import mean_image
-from service.calibrate.results import digits, open_capture, write_results
+from service.calibrate.results import color_matrix, digits, open_capture, write_results
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import WhiteBalanceRequest
@@ -70,8 +70,8 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
     if any(raw) and not request.sensor_colors:
         space = linear_space(capture.manifest.color_space)
         matrix = rgb_matrix("lin_rec709_scene", space).astype(np.float64) @ rec709_from_camera(request.images[0]) @ matrix
-    rows = tuple((float(f"{r:.8g}"), float(f"{g:.8g}"), float(f"{b:.8g}")) for r, g, b in matrix)
-    report = write_results("white-balance", request, capture.manifest.model_copy(update={"color_matrix": rows}), manifest_path, {
+    rows = color_matrix(matrix)
+    report = write_results("white-balance", request, capture.manifest.with_colors(rows), manifest_path, {
         "images": len(request.images), "region": list(region), "gains": digits(gains), "matrix": rows,
         "unevenness": digits(card.std(axis=(0, 1)) / mean)})
     return WhiteBalance(manifest_path, report, (float(gains[0]), 1.0, float(gains[2])), rows)

@@ -20,6 +20,7 @@ from service.requests.calibrate import (
     ResponseOptions,
     WhiteBalanceOptions,
 )
+from service.requests.chart import ChartOptions
 from service.requests.drive import RIG, RigDocument
 from service.requests.rig import RigCalibrationOptions
 from stage.model import Line
@@ -103,6 +104,19 @@ class WhiteBalanceJob(JobRequest):
     images: Annotated[tuple[Line, ...], Field(min_length=1), Role.INPUT, IMAGES]
     """Names of the images of the card in the capture's folder, of its resolution and encoding."""
     options: WhiteBalanceOptions = WhiteBalanceOptions()
+
+
+class ChartJob(JobRequest):
+    """Colours from a colour chart in the frames: capture.json with a matrix for each kind of light, chart.png, calibration.json."""
+
+    kind: Literal["calibrate-chart"]
+    capture: Annotated[CaptureId, Role.INPUT, CAPTURE]
+    """The capture whose frames show the chart."""
+    apply_to: Annotated[CaptureId | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
+    """Another capture of the same camera under the same kinds of light, whose manifest is written; None: the capture itself."""
+    reflectances: Annotated[Line | None, Role.INPUT, Spelling(metavar="NAME")] = None
+    """Name of the file in the capture's folder with the colours of the chart's patches: CGATS or CSV. None: those of the maker."""
+    options: ChartOptions = ChartOptions()
 
 
 class SaturationJob(JobRequest):
@@ -189,5 +203,6 @@ class RigCalibrationJob(JobRequest):
 
 
 AnyCalibration = (MirrorBallJob | LightPositionsJob | GreyBallJob | IntensityJob | DarkJob | FlatFieldJob | SaturationJob | ProcamJob
-                  | StereoCalibrationJob | ResponseJob | TofCalibrationJob | WhiteBalanceJob | LaserPlanesJob | RigCalibrationJob)
+                  | StereoCalibrationJob | ResponseJob | TofCalibrationJob | WhiteBalanceJob | ChartJob | LaserPlanesJob
+                  | RigCalibrationJob)
 """Every kind of job that calibrates."""

@@ -2,7 +2,7 @@
 
 import json
 import posixpath
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -55,6 +55,8 @@ class Frame(Strict):
     """The time-of-flight source."""
     stereo: StereoImages | None = None
     """The images of other cameras at the same moment, under projected texture without a code."""
+    color_matrix: Annotated[ColorMatrix, AfterValidator(_invertible)] | None = None
+    """The matrix of this frame's light or polariser, in place of that of the capture. None: `color_matrix` of the capture."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -115,6 +117,11 @@ class Manifest(Strict):
         if self.exposure_from is not None and self.frames[0].exposure_s is not None:
             raise ValueError("exposure_from: is given beside frames[0].exposure_s: give one of them")
         return self
+
+    def with_colors(self, matrix: ColorMatrix | None, own: Mapping[int, ColorMatrix] | None = None) -> Self:
+        """Return the manifest with a matrix, and with those of frames, by their index, that have one of their own."""
+        frames = tuple(frame.model_copy(update={"color_matrix": (own or {}).get(index)}) for index, frame in enumerate(self.frames))
+        return self.model_copy(update={"color_matrix": matrix, "frames": frames})
 
     def _stereo_faults(self) -> Iterator[str]:
         """Yield what does not agree between the frames under texture and the other cameras."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from stage.capture.capture import Capture
 from stage.capture.light import OffLight
-from stage.capture.manifest import Frame
+from stage.capture.manifest import ColorMatrix, Frame
 from stage.colour.colour import linearise
 from stage.colour.colour_spaces import channels_apart, is_linear
 from stage.errors import ImageError
@@ -36,13 +36,13 @@ class CodedRadiance(NamedTuple):
 class Correction:
     """The correction of every frame of a capture.
 
-    radiance = color_matrix · (linear(recorded) - dark) / flat / exposure - ambient, with the flat field scaled to mean 1 over the mask.
+    radiance = color_matrix · ((linear(recorded) - dark) / flat / exposure - ambient), with the flat field scaled to mean 1 over the mask.
     """
 
     capture: Capture
     dark: np.ndarray | None  # [rows, cols, 3] float32, linear; taken at the exposure of the frames
     flat: np.ndarray | None  # [rows, cols, 3] float32, mean 1 in each channel
-    ambient: np.ndarray | None  # [rows, cols, 3] float32, mean of the `off` frames, corrected
+    ambient: np.ndarray | None  # [rows, cols, 3] float32, mean of the `off` frames, corrected but for their colours
     full_scale: bool = False
     """True to mark the largest value of integers as saturated where the capture gives no `saturation`."""
 
@@ -70,10 +70,10 @@ class Correction:
                 raise ImageError(f"{capture.file(manifest.flat)}: flat is not above dark at {unlit} of the mask's pixels")
             flat = np.where(flat > 0, flat, 1) / flat[mask].mean(axis=0)
         dark, flat = (None if image is None else capture.part_of(image) for image in (dark, flat))
-        partial = cls(capture, dark, flat, None, full_scale)
-        off = [frame for frame, _ in capture.lit_by(OffLight)]
+        partial = cls(replace(capture, manifest=manifest.with_colors(None)), dark, flat, None, full_scale)
+        off = [frame for frame, _ in partial.capture.lit_by(OffLight)]
         if not off:
-            return partial
+            return cls(capture, dark, flat, None, full_scale)
         total = np.zeros((capture.camera.height, capture.camera.width, 3), dtype=np.float32)
         for frame in off:
             total += partial.apply(frame).pixels
@@ -97,7 +97,7 @@ class Correction:
             limit = FULL_SCALE if integer else None
         if limit is not None:
             saturated = _any_from(limit, recorded)
-        if self._is_pointwise and (recorded.dtype.kind == "u" or (recorded.dtype == np.float16 and is_linear(manifest.color_space))):
+        if self._is_pointwise(frame) and (recorded.dtype.kind == "u" or (recorded.dtype == np.float16 and is_linear(manifest.color_space))):
             codes = recorded if recorded.dtype.kind == "u" else recorded.view(np.uint16)
             every = np.arange(np.iinfo(codes.dtype).max + 1, dtype=codes.dtype)
             if recorded.dtype == np.float16:
@@ -111,12 +111,11 @@ class Correction:
     def has_codes(self, frame: Frame) -> bool:
         """Return whether a frame has integers or half values of which each stands for one radiance, as its header tells."""
         header = images.read_header(self.capture.file(frame.image))
-        return self._is_pointwise and (header.integer or (header.half and is_linear(self.capture.manifest.color_space)))
+        return self._is_pointwise(frame) and (header.integer or (header.half and is_linear(self.capture.manifest.color_space)))
 
-    @property
-    def _is_pointwise(self) -> bool:
+    def _is_pointwise(self, frame: Frame) -> bool:
         """Return whether no dark, flat or ambient frame tells pixels apart, and no matrix or colour space mixes their channels."""
-        apart = self.capture.manifest.color_matrix is None and channels_apart(self.capture.manifest.color_space)
+        apart = self._matrix(frame) is None and channels_apart(self.capture.manifest.color_space)
         return apart and self.dark is None and self.flat is None and self.ambient is None
 
     def at(self, pixels: np.ndarray) -> "Correction":
@@ -144,11 +143,13 @@ class Correction:
             pixels = pixels / self.flat
         if frame.exposure_s is not None:
             pixels = pixels / np.float32(frame.exposure_s)
-        if self.capture.manifest.color_matrix is not None:
-            pixels = pixels @ np.array(self.capture.manifest.color_matrix, np.float32).T
         if self.ambient is not None:
             pixels = pixels - self.ambient
-        return pixels
+        matrix = self._matrix(frame)
+        return pixels if matrix is None else pixels @ np.array(matrix, np.float32).T
+
+    def _matrix(self, frame: Frame) -> ColorMatrix | None:
+        return frame.color_matrix or self.capture.manifest.color_matrix
 
 
 def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:

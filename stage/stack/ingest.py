@@ -140,6 +140,8 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
         inputs["saturation"] = "largest integer"
     if manifest.color_matrix is not None:
         inputs["color_matrix"] = manifest.color_matrix
+    if any(frame.color_matrix is not None for frame in read):
+        inputs["color_matrices"] = [frame.color_matrix for frame in read]
     if location() != BUILT_IN and not is_linear(manifest.color_space):
         inputs["ocio"] = current().label
     if capture.pixels.clip_negative:

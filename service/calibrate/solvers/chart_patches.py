@@ -5,6 +5,7 @@ read on neutral patches alone: the light of narrow primaries meets the reflectan
 red, green and blue stand for.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,8 +53,8 @@ def find_patches(path: Path, grid: tuple[int, int], corners: np.ndarray, resolut
     Args:
         path: a CSV file with the columns name, r, g, b: the linear reflectances of each patch in reading order.
         grid: its columns and rows.
-        corners: [4, 2] the pixels (u, v) of the centres of the first patch, the last of the first row, the last of the chart, and the first
-            of the last row.
+        corners: [4, 2] the pixels (u, v), the first of the image being centred at (0.5, 0.5), of the centres of the first patch, the
+            last of the first row, the last of the chart, and the first of the last row.
         resolution: the width and height of the images.
 
     Raises:
@@ -61,6 +62,28 @@ def find_patches(path: Path, grid: tuple[int, int], corners: np.ndarray, resolut
         CalibrationError: the corners span no chart in the image, or its patches are too small.
     """
     names, reflectance = _read_reflectances(path, grid)
+    places = place_patches(names, grid, corners, resolution)
+    neutral = np.ptp(reflectance, axis=1) <= NEUTRAL * reflectance.max(axis=1)
+    if not neutral.any():
+        raise ManifestError(f"{path}: has no neutral patch, with equal r, g and b, from which irradiance could be read")
+    return ChartPatches(places.label, names, np.concatenate([reflectance, np.zeros((1, 3))]), np.append(neutral, False), places.box)
+
+
+class PatchPlaces(NamedTuple):
+    """The pixels that show each patch, in a part of an image."""
+
+    label: np.ndarray  # [h, w] int, the index of the patch that a pixel shows; -1 shows none
+    quarter: np.ndarray  # [h, w] int, 0 to 3, the quarter of the patch
+    box: tuple[slice, slice]
+    """The part of the image, rows and columns."""
+
+
+def place_patches(names: Sequence[str], grid: tuple[int, int], corners: np.ndarray, resolution: tuple[int, int]) -> PatchPlaces:
+    """Return the pixels that show each patch of a chart; the arguments as in `find_patches`, names as errors have them.
+
+    Raises:
+        CalibrationError: the corners span no chart in the image, or its patches are too small.
+    """
     columns, rows = grid
     last = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=float)
     # [u, v, 1] → [x, y, 1] of the grid up to a factor, with a last element of 1
@@ -73,25 +96,23 @@ def find_patches(path: Path, grid: tuple[int, int], corners: np.ndarray, resolut
         raise CalibrationError("--corners: three of them lie on a line, or two are the same") from error
     centres = centres[:2] / centres[2]
     width, height = resolution
-    if not ((centres >= 0).all() and (centres.max(axis=1) <= (width - 1, height - 1)).all()):
+    if not ((centres >= 0).all() and (centres.max(axis=1) <= (width, height)).all()):
         raise CalibrationError(f"--corners: the patches between them lead out of the images, which are {width}x{height}")
     (left, top), (right, bottom) = np.floor(centres.min(axis=1)).astype(int), np.ceil(centres.max(axis=1)).astype(int)
     reach = max(right - left, bottom - top) // min(grid)
     box = slice(max(top - reach, 0), min(bottom + reach + 1, height)), slice(max(left - reach, 0), min(right + reach + 1, width))
-    v, u = np.mgrid[box]
+    v, u = np.mgrid[box] + 0.5
     place = form @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
     place = place[:2] / place[2]
     nearest = np.rint(place).astype(int)
-    shown = (np.abs(place - nearest).max(axis=0) < INNER) & (nearest >= 0).all(axis=0) & (nearest < np.array(grid)[:, None]).all(axis=0)
+    off = place - nearest
+    shown = (np.abs(off).max(axis=0) < INNER) & (nearest >= 0).all(axis=0) & (nearest < np.array(grid)[:, None]).all(axis=0)
     label = np.where(shown, nearest[1] * columns + nearest[0], -1).reshape(u.shape)
     counts = np.bincount(label[label >= 0], minlength=len(names))
     if counts.min() < FEWEST_PIXELS:
-        raise CalibrationError(f"the patch {names[counts.argmin()]} of the chart has {counts.min()} pixels, {FEWEST_PIXELS} are needed: "
-                               "check --corners and --grid, or go nearer")
-    neutral = np.ptp(reflectance, axis=1) <= NEUTRAL * reflectance.max(axis=1)
-    if not neutral.any():
-        raise ManifestError(f"{path}: has no neutral patch, with equal r, g and b, from which irradiance could be read")
-    return ChartPatches(label, names, np.concatenate([reflectance, np.zeros((1, 3))]), np.append(neutral, False), box)
+        raise CalibrationError(f"the patch {names[int(counts.argmin())]} of the chart has {counts.min()} pixels, {FEWEST_PIXELS} are "
+                               "needed: check --corners and the number of patches, or go nearer")
+    return PatchPlaces(label, (2 * (off[1] > 0) + (off[0] > 0)).reshape(u.shape), box)
 
 
 def _read_reflectances(path: Path, grid: tuple[int, int]) -> tuple[tuple[str, ...], np.ndarray]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from service.cli.groups import make_group
-from service.cli.printing import print_table
+from service.cli.printing import print_table, print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
 from service.requests.calibrate import (
@@ -25,6 +25,7 @@ from service.requests.calibrate import (
     TofCalibrationRequest,
     WhiteBalanceRequest,
 )
+from service.requests.chart import ChartRequest
 from service.requests.rig import RigCalibrationRequest
 
 if TYPE_CHECKING:
@@ -41,8 +42,8 @@ def register(app: typer.Typer) -> None:
     """Add the command and its kinds."""
     kinds = make_group("calibrate",
                        help="Lights, projector and cameras, dark frame, flat field, colours and saturation from images; with residuals.")
-    for function in (_mirror_ball, _light_positions, _grey_ball, _intensity, _dark, _flat_field, _saturation, _white_balance, _procam,
-                     _stereo, _laser_planes, _response, _tof, _rig):
+    for function in (_mirror_ball, _light_positions, _grey_ball, _intensity, _dark, _flat_field, _saturation, _white_balance, _chart,
+                     _procam, _stereo, _laser_planes, _response, _tof, _rig):
         local_command(kinds, function.__name__[1:].replace("_", "-"), function)
     app.add_typer(kinds)
 
@@ -101,6 +102,20 @@ def _white_balance(request: WhiteBalanceRequest) -> None:
     print("gains    " + ", ".join(f"{gain:.4f} {name}" for gain, name in zip(result.gains, ("red", "green", "blue"), strict=True)))
     for row in result.matrix:
         print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
+
+
+def _chart(request: ChartRequest) -> None:
+    from service.calibrate.chart import calibrate_chart
+
+    result = with_bar(calibrate_chart, request)
+    _print_files((result.manifest_path,), result.report_path)
+    print(f"picture  {result.picture_path}")
+    for kind in result.kinds:
+        print(f"colours  {kind.summary}")
+        for row in kind.colors.matrix:
+            print("matrix   " + " ".join(f"{value:9.5f}" for value in row))
+        print_table([("patch", "before", "after", "remark"), *kind.rows[:LIGHT_ROWS]])
+    print_warnings(result.warnings)
 
 
 def _procam(request: ProcamRequest) -> None:

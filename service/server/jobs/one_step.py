@@ -160,6 +160,16 @@ def _calibrate(request: JobRequest, files: StepFiles) -> None:
     product(files.request(model, request, out=files.out / FILE_NAME, **given), files.progress)
 
 
+def _calibrate_chart(request: calibration_jobs.ChartJob, files: StepFiles) -> None:
+    from service.calibrate.chart import calibrate_chart
+    from service.requests.chart import ChartRequest
+
+    folder = files.intake(request.capture)
+    reflectances = None if request.reflectances is None else file_within(folder, request.reflectances, "reflectances")
+    calibrate_chart(files.request(ChartRequest, request, capture=folder, reflectances=reflectances, out=files.out / FILE_NAME),
+                    files.progress)
+
+
 def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.StereoCalibrationJob | calibration_jobs.LaserPlanesJob,
                    files: StepFiles) -> None:
     """Calibrate a rig, and write a manifest for each of its captures."""
@@ -203,7 +213,7 @@ RIGS = (calibration_jobs.ProcamJob, calibration_jobs.StereoCalibrationJob, calib
 ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] = {
     **dict.fromkeys(get_args(calibration_jobs.AnyCalibration), (MEASURE, _calibrate)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
-    calibration_jobs.RigCalibrationJob: (MEASURE, _calibrate_lamps),
+    calibration_jobs.RigCalibrationJob: (MEASURE, _calibrate_lamps), calibration_jobs.ChartJob: (MEASURE, _calibrate_chart),
     jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _join), jobs.ShadeJob: ("shade", _shade), jobs.ViewJob: ("view", _view),
     jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _drive),
     jobs.BasisJob: (MEASURE, _basis), jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan),

@@ -34,7 +34,8 @@ TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and
           "calibrate-response": "Calibrate the response of the projector",
           "calibrate-tof": "Calibrate a time-of-flight camera",
           "calibrate-rig": "Calibrate the lamps of a rig",
-          "calibrate-white-balance": "Calibrate colours: a grey card", "calibrate-laser-planes": "Calibrate the planes of a laser"}
+          "calibrate-white-balance": "Calibrate colours: a grey card", "calibrate-chart": "Calibrate colours: a colour chart",
+          "calibrate-laser-planes": "Calibrate the planes of a laser"}
 CAPTURE_JOBS = {name: JOBS[name] for name in TITLES if any(
     field.is_required() for part, field in JOBS[name].model_fields.items() if part in ("capture", "captures"))}
 """Jobs that begin with a capture, by kind."""

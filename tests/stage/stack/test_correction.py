@@ -54,6 +54,13 @@ def test_dark_flat_exposure_and_ambient_together(tmp_path):
     ambient = (linear[2] + linear[3]) / 2
     for index in (0, 1):
         assert np.allclose(corrected(tmp_path, index).pixels, linear[index] - ambient, **ROUNDING)
+    # the matrix of the capture, and that of a frame in its place, each on what is left without the ambient light
+    common, own = np.array([[1.6, -0.5, -0.1], [-0.2, 1.5, -0.3], [0, -0.4, 1.4]]), np.array([[2.0, 0, 0], [0.1, 1, 0], [0, 0, 0.5]])
+    edit_manifest(tmp_path, color_matrix=common.tolist())
+    edit_frame(tmp_path, 1, color_matrix=own.tolist())
+    edit_frame(tmp_path, 2, color_matrix=own.tolist())  # of an off frame: it is of no account
+    for index, matrix in ((0, common), (1, own)):
+        assert np.allclose(corrected(tmp_path, index).pixels, (linear[index] - ambient) @ matrix.T, **ROUNDING)
 
 
 def test_the_flat_keeps_the_mean_over_the_mask_and_takes_its_shape_away(tmp_path):

@@ -134,7 +134,10 @@ def swap_frames(folder):
     lambda folder: edit_manifest(folder, flat=None),
     lambda folder: edit_manifest(folder, color_space="lin_ap1_scene"),
     lambda folder: edit_manifest(folder, saturation=0.3),
-], ids=["pixel", "dark", "mask", "order", "exposure", "off", "no dark", "no flat", "colour space", "saturation"])
+    lambda folder: edit_manifest(folder, color_matrix=[[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
+    lambda folder: edit_frame(folder, 1, color_matrix=[[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]),
+], ids=["pixel", "dark", "mask", "order", "exposure", "off", "no dark", "no flat",
+        "colour space", "saturation", "colours", "colours of a frame"])
 def test_it_is_rebuilt_when_an_input_changes(tmp_path, change):
     prepare(tmp_path)
     before = open_stack(Capture.open(tmp_path))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.calibrate.chart import calibrate_chart
 from service.calibrate.images import dark, flat_field, saturation
 from service.calibrate.laser_planes import laser_planes
 from service.calibrate.procam import procam
@@ -14,8 +15,10 @@ from service.calibrate.response import response
 from service.calibrate.tof import calibrate_tof
 from service.calibrate.white_balance import white_balance
 from service.requests import calibrate as requests
+from service.requests.chart import ChartRequest
 from tests.reference import tof
 from tests.scenes.captures import make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.chart import CAMERA, Pose, picture, reflectances, shoot, table
 from tests.service.calibrate import test_rig as lamps
 from tests.service.calibrate.solvers import test_procam as boards
 from tests.service.calibrate.test_calibrate_tof import cw, sweep
@@ -106,6 +109,18 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
     job = submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
     finish(server, client, job)
     compare(client, job, here, {name: name for name in files}, {here: uploaded})
+
+
+@pytest.mark.long
+def test_the_colours_of_a_chart(server, client, tmp_path):
+    here = shoot(tmp_path / "cap", [np.maximum(picture(0.5 * reflectances() @ CAMERA.T, Pose(10, 5), size=(320, 240)).pixels, 0)])
+    (here / "chart.csv").write_text("name,r,g,b\n" + "\n".join(
+        f"{row['name']},{r},{g},{b}" for row, (r, g, b) in zip(table(), reflectances(), strict=True)))
+    uploaded = sent(server, client, here)
+    calibrate_chart(ChartRequest(capture=here, reflectances=here / "chart.csv"))
+    job = submit(client, kind="calibrate-chart", capture=uploaded, reflectances="chart.csv")
+    finish(server, client, job)
+    compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", "chart.png")}, {here: uploaded})
 
 
 @pytest.mark.long

@@ -1,0 +1,249 @@
+"""relit calibrate chart, on charts of a renderer of these tests, which knows where they are and what the camera makes of their colours."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from service.calibrate.chart import calibrate_chart
+from service.calibrate.solvers.cielab import delta_e_2000
+from service.requests.chart import ChartRequest
+from stage.capture.capture import Capture
+from stage.colour.colour import rgb_matrix
+from stage.stack.correction import Correction
+from tests.scenes.captures import edit_manifest, write_image
+from tests.scenes.chart import (
+    CAMERA,
+    D65_FROM_D50,
+    REC709_FROM_XYZ,
+    WHITE_D50,
+    Picture,
+    Pose,
+    picture,
+    poses,
+    reflectances,
+    shoot,
+    table,
+)
+
+REFLECTANCE = reflectances()
+NOISE, EXPOSURE = 0.01, 0.5
+LIGHTS = ((1.0, 1.0, 1.0), (1.3, 1.0, 0.45), (0.75, 1.0, 1.35))
+"""Daylight, tungsten and an overcast sky, as the camera sees white under them."""
+POSE = Pose(15, -11, 3, 10, -8, 700)
+
+
+def seen(light=LIGHTS[0], reflectance=REFLECTANCE):
+    """What the camera sees of patches."""
+    return EXPOSURE * np.array(light) * (reflectance @ CAMERA.T)
+
+
+def noisy(pixels, seed=0, noise=NOISE):
+    return np.maximum(pixels + np.random.default_rng(seed).normal(size=pixels.shape) * noise, 0)
+
+
+def difference(matrix, light=LIGHTS[0]):
+    """CIEDE2000 of each patch that the camera sees without noise through a matrix, at the exposure at which greys are right."""
+    def lab(linear):
+        root = np.cbrt(linear @ np.linalg.inv(D65_FROM_D50.T @ REC709_FROM_XYZ.T) / WHITE_D50)
+        return np.stack([116 * root[:, 1] - 16, 500 * (root[:, 0] - root[:, 1]), 200 * (root[:, 1] - root[:, 2])], axis=1)
+    through = seen(light) @ np.array(matrix).T
+    return delta_e_2000(lab(through * REFLECTANCE[18:, 1].sum() / through[18:, 1].sum()), lab(REFLECTANCE))
+
+
+def section(folder, name="calibration.json"):
+    return json.loads((folder / name).read_text())["chart"]
+
+
+@pytest.mark.long
+def test_charts_are_found_and_colours_corrected_in_twenty_poses_and_three_lights(tmp_path):
+    for number, pose in enumerate(poses(20)):
+        light = LIGHTS[number % 3]
+        shown = picture(seen(light), pose, seed=number)
+        folder = shoot(tmp_path / str(number), [noisy(shown.pixels, number)])
+        found = calibrate_chart(ChartRequest(capture=folder))
+        assert np.linalg.norm(found.corners - shown.corners, axis=1).max() < 0.5, number  # of the 2 px that are asked for
+        assert np.nanmean(found.kinds[0].colors.after) < 1.0, number
+        assert not found.kinds[0].colors.refused
+        # without the noise of the patches themselves: what the matrix does to colours
+        matrix = Capture.open(folder).manifest.color_matrix
+        assert difference(matrix, light).mean() < 0.6, number
+        assert difference(np.eye(3), light).mean() > 5
+
+
+def test_a_chart_corrects_the_capture_and_the_report_says_by_how_much(relit, tmp_path):
+    shown = picture(seen(), POSE)
+    folder = shoot(tmp_path / "cap", [noisy(shown.pixels)])
+    printed = relit.done("calibrate", "chart", folder).out
+    assert "24 of 24 patches" in printed and "warning" not in printed
+    chart = section(folder)
+    kind, = chart["kinds"]
+    assert kind["delta_e_2000"]["before"]["mean"] > 5 > 1 > kind["delta_e_2000"]["after"]["mean"]
+    assert [patch["name"] for patch in kind["patches"]] == [row["name"] for row in table()]
+    assert all(patch["after"] < 4 for patch in kind["patches"])
+    assert kind["response"] == pytest.approx(1, abs=0.03) and kind["light_falls_to"] > 0.95
+    np.testing.assert_allclose(chart["corners"], shown.corners, atol=0.5)
+    assert cv2.imread(str(folder / "chart.png")).shape[0] > 300
+    capture = Capture.open(folder)
+    white = Correction.of(capture).apply(capture.manifest.frames[0]).pixels
+    u, v = shown.corners[3].astype(int)
+    patch = white[v - 5 : v + 6, u - 5 : u + 6].mean(axis=(0, 1))
+    grey = seen()[18:].mean(axis=0)[1] / REFLECTANCE[18:, 1].mean()  # greys keep their green
+    np.testing.assert_allclose(patch, grey * REFLECTANCE[18], rtol=0.02)  # the noise of 121 pixels
+    # the matrix leads into the working space: greys are (1, 1, 1) in ACEScg too, and colours those that OpenColorIO makes of them
+    edit_manifest(folder, color_space="lin_ap1_scene", color_matrix=None)
+    relit.done("calibrate", "chart", folder, "--out", tmp_path / "aces.json")
+    aces = np.array(json.loads((tmp_path / "aces.json").read_text())["color_matrix"])
+    into = rgb_matrix("lin_rec709_scene", "lin_ap1_scene") @ np.array(kind["matrix"])
+    np.testing.assert_allclose(aces / aces.sum(), into / into.sum(), atol=2e-4)  # float32 of OpenColorIO, and where the search ends
+    edit_manifest(folder, color_space="lin_rec709_scene", color_matrix=kind["matrix"])
+    # once more, from the corrected capture: what is there is replaced
+    relit.done("calibrate", "chart", folder, "--out", tmp_path / "again.json")
+    again = section(tmp_path)["kinds"][0]
+    assert again["matrix"] == kind["matrix"]
+    assert again["delta_e_2000"]["before"]["mean"] == pytest.approx(kind["delta_e_2000"]["after"]["mean"], abs=0.05)
+
+
+def test_integers_in_another_space_and_a_chart_that_stands_on_its_head(relit, tmp_path):
+    shown = picture(seen(), POSE)
+    folder = shoot(tmp_path / "cap", [noisy(shown.pixels)])
+    turned = np.clip(noisy(shown.pixels), 0, 1)[::-1, ::-1]
+    encoded = np.where(turned <= 0.0031308, 12.92 * turned, 1.055 * turned ** (1 / 2.4) - 0.055)
+    write_image(folder / "0.png", np.rint(encoded * 65535).astype(np.uint16))
+    edit_manifest(folder, color_space="srgb_texture", frames=[{"image": "0.png", "light": {"type": "full"}}])
+    printed = relit.done("calibrate", "chart", folder).out
+    assert "the chart is upside down" in printed
+    rows, cols = shown.pixels.shape[:2]
+    np.testing.assert_allclose(section(folder)["corners"], [cols, rows] - shown.corners, atol=0.5)
+    # given in another order, the corners are put right by the colours
+    corners = ([cols, rows] - shown.corners)[[2, 3, 0, 1]].round(1)
+    relit.done("calibrate", "chart", folder, "--corners", ",".join(map(str, corners.ravel())))
+    np.testing.assert_allclose(section(folder)["corners"], [cols, rows] - shown.corners, atol=0.5)
+    assert difference(Capture.open(folder).manifest.color_matrix).mean() < 0.6
+
+
+def stain(shown: Picture, patches: dict[int, float], columns=6) -> np.ndarray:
+    """Add light to patches of a picture, by their numbers from 1 on."""
+    pixels = shown.pixels.copy()
+    a, b, _, d = shown.corners
+    for number, more in patches.items():
+        x, y = (number - 1) % columns / (columns - 1), (number - 1) // columns / 3
+        u, v = np.rint(a + x * (b - a) + y * (d - a)).astype(int)
+        pixels[v - 22 : v + 22, u - 22 : u + 22] += more
+    return pixels
+
+
+def test_patches_that_are_clipped_shadowed_or_glaring_are_left_out_by_name(relit, tmp_path):
+    shown = picture(seen(), Pose(distance=700))
+    pixels = stain(shown, {14: 0.1, 24: 0.05, 8: -0.035})
+    pixels[:, :] = np.minimum(noisy(pixels, noise=0.002), 0.4)
+    folder = shoot(tmp_path / "cap", [pixels], saturation=0.399)
+    printed = relit("calibrate", "chart", folder).out
+    for sentence in ("patch 19 (white) is clipped", "patch 14 (green) is glaring", "patch 24 (black) is glaring",
+                     "patch 8 (purplish blue) is shadowed"):
+        assert f"warning  {sentence}, and left out" in printed
+    assert difference(Capture.open(folder).manifest.color_matrix).mean() < 0.6
+    left_out = {patch["name"]: patch["left_out"] for patch in section(folder)["kinds"][0]["patches"] if "left_out" in patch}
+    assert left_out == {"white": "clipped", "green": "glaring", "black": "glaring", "purplish blue": "shadowed"}
+
+
+def half_shadow(shown, part, axis):
+    middle = shown.corners.mean(axis=0)
+    v, u = np.mgrid[: shown.pixels.shape[0], : shown.pixels.shape[1]]
+    return shown.pixels * np.where((u, v)[axis] > middle[axis], part, 1.0)[..., None]
+
+
+def test_charts_that_cannot_be_read_are_refused_with_one_sentence_and_nothing_is_written(relit, tmp_path):
+    shown, random = picture(seen(), POSE), np.random.default_rng(3)
+    cases = {
+        "no chart is found": cv2.resize(random.uniform(0, 0.8, (24, 32, 3)), (640, 480)),
+        "the response is not linear": np.clip(noisy(shown.pixels, noise=0.001), 1e-4, 1) ** (1 / 2.2),
+        "have not the colours of the chart": noisy(picture(seen(reflectance=random.uniform(0.05, 0.9, (24, 3))), POSE).pixels),
+        "are lit and not clipped: check the exposure": np.minimum(shown.pixels * 18, 1),
+        "12 of 24 patches of the chart can be used, 15 are needed: part of the chart lies in shadow": noisy(half_shadow(shown, 0.1, 1)),
+        "part of the chart lies in shadow": noisy(half_shadow(shown, 0.3, 0)),
+    }
+    for number, (words, pixels) in enumerate(cases.items()):
+        folder = shoot(tmp_path / str(number), [pixels], saturation=0.999)
+        before = (folder / "capture.json").read_bytes()
+        assert str(folder) in relit("calibrate", "chart", folder).refused(words)
+        assert {path.name for path in folder.iterdir()} == {"0.exr", "capture.json"} and (folder / "capture.json").read_bytes() == before
+
+
+def test_patches_under_light_of_two_colours_tell_no_matrix(relit, tmp_path):
+    shown = picture(seen((1, 0.9, 0.01)), POSE)
+    folder = shoot(tmp_path / "cap", [noisy(shown.pixels, noise=0.001)])
+    corners = ",".join(map(str, shown.corners.round(1).ravel()))
+    refused = relit("calibrate", "chart", folder, "--corners", corners).refused("needs light with red, green and blue")
+    assert "differ in fewer than three colours" in refused
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    (("--corners", "10,10,20,20,30,30,40,40"), "three of them lie on a line"),
+    (("--corners", "1e9,0,0,1e9,5,5,1,1"), "lead out of the images, which are 640x480"),
+    (("--corners", "300,200,310,200,310,210,300,210"), "pixels, 9 are needed"),
+    (("--corners", "60,60,580,60,580,420,60,420"), "have not the colours of the chart"),
+    (("--chart", "sg"), "no chart is found"),
+    (("--reflectances", "nowhere.csv"), "nowhere.csv"),
+])
+def test_options_that_lead_nowhere(relit, tmp_path, given, words):
+    folder = shoot(tmp_path / "cap", [picture(seen(), POSE, samples=1).pixels])
+    relit("calibrate", "chart", folder, *given).refused(words)
+    assert {path.name for path in folder.iterdir()} == {"0.exr", "capture.json"}
+
+
+def lamp(irradiance=(1, 1, 1), polarization="none"):
+    return {"type": "distant", "direction": [0, 0, 1], "irradiance": irradiance, "polarization": polarization}
+
+
+def test_polarised_frames_and_lamps_of_other_colours_have_a_matrix_each(relit, tmp_path):
+    """The filters before the lens in a cross-polarised frame have a colour; glare lies on other patches in each frame of one kind."""
+    filtered, cold = (0.32, 0.30, 0.22), (0.7, 1.0, 1.4)
+    lights = [lamp(), lamp((0.5, 0.5, 0.51)), lamp(), lamp(polarization="cross"), lamp((0.5, 0.8, 1.0)), {"type": "off"}]
+    plain = picture(seen(), POSE)
+    images = [stain(plain, {14: 0.2}), 0.5 * stain(plain, {15: 0.2}), stain(plain, {2: 0.3}),
+              picture(seen(filtered), POSE).pixels, picture(seen(cold), POSE).pixels, np.zeros_like(plain.pixels)]
+    room = 0.05 * np.array([1, 0.6, 0.3])  # the light of the room, which the frame without lamps shows too
+    folder = shoot(tmp_path / "cap", [noisy(image + room, number, 0.002) for number, image in enumerate(images)], lights)
+    other = shoot(tmp_path / "other", images, lights)
+    printed = relit("calibrate", "chart", folder, "--apply-to", other).out
+    assert printed.count("24 of 24 patches") == 3 and "cross-polarised light" in printed
+    assert "2 frames declare lights with a colour" not in printed and "1 frames declare lights with a colour" in printed
+    manifest = Capture.open(other).manifest
+    own = [frame.color_matrix for frame in manifest.frames]
+    assert own[:3] == [None] * 3 and own[5] is None and own[3] and own[4]
+    for matrix, light in ((manifest.color_matrix, LIGHTS[0]), (own[3], filtered), (own[4], cold)):
+        assert difference(matrix, light).mean() < 0.4
+        assert difference(matrix, (1.3, 1, 0.45)).mean() > 4
+    # the light of the room is subtracted in the colours of each frame
+    edit_manifest(folder, **{key: value for key, value in json.loads((other / "capture.json").read_text()).items() if key != "schema"})
+    correction = Correction.of(Capture.open(folder))
+    u, v = plain.corners[3].astype(int)
+    for frame in correction.capture.manifest.frames[:5]:
+        patch = correction.apply(frame).pixels[v - 8 : v + 9, u - 8 : u + 9].mean(axis=(0, 1))
+        np.testing.assert_allclose(patch / patch[1], REFLECTANCE[18] / REFLECTANCE[18, 1], atol=0.02)
+    # a white balance takes the place of them all
+    card = shoot(tmp_path / "card", [np.full((480, 640, 3), 0.3)])
+    relit.done("calibrate", "white-balance", other, card / "0.exr")
+    assert not any(frame.color_matrix for frame in Capture.open(other).manifest.frames)
+    # and a kind of light that no frame with the chart has is named
+    edit_manifest(other, frames=[{"image": "0.exr", "light": lamp(polarization="parallel")}])
+    assert "shows the chart in such light" in relit("calibrate", "chart", folder, "--apply-to", other).refused("parallel-polarised light")
+
+
+@pytest.mark.parametrize("gap", [0.79, 0.94])
+def test_charts_with_other_gaps_are_found(gap, tmp_path):
+    shown = picture(seen(), POSE, patch=47 * gap)
+    found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))
+    assert np.abs(found.corners - shown.corners).max() < 0.5 and np.nanmean(found.kinds[0].colors.after) < 1
+
+
+def test_a_chart_of_140_patches(relit, tmp_path):
+    colours = seen(reflectance=reflectances(140))
+    shown = picture(colours, Pose(12, -9, 4, distance=560), grid=(14, 10), pitch=24, patch=20, size=(960, 720))
+    folder = shoot(tmp_path / "cap", [noisy(shown.pixels, noise=0.004)])
+    relit("calibrate", "chart", folder, "--chart", "sg")
+    np.testing.assert_allclose(section(folder)["corners"], shown.corners, atol=0.7)
+    assert section(folder)["kinds"][0]["delta_e_2000"]["after"]["mean"] < 1
+    assert difference(Capture.open(folder).manifest.color_matrix).mean() < 0.5
