@@ -5,6 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gphoto2 as gp
 import numpy as np
 
@@ -28,6 +29,7 @@ REASONS = {
     gp.GP_ERROR_IO_USB_CLAIM: "another program uses the camera: end it, or the system's service that mounts cameras",
     gp.GP_ERROR_IO_LOCK: "another program uses the camera: end it",
     gp.GP_ERROR_IO_INIT: "the USB device may not be opened: give your user the right to use it (udev rules of libgphoto2)",
+    gp.GP_ERROR_NOT_SUPPORTED: "libgphoto2 does not know how this camera does that",
     gp.GP_ERROR_NO_SPACE: "the card of the camera is full: empty it",
     gp.GP_ERROR_CAMERA_BUSY: "the camera is busy: wait until it has stored its pictures",
     gp.GP_ERROR_TIMEOUT: "the camera does not answer: check the cable and the battery",
@@ -92,6 +94,17 @@ class Gphoto2Camera:
             raise self._refused(error) from error
         self._last = Path(place.name).stem
         return Picture(path, images.read_pixels(path))
+
+    def look(self) -> np.ndarray:
+        """Return a picture of the camera's live view."""
+        try:
+            data = np.frombuffer(self._camera.capture_preview().get_data_and_size(), np.uint8)
+        except gp.GPhoto2Error as error:
+            raise self._refused(error) from error
+        frame = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        if frame is None:
+            raise RequestError(f"{self._name}: its live view is no picture that can be read")
+        return np.ascontiguousarray(frame[..., ::-1], np.float32) / 255
 
     def unasked(self) -> list[Path]:
         """Return the pictures that the camera has made by itself; the second file of a picture, raw and JPEG, is none."""
