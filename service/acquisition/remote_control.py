@@ -142,15 +142,14 @@ class RemoteControl:
     def confirm(self) -> None:
         """Tell the capture that a person has done what it asked for."""
         with self._lock:
-            if self._prompt is not None and self._running():
-                self._prompt = None
-                os.write(self._terminal, b"\n")
+            self._answer()
 
     def stop(self) -> None:
         """End the capture as Ctrl-C does, with the lamps dark and its pictures kept."""
         with self._lock:
             if self._process is not None and self._running():
                 self._process.send_signal(signal.SIGINT)
+                self._answer()  # nothing else ends the wait for a person
 
     def look(self, on: bool) -> None:
         """Begin or end the live view.
@@ -189,11 +188,11 @@ class RemoteControl:
             if line.get("event") == "rejected":
                 retaken[line["shot"]] = retaken.get(line["shot"], 0) + 1
         running = self._running()
-        faults = {key: [words for _, words in line.get("faults", [])] for key, line in taken.items()}
+        faults = {key: [_named(*fault) for fault in line.get("faults", [])] for key, line in taken.items()}
         if not running and taken and (report := self._capture / REPORT_FILE).exists():  # all pictures together have been judged
             faults = {}
             for fault in json.loads(report.read_text())["faults"]:
-                faults.setdefault(fault["shot"], []).append(fault["sentence"])
+                faults.setdefault(fault["shot"], []).append(_named(fault["kind"], fault["sentence"]))
         shots = [{"shot": shot.key, "step": _step_of(shot), "lamp": shot.lamp, "taken": shot.key in taken,
                   "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
@@ -233,6 +232,11 @@ class RemoteControl:
         self._lines.clear()
         self._process = self._prompt = self._address = None
 
+    def _answer(self) -> None:
+        if self._prompt is not None and self._running():
+            self._prompt = None
+            os.write(self._terminal, b"\n")
+
     def _refuse_beside_another(self) -> None:
         if self._running():
             raise RequestError("a capture is running: wait for its end, or stop it")
@@ -257,6 +261,11 @@ class RemoteControl:
                 if text.startswith(PLEASE) and (address := re.search(r"http://\S+", text)) is not None:
                     self._address = address[0]
         process.wait()
+
+
+def _named(kind: str, sentence: str) -> str:
+    """Return a fault as `relit capture` prints it."""
+    return f"{kind.replace('_', ' ')}: {sentence}"
 
 
 def _step_of(shot: Shot) -> str:

@@ -37,7 +37,7 @@ def stage(folder: Path, *options: object, sample: bool = False, serve: tuple[obj
         capture, directions = write_capture(folder / "scene", scene), scene.directions
     rig = write_rig_file(folder / "rig.json", directions, host=host, name="the little dome")
     command = [sys.executable, "-m", "service.cli.main", "twin", rig, capture, "--interface", host, "--port", "0", "--pictures", watched,
-               "--picture-format", "png", "--noise", "0.003", "--cache", folder, *options]
+               "--picture-format", "png", "--noise", "0.001", "--exposure", "-1" if sample else "0", "--cache", folder, *options]
     twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     try:
         assert twin.stdout.readline().startswith("twin ")
@@ -111,13 +111,16 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
             page.get_by_role("button", name="Take the capture").press("Enter")
             page.get_by_role("button", name="Make an asset").wait_for()
             page.locator("canvas[data-turns=true]").wait_for()
-            assert "✓" in page.locator("[data-step=object]").inner_text() and "1 of 1 picture" in page.locator("[data-step=dark]").inner_text()
+            assert "✓" in page.locator("[data-step=object]").inner_text()
+            assert "1 of 1 picture" in page.locator("[data-step=dark]").inner_text()
             assert_turns(page)
             assert_accessible(page)
-            page.get_by_role("button", name="Make an asset").press("Enter")
-            page.get_by_role("link", name="Open the asset").wait_for()
             page.evaluate("() => scrollTo(0, 0)")
             page.screenshot(path=Path(PICTURES or tmp_path) / "page_set.png")
+            if PICTURES:  # to solve the sample takes minutes
+                return
+            page.get_by_role("button", name="Make an asset").press("Enter")
+            page.get_by_role("link", name="Open the asset").wait_for()
             page.reload()  # what was made is found again, and made no second time
             page.locator("#captures option[value=owl]").wait_for(state="attached")
             page.get_by_role("link", name="Open the asset").press("Enter")
@@ -132,7 +135,7 @@ def assert_turns(page) -> None:
     """The light turns while nobody points, follows the pointer and the arrow keys, and rests where motion is to be reduced."""
     direction = "() => relit.state().light.direction"
     before = page.evaluate(direction)
-    page.wait_for_function("(before) => Math.hypot(...relit.state().light.direction.map((each, axis) => each - before[axis])) > 0.1", arg=before)
+    page.wait_for_function(f"(before) => Math.hypot(...({direction})().map((each, axis) => each - before[axis])) > 0.1", arg=before)
     picture = page.locator("canvas.picture")
     picture.hover(position={"x": 5, "y": picture.bounding_box()["height"] / 2})
     assert page.evaluate(direction)[0] < -0.5  # it follows at once, and stays for a while
@@ -145,7 +148,7 @@ def assert_turns(page) -> None:
 
 
 @pytest.mark.long
-def test_a_fault_is_named_and_mended_and_what_is_missing_can_be_added(browser, tmp_path):
+def test_a_fault_is_named_and_mended(browser, tmp_path):
     with stage(tmp_path, "--faults", DEAD) as (server, captures), opened(browser, server, bypass_csp=True) as page:
         page.get_by_label("Capture", exact=True).fill("ball")
         page.get_by_label("Plan").fill("dark,chart,olat")
@@ -156,7 +159,7 @@ def test_a_fault_is_named_and_mended_and_what_is_missing_can_be_added(browser, t
         mend = page.get_by_role("button", name="Take those with a fault again")
         mend.wait_for()
         assert page.locator("#now").inner_text().startswith(f"{LAMPS + 2} of {LAMPS + 2} pictures, 1 with a fault.")
-        page.locator("#dome title", has_text="lamp 2: has 0 %").wait_for(state="attached")
+        page.locator("#dome title", has_text="lamp 2: did not light: has 0").wait_for(state="attached")
         assert "1 with a fault" in page.locator("[data-step=object]").inner_text()
         assert_accessible(page)
         page.get_by_role("button", name="0006_light_004", exact=True).click()
@@ -172,8 +175,19 @@ def test_a_fault_is_named_and_mended_and_what_is_missing_can_be_added(browser, t
         lines = [json.loads(line) for line in (captures / "ball" / "acquisition.jsonl").read_text().splitlines()]
         assert [line["shot"] for line in lines if line.get("was_taken")] == ["0005_light_003", "0006_light_004"]
 
-        page.get_by_role("button", name="White card: New capture with it").click()
-        assert (page.get_by_label("Capture", exact=True).input_value(), page.get_by_label("Plan").input_value()) == ("ball-2", "dark,flat,chart,olat")
+
+@pytest.mark.long
+def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(browser, tmp_path):
+    with stage(tmp_path) as (server, captures), opened(browser, server) as page:
+        page.get_by_label("Capture", exact=True).fill("ball")
+        page.get_by_label("Plan").fill("dark")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text="1 of 1 pictures").wait_for()
+        page.get_by_role("button", name="Object: New capture with it").click()
+        assert page.get_by_label("Plan").input_value() == "dark,olat"
+        page.get_by_role("button", name="White card: Add").click()
+        values = page.get_by_label("Capture", exact=True).input_value(), page.get_by_label("Plan").input_value()
+        assert values == ("ball-2", "dark,flat,olat")
         page.get_by_role("button", name="Meter the light").click()
         page.locator("#metered[data-shown]").wait_for()
         page.locator("#now", has_text="The meter proposes").wait_for()
@@ -181,11 +195,12 @@ def test_a_fault_is_named_and_mended_and_what_is_missing_can_be_added(browser, t
 
         page.get_by_label("Capture", exact=True).fill("ball")
         page.get_by_label("Capture", exact=True).press("Tab")
-        page.locator("tr[data-shot='0006_light_004']", has_text="good, taken 2 times").wait_for()
+        page.locator("tr[data-shot='0001_dark']", has_text="good").wait_for()
         page.get_by_role("button", name="Ball: Take it now").click()
         page.locator("#prompt", has_text="put the mirror ball").wait_for()
         page.get_by_role("button", name="Stop").click()
-        page.locator("#now", has_text="Take the capture").or_(page.locator("#now", has_text="take the capture")).wait_for()
+        page.get_by_role("button", name="Take the capture").wait_for()
+        assert page.get_by_label("Capture", exact=True).input_value() == "ball-ball" and not list((captures / "ball-ball").glob("*.png"))
 
 
 @pytest.mark.long
@@ -226,15 +241,15 @@ def test_the_live_view_says_what_clips_and_ends_before_a_capture(browser, tmp_pa
         writer.write(frame)
     writer.release()
     rig = write_rig_file(tmp_path / "rig.json", make_scene(size=8, lights=LAMPS).directions, host=loopback(), name="the little dome")
-    with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", f"video:{path}") as server:
-        with opened(browser, server, bypass_csp=True) as page:
-            live = page.get_by_role("button", name="Live view")
-            live.press("Enter")
-            page.locator("#seen-words", has_text="50.0 % clipped").wait_for()
-            page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
-            assert live.get_attribute("aria-pressed") == "true"
-            assert_accessible(page)
-            page.get_by_label("Plan").fill("olat")
-            page.get_by_role("button", name="Take the capture").click()
-            page.locator("#now", has_text=f"{LAMPS} of {LAMPS} pictures").wait_for()
-            assert live.get_attribute("aria-pressed") == "false" and not page.locator("#seen").is_visible()
+    with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", f"video:{path}") as server, \
+            opened(browser, server, bypass_csp=True) as page:
+        live = page.get_by_role("button", name="Live view")
+        live.press("Enter")
+        page.locator("#seen-words", has_text="50.0 % clipped").wait_for()
+        page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
+        assert live.get_attribute("aria-pressed") == "true"
+        assert_accessible(page)
+        page.get_by_label("Plan").fill("olat")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text=f"{LAMPS} of {LAMPS} pictures").wait_for()
+        assert live.get_attribute("aria-pressed") == "false" and not page.locator("#seen").is_visible()

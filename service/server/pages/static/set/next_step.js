@@ -50,7 +50,7 @@ function nextOf(state, outcome, faulty) {
   if (there < total) return { words: `${count} Take those that are missing.`, offered: ["start"], prominent: "start" };
   if (outcome.asset !== null) return { words: `${count} The asset is made.`, offered: ["asset"], prominent: "asset" };
   const results = outcome.solvable ? ["solve", "export"] : [];
-  if (faulty > 0) return { words: `${count} Take those with a fault again, or go on as it is.`, offered: ["mend", ...results], prominent: "mend" };
+  if (faulty > 0) return { words: `${count} Take those with a fault again${outcome.solvable ? ", or go on as it is" : ""}.`, offered: ["mend", ...results], prominent: "mend" };
   if (!state.shots.some(({ step }) => step === "object")) return { words: `${count} Go on with the capture of the object: give its name.`, offered: [], prominent: null };
   if (!outcome.solvable) return { words: count, offered: [], prominent: null };
   return { words: outcome.busy ? `${count} It is being solved.` : `${count} Make an asset of it.`, offered: results, prominent: "export" };

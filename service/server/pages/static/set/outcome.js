@@ -31,12 +31,14 @@ export function mountOutcome(patterns, changed) {
   async function begin(state) {
     const now = version;
     const current = () => version === now;
+    byId("state").textContent = "The service looks at the capture …";
     capture = await registered(state);
     if (!current()) return;
     if (capture.state !== "ready") {
       byId("state").textContent = capture.problem;
       return;
     }
+    byId("state").textContent = "";
     byId("light-page").href = `/light/${capture.id}`;
     byId("capture-page").href = `/captures/${capture.id}`;
     show(byId("light-page"), kind === "solve");
