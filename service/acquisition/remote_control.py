@@ -199,7 +199,7 @@ class RemoteControl:
         whole = not running and self._shots and len(taken) == len(self._shots) and (self._capture / FILE_NAME).exists()
         live = self._live
         return {"name": self._name, "plan": self._plan, "running": running, "metering": self._metering and running, "prompt": self._prompt,
-                "code": None if self._process is None else self._process.poll(), "projector": self._address if running else None,
+                "code": self._code(), "projector": self._address if running else None,
                 "shots": shots, "files": found, "lines": list(self._lines), "folder": str(self._capture),
                 "version": str((self._capture / JOURNAL_FILE).stat().st_mtime_ns) if whole else None,
                 "captures": sorted(path.parent.name for path in self._folder.glob(f"*/{JOURNAL_FILE}")),
@@ -248,7 +248,11 @@ class RemoteControl:
             self._live = None
 
     def _running(self) -> bool:
-        return self._process is not None and self._process.poll() is None
+        return self._code() is None and self._process is not None
+
+    def _code(self) -> int | None:
+        process = self._process
+        return None if process is None else process.poll()
 
     def _listen(self, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None

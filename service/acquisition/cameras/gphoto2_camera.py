@@ -5,7 +5,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import gphoto2 as gp
 import numpy as np
 
@@ -97,14 +96,13 @@ class Gphoto2Camera:
 
     def look(self) -> np.ndarray:
         """Return a picture of the camera's live view."""
+        path = self._setup.spool / "look.jpg"
         try:
-            data = np.frombuffer(self._camera.capture_preview().get_data_and_size(), np.uint8)
+            with replacing(path, flush=False) as temporary:
+                self._camera.capture_preview().save(str(temporary))
         except gp.GPhoto2Error as error:
             raise self._refused(error) from error
-        frame = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        if frame is None:
-            raise RequestError(f"{self._name}: its live view is no picture that can be read")
-        return np.ascontiguousarray(frame[..., ::-1], np.float32) / 255
+        return images.read_pixels(path).astype(np.float32)
 
     def unasked(self) -> list[Path]:
         """Return the pictures that the camera has made by itself; the second file of a picture, raw and JPEG, is none."""

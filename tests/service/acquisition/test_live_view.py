@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from service.acquisition.cameras.camera import Setup, open_camera
 from service.acquisition.live_view import LiveView
 from service.errors import RequestError
 from stage.formats import images
@@ -53,6 +54,32 @@ def test_it_tells_focus_and_stripes_what_clips_and_the_lamps_are_dark_when_it_en
 def test_a_camera_without_a_live_view_is_refused(tmp_path):
     with pytest.raises(RequestError, match="no live view"):
         LiveView(tmp_path / "rig.json", f"watch:{tmp_path}", tmp_path / "live")
+
+
+def test_a_picture_of_a_camera_that_has_one(tmp_path, monkeypatch):
+    """A stand-in for a camera at a USB port: the package itself makes and saves its file."""
+    gp = pytest.importorskip("gphoto2")
+
+    class Camera:
+        autodetect = staticmethod(lambda: type("Found", (), {"count": lambda self: 0})())
+
+        def init(self) -> None:
+            """Do nothing."""
+
+        exit = init
+
+        def get_single_config(self, name: str) -> None:
+            raise gp.GPhoto2Error(gp.GP_ERROR_NOT_SUPPORTED)
+
+        def capture_preview(self):
+            file = gp.CameraFile()
+            file.set_data_and_size(cv2.imencode(".jpg", np.full((24, 32, 3), (50, 100, 200), np.uint8))[1].tobytes())
+            return file
+
+    monkeypatch.setattr(gp, "Camera", Camera)
+    pixels = open_camera("gphoto2", Setup(tmp_path / "spool", 1.0, (), None)).look()
+    assert pixels.shape == (24, 32, 3) and pixels.dtype == np.float32
+    assert 255 * pixels.mean(axis=(0, 1)) == pytest.approx([200, 100, 50], abs=4)  # JPEG; OpenCV's order is blue first
 
 
 def test_the_virtual_camera_has_none_and_the_sentence_says_so(tmp_path):
