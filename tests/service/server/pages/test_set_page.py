@@ -209,7 +209,7 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
     size, watched, released = (64, 48), tmp_path / "watched", tmp_path / "released"
     watched.mkdir()
     rig = write_rig_file(tmp_path / "rig.json", make_scene(size=8, lights=LAMPS).directions, host=loopback(), name="the little dome")
-    with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", f"watch:{watched}", "--trigger",
+    with serving(tmp_path / "data", "--anonymous", "--device", "cpu", "--set", rig, "--camera", f"watch:{watched}", "--trigger",
                  f"touch {released}", "--projector", "64x48", "--projector-port", "0") as server, opened(browser, server) as page:
         page.get_by_label("Plan").fill("gray")
         page.get_by_role("button", name="Take the capture").click()
@@ -229,6 +229,9 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
         frames = Capture.open(server.data / "set" / "capture").manifest.frames
         assert len(frames) == taken == 2 + 2 * 6  # white, black, and six bits of 64 columns with their inverses
         assert not link.is_visible()
+        page.get_by_role("button", name="Solve").click()
+        page.get_by_role("link", name="Its maps").wait_for()
+        assert "The patterns are decoded." in page.locator("#now").inner_text()
 
 
 @pytest.mark.long

@@ -19,7 +19,8 @@ export function mountNext() {
       byId(id).classList.toggle("quiet", id !== prominent);
     }
     byId("start").textContent = offered.includes("start") && begun(state) ? "Take the missing pictures" : "Take the capture";
-    for (const id of ["solve", "export"]) byId(id).disabled = outcome.busy;
+    byId("solve").disabled = outcome.busy || outcome.solved;
+    byId("export").disabled = outcome.busy;
     const problem = state.code === REFUSED ? state.lines.at(-1) ?? null : null;
     show(byId("problem"), problem !== null);
     if (problem !== null && byId("problem").textContent !== problem) byId("problem").textContent = problem;
@@ -49,9 +50,10 @@ function nextOf(state, outcome, faulty) {
   const count = `${there} of ${total} pictures, ${faulty} with a fault.`;
   if (there < total) return { words: `${count} Take those that are missing.`, offered: ["start"], prominent: "start" };
   if (outcome.asset !== null) return { words: `${count} The asset is made.`, offered: ["asset"], prominent: "asset" };
-  const results = outcome.solvable ? ["solve", "export"] : [];
+  const results = !outcome.solvable ? [] : outcome.patterns ? ["solve"] : ["solve", "export"]; // a rig has no calibrated projector
   if (faulty > 0) return { words: `${count} Take those with a fault again${outcome.solvable ? ", or go on as it is" : ""}.`, offered: ["mend", ...results], prominent: "mend" };
   if (!state.shots.some(({ step }) => step === "object")) return { words: `${count} Go on with the capture of the object: give its name.`, offered: [], prominent: null };
   if (!outcome.solvable) return { words: count, offered: [], prominent: null };
+  if (outcome.patterns) return { words: `${count} ${outcome.solved ? "The patterns are decoded." : "Decode the patterns."}`, offered: results, prominent: "solve" };
   return { words: outcome.busy ? `${count} It is being solved.` : `${count} Make an asset of it.`, offered: results, prominent: "export" };
 }

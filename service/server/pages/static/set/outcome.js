@@ -1,7 +1,7 @@
 /** What is made of a capture that is whole: one of the service's captures, a picture whose light moves, maps and an asset. */
 
 import { attempt, listing, newToken, post, read, Refusal } from "../api.js";
-import { byId, show } from "../element.js";
+import { byId, show, tell } from "../element.js";
 import { watch } from "../events.js";
 import { progressOf } from "../jobs_table.js";
 import { openView } from "../view_jobs.js";
@@ -15,7 +15,7 @@ const CHECK_MS = 300;
  * @param {function(): void} changed Called when `outcome` has changed.
  */
 export function mountOutcome(patterns, changed) {
-  const outcome = { solvable: false, busy: false, asset: null };
+  const outcome = { solvable: false, patterns: false, busy: false, solved: false, asset: null };
   let version = null;
   let capture = null;
   let solved = null;
@@ -94,6 +94,7 @@ export function mountOutcome(patterns, changed) {
       solved = last;
       byId("maps-page").href = `/maps/${last.id}`;
       show(byId("maps-page"), true);
+      set({ solved: true });
     }
     return last;
   }
@@ -103,7 +104,8 @@ export function mountOutcome(patterns, changed) {
     try {
       await action();
     } catch (error) {
-      byId("jobs").textContent = error.message;
+      byId("jobs").textContent = "";
+      tell(error.message);
     } finally {
       set({ busy: false });
     }
@@ -137,7 +139,7 @@ export function mountOutcome(patterns, changed) {
       byId("state").textContent = byId("jobs").textContent = "";
       show(byId("preview"), preview !== undefined);
       for (const id of ["pages", "maps-page", "moving", "progress"]) show(byId(id), false);
-      Object.assign(outcome, { solvable: false, asset: null });
+      Object.assign(outcome, { solvable: false, patterns: kind === "depth", solved: false, asset: null });
       if (now !== null && state.shots.some((shot) => shot.step === "object")) attempt(() => begin(state));
     },
   };
