@@ -199,13 +199,12 @@ class _Meter:
         recorded = taken.pixels.max(axis=2)[seen]
         bright = float(np.quantile(linearise(taken.pixels, self._space).max(axis=2)[seen], 1 - SHARE))
         lamp = "all" if taken.shot.lamp is None else self._rig.lights[taken.shot.lamp].name
-        fine, coarse = (float(band.std()) for band in bands_of(taken.tile))
-        return Reading(taken.shot.key, lamp, exposure, float((recorded >= self._full).mean()), bright, fine / max(coarse, 1e-12))
+        return Reading(taken.shot.key, lamp, exposure, float((recorded >= self._full).mean()), bright, focus_of(taken.tile))
 
     def _write(self, result: Metered, taken: list[_Taken], seen: np.ndarray, brightest: int) -> None:
         counts = np.histogram(taken[brightest].pixels.max(axis=2)[seen], bins=BINS, range=(0, 1))[0]
         across = 3
-        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", self._zebra(each.pixels))
+        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", zebra(each.pixels, self._space, self._full))
                  for each, reading in zip(taken, result.readings, strict=True)]
         tiles.append((f"readings under {result.readings[brightest].lamp}", _bars(counts)))
         write_sheet(result.picture, [tiles[begin:begin + across] for begin in range(0, len(tiles), across)])
@@ -215,14 +214,21 @@ class _Meter:
             "histogram": counts.tolist(), "readings": [reading._asdict() for reading in result.readings],
             "camera_settings": self._camera.settings}, indent=1) + "\n")
 
-    def _zebra(self, pixels: np.ndarray) -> np.ndarray:
-        """Return a picture as it is displayed, [rows, cols, 3], with stripes where a channel clips."""
-        step = max(1, len(pixels) // TILE)
-        clipped = ndimage.maximum_filter(pixels.max(axis=2) >= self._full, step)[::step, ::step]
-        shown = display(linearise(np.ascontiguousarray(pixels[::step, ::step]), self._space), linear_space(self._space))
-        stripe = (np.add(*np.indices(clipped.shape)) // STRIPE_PX) % 2 == 0
-        shown[clipped & stripe] = (1.0, 0.1, 0.1)
-        return shown
+
+def zebra(pixels: np.ndarray, space: str, full: float) -> np.ndarray:
+    """Return a picture as it is displayed, [rows, cols, 3], with stripes where a channel is at full scale."""
+    step = max(1, len(pixels) // TILE)
+    clipped = ndimage.maximum_filter(pixels.max(axis=2) >= full, step)[::step, ::step]
+    shown = display(linearise(np.ascontiguousarray(pixels[::step, ::step]), space), linear_space(space))
+    stripe = (np.add(*np.indices(clipped.shape)) // STRIPE_PX) % 2 == 0
+    shown[clipped & stripe] = (1.0, 0.1, 0.1)
+    return shown
+
+
+def focus_of(tile: np.ndarray) -> float:
+    """Return the contrast of the finest details of a tile, [rows, cols] linear, over that of coarser ones."""
+    fine, coarse = (float(band.std()) for band in bands_of(tile))
+    return fine / max(coarse, 1e-12)
 
 
 def _thirds(factor: float) -> float:

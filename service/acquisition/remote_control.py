@@ -8,27 +8,38 @@ import subprocess
 import sys
 import threading
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from service.acquisition.journal import lines_of, record
+from service.acquisition.cameras.camera import LIVE
+from service.acquisition.journal import JOURNAL_FILE, lines_of, record
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
+from service.acquisition.live_view import LiveView
 from service.acquisition.meter import PICTURE_FILE
-from service.acquisition.plans.plan import NAMED, read_plan
-from service.acquisition.plans.shots import Shot, shots_of
+from service.acquisition.plans.plan import NAMED, Plan, read_plan
+from service.acquisition.plans.shots import FLAT, Shot, shots_of
 from service.acquisition.preview import PREVIEW_FILE
 from service.errors import RequestError
 from service.relight.sheet import display, fit
 from service.reporting.provenance import REPORT_FILE
+from service.requests.patterns import PatternCode
+from stage.capture.light import OffLight
+from stage.capture.manifest import FILE_NAME
 from stage.colour.colour import linearise
 from stage.colour.colour_spaces import linear_space
 from stage.files import replacing
 from stage.formats import images
 from stage.importers.layout import color_space_of
+from stage.rig.cues import rig_digest
 from stage.rig.rig import read_rig
 
+NAME = r"\w[\w-]{0,63}"
+"""A name of a capture, which is that of its folder."""
+SPOOL = ".live"
+"""The folder of live pictures, in that of the captures."""
 LINES = 40
 """The last lines of the process that are kept."""
 PICTURE_ROWS = 480
@@ -39,50 +50,88 @@ END_S = 30.0
 class RemoteControl:
     """One stage, at which one capture is taken at a time."""
 
-    def __init__(self, rig: Path, camera: str, trigger: str | None, folder: Path) -> None:
-        """Read the rig; captures lie below a folder.
+    def __init__(self, rig: Path, camera: str, folder: Path, *, trigger: str | None = None, projector: str | None = None,
+                 projector_port: int | None = None) -> None:
+        """Read the rig; captures lie below a folder, and devices are named as `relit capture` takes them.
 
         Raises:
+            RequestError: the size of the projector cannot be read.
             StageError: the rig is wrong; names file and field.
         """
-        self._rig, self._path, self._folder = read_rig(rig), rig.resolve(), folder
-        self._words = ["--rig", str(self._path), "--camera", camera, *([] if trigger is None else ["--trigger", trigger])]
+        self._rig, self._path, self._camera, self._folder = read_rig(rig), rig.resolve(), camera, folder
+        size = None if projector is None else re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", projector)
+        if projector is not None and size is None:
+            raise RequestError(f"--projector: is {projector}: give width x height in pixels, as in 1280x800")
+        self._projector = None if size is None else (int(size[1]), int(size[2]))
+        given = {"--rig": self._path, "--camera": camera, "--trigger": trigger, "--projector": projector,
+                 "--projector-port": projector_port}
+        self._words = [str(word) for option, value in given.items() if value is not None for word in (option, value)]
+        self._patterns = () if self._projector is None else tuple(map(str, PatternCode))
+        self._plans = (*(name for name in NAMED if name not in tuple(PatternCode)), *self._patterns)
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._terminal = -1
         self._lines: deque[str] = deque(maxlen=LINES)
         self._prompt: str | None = None
-        self._capture = folder
+        self._address: str | None = None
+        self._name, self._plan, self._metering = "", "", False
         self._shots: tuple[Shot, ...] = ()
+        self._live: LiveView | None = None
 
     def described(self) -> dict[str, Any]:
-        """Return the name of the rig, its lamps with their directions, and the names of plans."""
+        """Return the name of the rig, its lamps with their directions, the names of plans, and whether the camera has a live view."""
         lamps = [{"name": lamp.name, "direction": direction}
                  for lamp, direction in zip(self._rig.lights, self._rig.directions.tolist(), strict=True)]
-        return {"name": self._rig.name, "lamps": lamps, "plans": list(NAMED)}
+        return {"name": self._rig.name, "lamps": lamps, "plans": self._plans, "patterns": self._patterns,
+                "live": self._camera.partition(":")[0] in LIVE}
 
-    def start(self, name: str, plan: str, *, preview: bool = False, then: str = "", retake: str | None = None) -> None:
+    def open(self, name: str) -> None:
+        """Show a capture that was taken before.
+
+        Raises:
+            RequestError: a capture is running, there is no such capture, or it was not taken on this page with this rig.
+        """
+        with self._lock:
+            self._refuse_beside_another()
+            head = next(iter(lines_of(self._folder / name)), None) if re.fullmatch(NAME, name) else None
+            if head is None:
+                raise RequestError(f"name: there is no capture {name!r}")
+            if head["rig"] != rig_digest(self._rig):
+                raise RequestError(f"name: {name} was taken with another rig: start the service with it")
+            plan = Plan.model_validate(head["plan"])
+            names, left = [], plan.sequences
+            while left:
+                found = next((word for word in self._plans if left[:len(NAMED[word])] == NAMED[word]), None)
+                if found is None:
+                    raise RequestError(f"name: {name} was taken with a plan of its own: go on with relit capture")
+                names.append(found)
+                left = left[len(NAMED[found]):]
+            self._show(name, ",".join(names))
+
+    def start(self, name: str, plan: str, *, preview: bool = False, retake: Sequence[str] = ()) -> None:
         """Start a capture, go on with one, or meter the light.
 
         Raises:
             RequestError: a capture is running, or a name or the plan cannot be used.
         """
-        if re.fullmatch(r"\w[\w-]{0,63}", name) is None:
+        if re.fullmatch(NAME, name) is None:
             raise RequestError(f"name: {name!r} is no name of a capture: give letters, digits, - and _")
-        if unknown := [word for word in plan.split(",") if word not in NAMED]:
-            raise RequestError(f"plan: {unknown[0]!r} is none of {', '.join(NAMED)}")
+        if unknown := [word for word in plan.split(",") if word not in self._plans]:
+            why = f"is none of {', '.join(self._plans)}"
+            if unknown[0] in NAMED:
+                why = "shows patterns: start the service with --projector 1280x800"
+            raise RequestError(f"plan: {unknown[0]!r} {why}")
         with self._lock:
-            if self._running():
-                raise RequestError("a capture is running: wait for its end, or stop it")
-            self._shots, self._capture = shots_of(read_plan(plan), self._rig, None), self._folder / name
+            self._refuse_beside_another()
+            self._show(name, plan)
+            self._metering = preview
             words = [plan, *self._words, "--out", str(self._capture), *(["--preview"] if preview else []),
-                     *(["--then", then] if then else []), *([] if retake is None else ["--retake", retake])]
+                     *(word for shot in retake for word in ("--retake", shot))]
+            self._darken()
             self._folder.mkdir(parents=True, exist_ok=True)
             if self._terminal >= 0:
                 os.close(self._terminal)
             self._terminal, terminal = os.openpty()  # the program asks a person where its input is a terminal
-            self._lines.clear()
-            self._prompt = None
             try:
                 self._process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "capture", *words], stdin=terminal, text=True,
                                                  stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
@@ -93,24 +142,45 @@ class RemoteControl:
     def confirm(self) -> None:
         """Tell the capture that a person has done what it asked for."""
         with self._lock:
-            if self._prompt is not None and self._running():
-                self._prompt = None
-                os.write(self._terminal, b"\n")
+            self._answer()
 
     def stop(self) -> None:
         """End the capture as Ctrl-C does, with the lamps dark and its pictures kept."""
         with self._lock:
             if self._process is not None and self._running():
                 self._process.send_signal(signal.SIGINT)
+                self._answer()  # nothing else ends the wait for a person
+
+    def look(self, on: bool) -> None:
+        """Begin or end the live view.
+
+        Raises:
+            RequestError: a capture is running, or the camera has no live view.
+        """
+        with self._lock:
+            self._darken()
+            if on:
+                self._refuse_beside_another()
+                self._live = LiveView(self._path, self._camera, self._folder / SPOOL)
+
+    def live_picture(self) -> bytes | None:
+        """Return the last picture of the live view as PNG; None where there is none."""
+        live = self._live
+        return None if live is None else live.picture()
 
     def close(self) -> None:
-        """End the capture, and wait for it."""
+        """End the capture and the live view, and wait for them."""
+        with self._lock:
+            self._darken()
         self.stop()
         if self._process is not None:
             self._process.wait(END_S)
 
     def state(self) -> dict[str, Any]:
-        """Return how far the capture is: its shots with the faults of their pictures, what it asks for, and what there is of it."""
+        """Return how far the capture is: its shots with the faults of their pictures, what it asks for, and what there is of it.
+
+        `version` is a word that is another one when its pictures are; None where there is no capture with all of them.
+        """
         taken: dict[str, dict[str, Any]] = {}
         retaken: dict[str, int] = {}
         for line in lines_of(self._capture):
@@ -118,16 +188,22 @@ class RemoteControl:
             if line.get("event") == "rejected":
                 retaken[line["shot"]] = retaken.get(line["shot"], 0) + 1
         running = self._running()
-        faults = {key: [words for _, words in line.get("faults", [])] for key, line in taken.items()}
+        faults = {key: [_named(*fault) for fault in line.get("faults", [])] for key, line in taken.items()}
         if not running and taken and (report := self._capture / REPORT_FILE).exists():  # all pictures together have been judged
             faults = {}
             for fault in json.loads(report.read_text())["faults"]:
-                faults.setdefault(fault["shot"], []).append(fault["sentence"])
-        shots = [{"shot": shot.key, "lamp": shot.lamp, "taken": shot.key in taken,
+                faults.setdefault(fault["shot"], []).append(_named(fault["kind"], fault["sentence"]))
+        shots = [{"shot": shot.key, "step": _step_of(shot), "lamp": shot.lamp, "taken": shot.key in taken,
                   "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
-        return {"running": running, "code": None if self._process is None else self._process.poll(), "prompt": self._prompt,
-                "shots": shots, "files": found, "lines": list(self._lines)}
+        whole = not running and self._shots and len(taken) == len(self._shots) and (self._capture / FILE_NAME).exists()
+        live = self._live
+        return {"name": self._name, "plan": self._plan, "running": running, "metering": self._metering and running, "prompt": self._prompt,
+                "code": self._code(), "projector": self._address if running else None,
+                "shots": shots, "files": found, "lines": list(self._lines), "folder": str(self._capture),
+                "version": str((self._capture / JOURNAL_FILE).stat().st_mtime_ns) if whole else None,
+                "captures": sorted(path.parent.name for path in self._folder.glob(f"*/{JOURNAL_FILE}")),
+                "live": None if live is None else live.state()}
 
     def file(self, name: str) -> Path | None:
         """Return the path of preview.png or meter.png of the capture; None where it is not there."""
@@ -146,8 +222,37 @@ class RemoteControl:
             images.write_png(temporary, np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8), srgb=True)
         return True
 
+    @property
+    def _capture(self) -> Path:
+        return self._folder / self._name
+
+    def _show(self, name: str, plan: str) -> None:
+        self._shots = shots_of(read_plan(plan), self._rig, self._projector)
+        self._name, self._plan, self._metering = name, plan, False
+        self._lines.clear()
+        self._process = self._prompt = self._address = None
+
+    def _answer(self) -> None:
+        if self._prompt is not None and self._running():
+            self._prompt = None
+            os.write(self._terminal, b"\n")
+
+    def _refuse_beside_another(self) -> None:
+        if self._running():
+            raise RequestError("a capture is running: wait for its end, or stop it")
+
+    def _darken(self) -> None:
+        """End the live view, so that the camera and the lamps are free."""
+        if self._live is not None:
+            self._live.close()
+            self._live = None
+
     def _running(self) -> bool:
-        return self._process is not None and self._process.poll() is None
+        return self._code() is None and self._process is not None
+
+    def _code(self) -> int | None:
+        process = self._process
+        return None if process is None else process.poll()
 
     def _listen(self, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None
@@ -157,4 +262,20 @@ class RemoteControl:
                 self._prompt = text.removeprefix(PLEASE).removesuffix(THEN_ENTER)
             elif text:
                 self._lines.append(text)
+                if text.startswith(PLEASE) and (address := re.search(r"http://\S+", text)) is not None:
+                    self._address = address[0]
         process.wait()
+
+
+def _named(kind: str, sentence: str) -> str:
+    """Return a fault as `relit capture` prints it."""
+    return f"{kind.replace('_', ' ')}: {sentence}"
+
+
+def _step_of(shot: Shot) -> str:
+    """Return what the picture of a shot is for: ball, chart, dark, flat or object."""
+    if shot.folder:
+        return "ball" if shot.folder.endswith("-ball") else shot.folder
+    if shot.name == FLAT:
+        return FLAT
+    return "dark" if isinstance(shot.light, OffLight) else "object"

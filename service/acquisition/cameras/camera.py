@@ -11,6 +11,8 @@ from service.errors import RequestError
 KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device"}
 """The module of each kind of camera, KIND or KIND:DETAIL. A new one is a module with a function `open_camera(detail, setup)`, and an entry
 here."""
+LIVE = ("gphoto2", "video")
+"""The kinds of cameras that show what they see before a picture is taken."""
 
 
 class NoPictureError(Exception):
@@ -63,6 +65,13 @@ class Camera(Protocol):
         Raises:
             NoPictureError: no picture came in time.
             RequestError: the camera does not answer, or cannot be set to the exposure.
+        """
+
+    def look(self) -> np.ndarray:
+        """Return what the camera sees now, [rows, cols, 3] float32, 0 to 1, encoded for a screen.
+
+        Raises:
+            RequestError: it has no live view, or does not answer.
         """
 
     def unasked(self) -> list[Path]:

@@ -28,6 +28,7 @@ REASONS = {
     gp.GP_ERROR_IO_USB_CLAIM: "another program uses the camera: end it, or the system's service that mounts cameras",
     gp.GP_ERROR_IO_LOCK: "another program uses the camera: end it",
     gp.GP_ERROR_IO_INIT: "the USB device may not be opened: give your user the right to use it (udev rules of libgphoto2)",
+    gp.GP_ERROR_NOT_SUPPORTED: "libgphoto2 does not know how this camera does that",
     gp.GP_ERROR_NO_SPACE: "the card of the camera is full: empty it",
     gp.GP_ERROR_CAMERA_BUSY: "the camera is busy: wait until it has stored its pictures",
     gp.GP_ERROR_TIMEOUT: "the camera does not answer: check the cable and the battery",
@@ -92,6 +93,16 @@ class Gphoto2Camera:
             raise self._refused(error) from error
         self._last = Path(place.name).stem
         return Picture(path, images.read_pixels(path))
+
+    def look(self) -> np.ndarray:
+        """Return a picture of the camera's live view."""
+        path = self._setup.spool / "look.jpg"
+        try:
+            with replacing(path, flush=False) as temporary:
+                self._camera.capture_preview().save(str(temporary))
+        except gp.GPhoto2Error as error:
+            raise self._refused(error) from error
+        return images.read_pixels(path).astype(np.float32)
 
     def unasked(self) -> list[Path]:
         """Return the pictures that the camera has made by itself; the second file of a picture, raw and JPEG, is none."""

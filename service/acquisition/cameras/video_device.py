@@ -62,6 +62,16 @@ class VideoDevice:
             write_png(temporary, np.ascontiguousarray(frame[..., ::-1]), srgb=True)
         return Picture(path, images.read_pixels(path))
 
+    def look(self) -> np.ndarray:
+        """Return the next frame; a file begins again after its last one."""
+        there, frame = self._video.read()
+        if not there and not self._live:
+            self._video.set(cv2.CAP_PROP_POS_FRAMES, 0)
+            there, frame = self._video.read()
+        if not there or frame is None:
+            raise RequestError(f"{self._name}: gives no frames any more: check that it is connected")
+        return np.ascontiguousarray(frame[..., ::-1], np.float32) / 255
+
     def unasked(self) -> list[Path]:
         """Return nothing: frames come on request."""
         return []

@@ -50,6 +50,10 @@ class WatchedFolder:
             raise NoPictureError(f"{self._folder / next(iter(sizes))} was begun and is no whole image")
         raise NoPictureError(f"no file came into {self._folder} within {self._setup.timeout_s:g} s")
 
+    def look(self) -> np.ndarray:
+        """Refuse: a folder has pictures that were taken alone."""
+        raise RequestError(f"--camera watch:{self._folder}: a watched folder has no live view")
+
     def unasked(self) -> list[Path]:
         """Return the files that came without being asked for."""
         found = self._new()

@@ -38,21 +38,26 @@ def serve(
     trigger: Annotated[str | None, typer.Option(
         "--trigger", metavar="COMMAND", help="The program that releases the camera of --set, as relit capture takes it.",
         show_default=False)] = None,
+    projector: Annotated[str | None, typer.Option(
+        "--projector", metavar="WxH", help="Width and height of the projector of --set in pixels, for patterns.",
+        show_default=False)] = None,
+    projector_port: Annotated[int | None, typer.Option(
+        "--projector-port", help="The port of the page of --projector, as relit capture takes it.", show_default=False)] = None,
 ) -> None:
     """Run the service: the API, and a worker on each device."""
     from service.server.process.serve import serve as run
 
     settings = settings_of(config, data=data, host=host, port=port, anonymous=anonymous, devices=tuple(device) if device else None)
-    if (rig is None) != (camera is None) or (trigger is not None and rig is None):
-        from service.errors import RequestError
-
-        raise RequestError("--set and --camera go together, and --trigger with them: give the lamps and the camera")
     if rig is None or camera is None:
+        if any(given is not None for given in (rig, camera, trigger, projector, projector_port)):
+            from service.errors import RequestError
+
+            raise RequestError("--set and --camera go together, and --trigger and --projector with them: give the lamps and the camera")
         run(settings)
         return
     from service.acquisition.remote_control import RemoteControl
 
-    stage = RemoteControl(rig, camera, trigger, settings.data / "set")
+    stage = RemoteControl(rig, camera, settings.set_captures, trigger=trigger, projector=projector, projector_port=projector_port)
     try:
         run(settings, set_stage=stage)
     finally:

@@ -1,14 +1,16 @@
 """The stage at this machine, for the page /set: captures are started and watched, by programs of this machine alone."""
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Protocol
 
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict
 
 from service.server.api.context import require_local
 from service.server.api.problems import ApiError
+from stage.model import Line
 
 
 class Stage(Protocol):
@@ -17,8 +19,17 @@ class Stage(Protocol):
     def described(self) -> dict[str, Any]:
         """Return the rig."""
 
-    def start(self, name: str, plan: str, *, preview: bool, then: str, retake: str | None) -> None:
+    def open(self, name: str) -> None:
+        """Show a capture that was taken before."""
+
+    def start(self, name: str, plan: str, *, preview: bool, retake: Sequence[str]) -> None:
         """Start a capture."""
+
+    def look(self, on: bool) -> None:
+        """Begin or end the live view."""
+
+    def live_picture(self) -> bytes | None:
+        """Return the last picture of the live view."""
 
     def confirm(self) -> None:
         """Tell that a person has done what was asked for."""
@@ -44,8 +55,23 @@ class Run(BaseModel):
     name: str
     plan: str
     preview: bool = False
-    then: Literal["", "solve", "solve,export"] = ""
-    retake: str | None = None
+    retake: tuple[Line, ...] = ()
+
+
+class Named(BaseModel):
+    """A capture that is to be shown."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+
+
+class Live(BaseModel):
+    """Whether the live view is to be seen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    on: bool
 
 
 def _stage(request: Request) -> Stage:
@@ -72,7 +98,28 @@ def state(stage: Given) -> dict[str, Any]:
 @router.post("/run", status_code=204)
 def run(stage: Given, given: Run) -> None:
     """Start a capture."""
-    stage.start(given.name, given.plan, preview=given.preview, then=given.then, retake=given.retake)
+    stage.start(given.name, given.plan, preview=given.preview, retake=given.retake)
+
+
+@router.post("/open", status_code=204)
+def show(stage: Given, given: Named) -> None:
+    """Show a capture that was taken before."""
+    stage.open(given.name)
+
+
+@router.post("/look", status_code=204)
+def look(stage: Given, given: Live) -> None:
+    """Begin or end the live view."""
+    stage.look(given.on)
+
+
+@router.get("/live")
+def live(stage: Given) -> Response:
+    """Return the last picture of the live view as PNG."""
+    data = stage.live_picture()
+    if data is None:
+        raise ApiError("not-found", "there is no live picture yet")
+    return _png(data)
 
 
 @router.post("/confirm", status_code=204)
@@ -93,7 +140,7 @@ def file(stage: Given, name: str) -> Response:
     path = stage.file(name)
     if path is None:
         raise ApiError("not-found", f"there is no {name} yet")
-    return Response(path.read_bytes(), media_type="image/png", headers={"Cache-Control": "no-store"})
+    return _png(path.read_bytes())
 
 
 @router.get("/picture")
@@ -103,4 +150,8 @@ def picture(stage: Given, shot: str) -> Response:
         path = Path(folder) / "picture.png"
         if not stage.picture(shot, path):
             raise ApiError("not-found", f"there is no picture of {shot} yet")
-        return Response(path.read_bytes(), media_type="image/png", headers={"Cache-Control": "no-store"})
+        return _png(path.read_bytes())
+
+
+def _png(data: bytes) -> Response:
+    return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})

@@ -219,8 +219,8 @@ class Settings(BaseSettings):
         return self
 
     def roots_of(self, project: str) -> tuple[Path, ...]:
-        """Return the folders below which a project may register captures and environments."""
-        return (*self.roots, *(root.folder for root in self.project_roots if root.project == project))
+        """Return the folders below which a project may register captures and environments, that of the page /set among them."""
+        return (*self.roots, *(root.folder for root in self.project_roots if root.project == project), self.set_captures)
 
     def quota_of(self, project: str, quota: str) -> int | None:
         """Return the limit of one of QUOTAS for a project; None: there is none."""
@@ -231,6 +231,11 @@ class Settings(BaseSettings):
     def loopback(self) -> bool:
         """True if the API listens to this machine only."""
         return is_loopback(self.host)
+
+    @property
+    def set_captures(self) -> Path:
+        """Folder of the captures that were taken on the page /set, which belong to all projects."""
+        return self.data / "set"
 
     @property
     def is_sqlite(self) -> bool:

@@ -65,6 +65,8 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     address = _address(settings.host, listening.getsockname()[1])
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
+    if set_stage is not None:
+        print(f"set      {address}/set", flush=True)
     if before_answering is not None:
         before_answering(address, database, app.state.service.queue, app.state.service.storage)
 

@@ -108,8 +108,9 @@ def test_roots_of_projects(monkeypatch, tmp_path):
     monkeypatch.setenv("RELIT_ROOTS", "/shared")
     monkeypatch.setenv("RELIT_PROJECT_ROOTS", "larch=/l:birch=/b/../c:larch=/l=2")
     settings = Settings(data=tmp_path)
-    assert settings.roots_of("larch") == (Path("/shared"), Path("/l"), Path("/l=2"))
-    assert settings.roots_of("birch") == (Path("/shared"), Path("/c")) and settings.roots_of("oak") == (Path("/shared"),)
+    of_set = tmp_path / "set"  # the captures of the page /set
+    assert settings.roots_of("larch") == (Path("/shared"), Path("/l"), Path("/l=2"), of_set)
+    assert settings.roots_of("birch") == (Path("/shared"), Path("/c"), of_set) and settings.roots_of("oak") == (Path("/shared"), of_set)
     for wrong in ("larch", "=/l", "larch=", "Larch=/l"):
         monkeypatch.setenv("RELIT_PROJECT_ROOTS", wrong)
         with pytest.raises(ValidationError) as error:

@@ -22,13 +22,13 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  * @param {import("./view_file.js").ViewFile} view With `relight`.
  * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
  *          onchange: function(any): void}} options Environments of the server and how their files are read; `onchange` is told the light.
- * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void}>}
+ * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void, point: function(PointerEvent): void}>}
  */
 export async function mount(parent, view, { environments, load, onchange }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, point: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const canvas = element("canvas", { class: "picture", width: relight.cols, height: relight.rows, tabindex: 0, role: "img",
@@ -216,6 +216,7 @@ export async function mount(parent, view, { environments, load, onchange }) {
     pixels: () => { draw(); return renderer.pixels(); },
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
+    point: onPicture,
   };
 }
 

@@ -1,0 +1,66 @@
+/** The list of what belongs to a capture: what is there, what is planned, and what its absence means. */
+
+import { byId, element } from "../element.js";
+import { fill, open, planned, start } from "./plan_form.js";
+
+const STEPS = [
+  { id: "dark", name: "Dark", takes: ["dark"], lacks: "What the camera reads in the dark stays in the pictures." },
+  { id: "flat", name: "White card", takes: ["flat"], lacks: "What lens and lamps darken towards the edges stays in the pictures." },
+  { id: "ball", name: "Ball", takes: ["mirror-ball", "grey-ball"], alone: true, lacks: "The directions of the lights are those of the rig file." },
+  { id: "chart", name: "Colour chart", takes: ["chart"], alone: true, lacks: "The colours are those of the camera." },
+];
+const OBJECT = { id: "object", name: "Object", takes: ["olat"], lacks: "There is nothing to solve." };
+
+/** Return the sequences of a plan with a further one, in the order in which they are taken. */
+function withStep(sequences, step) {
+  const rank = (word) => (STEPS.findIndex(({ takes }) => takes.includes(word)) + 1) || STEPS.length + 1;
+  return [...sequences, step.takes[0]].sort((one, other) => rank(one) - rank(other)).join(",");
+}
+
+/** Return the name of a capture that there is not yet: with the next number at its end. */
+function following(name, captures) {
+  const stem = name.replace(/-\d+$/, "");
+  for (let number = 2; ; number += 1) if (!captures.includes(`${stem}-${number}`)) return `${stem}-${number}`;
+}
+
+/** Return the state of a step, and the button that changes it. */
+function stateOf(step, state, changed) {
+  const { name, sequences } = planned();
+  const shots = state.name === name ? state.shots.filter((shot) => shot.step === step.id) : [];
+  const there = shots.filter((shot) => shot.taken).length;
+  const faulty = shots.filter((shot) => shot.taken && shot.faults.length).length;
+  const begun = state.name === name && state.shots.some((shot) => shot.taken);
+  const isPlanned = sequences.some((word) => step.takes.includes(word));
+  const alone = `${name}-${step.id}`;
+  const button = (words, action) => element("button", { type: "button", class: "quiet", disabled: state.running, "aria-label": `${step.name}: ${words}`, onclick: action }, words);
+  const plan = (words, values) => button(words, () => { fill(values); changed(); });
+  if (there > 0 || (begun && isPlanned)) {
+    const words = `${there} of ${shots.length} ${shots.length === 1 ? "picture" : "pictures"}${faulty ? `, ${faulty} with a fault` : ""}`;
+    return { mark: faulty ? "wrong" : there === shots.length ? "there" : "", words, button: null };
+  }
+  if (isPlanned) {
+    return { mark: "", words: "In the plan.", button: sequences.length > 1 ? plan("Leave out", { name, plan: sequences.filter((word) => !step.takes.includes(word)).join(",") }) : null };
+  }
+  if (state.captures.includes(alone)) return { mark: "there", words: `There, as the capture ${alone}.`, button: button("Show", () => open(alone)) };
+  if (!begun) return { mark: "", words: step.lacks, button: plan("Add", { name, plan: withStep(sequences, step) }) };
+  return step.alone ? { mark: "", words: step.lacks, button: button("Take it now", () => start({ name: alone, plan: step.takes[0] })) }
+    : { mark: "", words: step.lacks, button: plan("New capture with it", { name: following(name, state.captures), plan: withStep(sequences, step) }) };
+}
+
+/**
+ * Return a function that shows the steps.
+ * @param {string[]} patterns Names of the plans of patterns.
+ * @param {function(): void} changed Called when the plan has been changed here.
+ */
+export function mountSteps(patterns, changed) {
+  const list = [...STEPS, { ...OBJECT, takes: ["olat", "gradients", "polarised", ...patterns] }];
+  return (state) => {
+    const focused = byId("steps").contains(document.activeElement) ? document.activeElement.closest("li").dataset.step : null;
+    byId("steps").replaceChildren(...list.map((step) => {
+      const { mark, words, button } = stateOf(step, state, changed);
+      const sign = { there: "✓ ", wrong: "! ", "": "○ " }[mark];
+      return element("li", { "data-step": step.id }, element("strong", {}, element("span", { class: `mark ${mark}`, "aria-hidden": "true" }, sign), step.name), button ?? "", element("p", { class: "help" }, words));
+    }));
+    if (focused !== null) byId("steps").querySelector(`[data-step=${focused}] button`)?.focus();
+  };
+}

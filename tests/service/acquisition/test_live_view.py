@@ -1,0 +1,94 @@
+"""The live view: a process that shows what a camera sees under all lamps, and leaves them dark and the camera free."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from service.acquisition.cameras.camera import Setup, open_camera
+from service.acquisition.live_view import LiveView
+from service.errors import RequestError
+from stage.formats import images
+from tests.service.acquisition.test_acquire import LAMPS, Stage, controller
+from tests.service.acquisition.test_cameras import virtual_camera
+from tests.service.waiting import until
+
+ROOT = Path(__file__).parents[3]
+
+
+def video(path: Path, *, blur_px: float) -> Path:
+    """A video of one frame again and again: fine texture, and a quarter of it at full scale."""
+    frame = np.random.default_rng(3).integers(40, 160, (200, 240), dtype=np.uint8)
+    frame = cv2.GaussianBlur(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR), (0, 0), blur_px)
+    frame[100:, 120:] = 255
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (240, 200))
+    for _ in range(3):
+        writer.write(frame)
+    writer.release()
+    return path
+
+
+@pytest.mark.long
+def test_it_tells_focus_and_stripes_what_clips_and_the_lamps_are_dark_when_it_ends(tmp_path):
+    stage, focus = Stage(tmp_path / "watch"), []
+    with controller(tmp_path, stage) as (rig, _):
+        for blur_px in (0.5, 3.0):
+            view = LiveView(rig, f"video:{video(tmp_path / 'video.avi', blur_px=blur_px)}", tmp_path / "live")
+            until(lambda view=view: view.state()["number"] > 4)  # a video of three frames begins again
+            focus.append(view.state()["focus"])
+            assert stage.on == set(range(LAMPS))
+            view.close()
+            assert stage.on == set()
+    assert view.state()["clipped"] == pytest.approx(1 / 4, abs=0.01)  # JPEG, at the borders
+    assert focus[0] > 1.2 * focus[1]  # JPEG adds details of its own to the blurred one
+    shown = images.read_pixels(tmp_path / "live" / "live.png").astype(np.float32)
+    red = (shown[..., 0] > 0.9) & (shown[..., 1] < 0.2)
+    assert red[104:, 124:].mean() == pytest.approx(1 / 2, abs=0.05) and not red[:96].any()
+
+
+def test_a_camera_without_a_live_view_is_refused(tmp_path):
+    with pytest.raises(RequestError, match="no live view"):
+        LiveView(tmp_path / "rig.json", f"watch:{tmp_path}", tmp_path / "live")
+
+
+def test_a_picture_of_a_camera_that_has_one(tmp_path, monkeypatch):
+    """A stand-in for a camera at a USB port: the package itself makes and saves its file."""
+    gp = pytest.importorskip("gphoto2")
+
+    class Camera:
+        autodetect = staticmethod(lambda: type("Found", (), {"count": lambda self: 0})())
+
+        def init(self) -> None:
+            """Do nothing."""
+
+        exit = init
+
+        def get_single_config(self, name: str) -> None:
+            raise gp.GPhoto2Error(gp.GP_ERROR_NOT_SUPPORTED)
+
+        def capture_preview(self):
+            file = gp.CameraFile()
+            file.set_data_and_size(cv2.imencode(".jpg", np.full((24, 32, 3), (50, 100, 200), np.uint8))[1].tobytes())
+            return file
+
+    monkeypatch.setattr(gp, "Camera", Camera)
+    pixels = open_camera("gphoto2", Setup(tmp_path / "spool", 1.0, (), None)).look()
+    assert pixels.shape == (24, 32, 3) and pixels.dtype == np.float32
+    assert 255 * pixels.mean(axis=(0, 1)) == pytest.approx([200, 100, 50], abs=4)  # JPEG; OpenCV's order is blue first
+
+
+def test_the_virtual_camera_has_none_and_the_sentence_says_so(tmp_path):
+    stage = Stage(tmp_path / "watch")
+    (tmp_path / "card").mkdir()
+    cv2.imwrite(str(tmp_path / "card" / "a.jpg"), np.full((24, 32, 3), 200, np.uint8))
+    with controller(tmp_path, stage) as (rig, _):
+        command = [sys.executable, "-m", "service.acquisition.live_view", rig, "gphoto2", tmp_path / "live"]
+        environment = virtual_camera(tmp_path / "card") | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, stage.on) == (1, set())
+    assert json.loads(done.stdout.splitlines()[-1])["refused"] == "--camera gphoto2: libgphoto2 does not know how this camera does that"
