@@ -132,8 +132,8 @@ def test_a_virtual_camera_is_metered_and_left_at_the_longest_time_it_offers(tmp_
     environment = virtual_camera(tmp_path / "card")
     with controller(tmp_path, stage) as (rig, _):
         request(tmp_path, stage, rig)
-        done = subprocess.run([sys.executable, "-m", "service.cli.main", "capture", str(tmp_path / "plan.json"), "--rig", str(rig), "--camera",
-                               "gphoto2", "--out", str(tmp_path / "meter"), "--preview"], env=environment, capture_output=True, text=True,
+        words = ["capture", tmp_path / "plan.json", "--rig", rig, "--camera", "gphoto2", "--out", tmp_path / "meter", "--preview"]
+        done = subprocess.run([sys.executable, "-m", "service.cli.main", *map(str, words)], env=environment, capture_output=True, text=True,
                               timeout=60)
     assert done.returncode == 0, done.stderr
     assert f"exposure {proposed:g} s, " in done.stdout and stage.on == set()
