@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -60,6 +60,19 @@ class AcquireResult(NamedTuple):
     """Seconds that each picture of this run took beside settling, exposure and transfer."""
 
 
+class Receiver(Protocol):
+    """Gets the pictures of a capture while others are taken."""
+
+    def open(self) -> None:
+        """Begin; the journal of the capture is there."""
+
+    def send(self, name: str, *, new: bool) -> None:
+        """Take note of a file of the capture, and return at once; `new`: it was taken in this run."""
+
+    def stop(self) -> None:
+        """End, as the capture has ended before its last picture."""
+
+
 class Acquisition:
     """One run of a capture."""
 
@@ -93,9 +106,13 @@ class Acquisition:
         self.retaken: list[Fault] = []
         """The faults of pictures that were taken again, and of pictures that came late."""
         self._own: list[float] = []
+        self._receiver: Receiver | None = None
 
-    def run(self, stop: threading.Event | None = None) -> AcquireResult:
+    def run(self, stop: threading.Event | None = None, receiver: Receiver | None = None) -> AcquireResult:
         """Take all pictures that are missing; ends early when `stop` is set or the program is interrupted, with the lamps dark.
+
+        Args:
+            receiver: gets the name of each picture of the capture itself; opened before a lamp is switched.
 
         Raises:
             RequestError: the lamps or the camera do not answer any more; the pictures that were taken are kept.
@@ -103,6 +120,9 @@ class Acquisition:
         with ended_by_signals(stop or threading.Event()) as stopping:
             lights = None
             try:
+                if receiver is not None:
+                    receiver.open()
+                    self._receiver = receiver
                 self._recall()
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
                 self._open_projector()
@@ -121,6 +141,8 @@ class Acquisition:
                     self._review(lights, stopping)
             finally:
                 self._close(lights)
+        if self._receiver is not None and len(self.journal.taken) < len(self.shots):
+            self._receiver.stop()
         faults = tuple(fault for found in self.faults.values() for fault in found)
         self._report(faults)
         return AcquireResult(self._request.out, len(self._own), len(self.journal.taken), len(self.shots), faults, tuple(self.retaken),
@@ -149,6 +171,7 @@ class Acquisition:
             path = self._request.out / line["file"]
             self.faults[shot.key] = [Fault(shot.key, FaultKind(kind), sentence) for kind, sentence in line.get("faults", [])]
             self.judge.accept(shot, images.read_pixels(path), *self._encoding(path), self.faults[shot.key])
+            self._send(shot, new=False)
 
     def _adopt(self) -> None:
         """Take the picture that came after an earlier run had released the camera and before it recorded the picture."""
@@ -247,6 +270,12 @@ class Acquisition:
         self.faults[shot.key] = faults
         self.journal.picture(shot.key, "taken", {**self._files.keep(shot, picture.path), **_said(faults)})
         self._files.write_manifest(shot.folder, self.journal.taken)
+        self._send(shot, new=True)
+
+    def _send(self, shot: Shot, *, new: bool) -> None:
+        """Name the picture of a shot of the capture itself to the receiver, if there is one."""
+        if self._receiver is not None and not shot.folder:
+            self._receiver.send(self.journal.taken[shot.key]["file"], new=new)
 
     def _review(self, lights: Lights, stopping: threading.Event) -> None:
         """Take those pictures again, the worst first, in which all of them together show a fault that none showed when it came."""

@@ -55,11 +55,14 @@ class CaptureFiles:
         path.unlink()
         return {**found, "source": line["source"], "was_taken": True}
 
-    def write_manifest(self, folder: str, taken: Mapping[str, Mapping[str, Any]]) -> None:
+    def write_manifest(self, folder: str, taken: Mapping[str, Mapping[str, Any]], *, mask: str | None = None,
+                       assumed: tuple[str, ...] = ()) -> None:
         """Write the capture.json of a folder with the pictures that there are; without any frame there is none.
 
         Args:
             taken: the lines of the journal by the key of the shot.
+            mask: the image of the mask in the folder.
+            assumed: more sentences for the entry `assumed`.
 
         Raises:
             RequestError: the camera of the rig has another resolution than the pictures.
@@ -90,6 +93,6 @@ class CaptureFiles:
         space = self._color_space or color_space_of(first)
         manifest = Manifest.model_validate({
             "schema": SCHEMA, "name": folder or self._folder.resolve().name, "color_space": space,
-            "camera": camera or View().entry(resolution), "flat": flat, "saturation": self._saturation,
-            "assumed": tuple(assumed_encoding(space, self._color_space)), "irradiance_scale": "relative", "frames": tuple(frames)})
+            "camera": camera or View().entry(resolution), "flat": flat, "saturation": self._saturation, "mask": mask,
+            "assumed": (*assumed, *assumed_encoding(space, self._color_space)), "irradiance_scale": "relative", "frames": tuple(frames)})
         write_manifest(manifest, place / FILE_NAME)

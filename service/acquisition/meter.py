@@ -38,6 +38,8 @@ OBJECT_PART = 0.05
 """Pixels that read more than this part of the brightest under one of the lamps are of the object."""
 STEP = 2 ** (1 / 3)
 """The steps of exposure times, thirds of a stop, as cameras have them."""
+ROUNDED = 1.1
+"""A time that the camera offers may be longer than a proposed one by this factor, of which TARGET leaves as much: cameras round."""
 SHORTER = 1 / 4
 """The exposure over the one before, where the picture clips so much that nothing says how bright the object is."""
 MOST_PICTURES = 6
@@ -156,14 +158,15 @@ class _Meter:
         sure = found.clipped < SHARE
         target = TARGET * float(linearise(np.full((1, 1, 3), min(self._full, 1.0), np.float32), self._space).max())
         factor *= _thirds(target / max(found.bright, 1e-6)) if sure else SHORTER
-        proposed = None if first is None else first * factor
+        proposed = None if first is None else self._offered(first * factor)
         if sure and proposed is not None and first is not None:
             shot = next(each.shot for each in taken if each.shot.key == found.shot)
             for _ in range(MOST_PICTURES):
                 clipped = self._reading(self._take(shot, proposed), seen, proposed).clipped
                 if clipped < SHARE:
                     break
-                factor, proposed = factor / STEP, proposed / STEP
+                proposed = self._offered(proposed / STEP)
+            factor = proposed / first
         out = self._request.out
         result = Metered(tuple(readings), found, factor, proposed, sure, clipped, out / METER_FILE, out / PICTURE_FILE)
         timings.stage("write", 1)
@@ -173,13 +176,19 @@ class _Meter:
 
     def _unclipped(self, shot: Shot, seen: np.ndarray, exposure: float) -> tuple[float, Reading]:
         """Return a reading of a shot that clips no more, and its exposure over the first one."""
-        factor = 1.0
+        shorter = exposure
         for _ in range(MOST_PICTURES):
-            factor *= SHORTER
-            reading = self._reading(self._take(shot, exposure * factor), seen, exposure * factor)
+            shorter = self._offered(shorter * SHORTER)
+            reading = self._reading(self._take(shot, shorter), seen, shorter)
             if reading.clipped < SHARE:
                 break
-        return factor, reading
+        return shorter / exposure, reading
+
+    def _offered(self, exposure: float) -> float:
+        """Return the longest exposure time of the camera that is hardly longer than one, its shortest if all are longer; where it does not
+        tell its times, the one itself."""
+        times = self._camera.exposures_s
+        return max((time for time in times if time <= ROUNDED * exposure), default=min(times, default=exposure))
 
     def _take(self, shot: Shot, exposure: float | None) -> _Taken:
         self._lights.set(shot.levels)

@@ -82,6 +82,16 @@ class Intakes:
                                        headers={"Idempotency-Key": token or self._connection.new_token()})
         return IntakeView.model_validate_json(answer.content)
 
+    def send(self, intake: str, files: list[tuple[Path, str]]) -> None:
+        """Send files to an intake that receives them; bytes that the server has are not sent twice, and a file of a path replaces another.
+
+        Args:
+            files: paths and their names in the intake.
+        """
+        hashed = hash_files(files, parallel=self._parallel, progress=TransferProgress(None, "hash", 0))
+        told = TransferProgress(None, "upload", 0)
+        transfer_all((Upload(self._connection, self._at(intake), file, told).run for file in hashed), parallel=self._parallel)
+
     def validate(self, intake: str) -> IntakeView:
         """End the upload and begin the check; an intake that is being checked or is ready does not change."""
         try:

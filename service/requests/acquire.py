@@ -42,6 +42,9 @@ class AcquireRequest(DeviceRequest):
     meter.png."""
     then: Annotated[tuple[Then, ...], FirstFault, Commas, Role.RUN, Spelling(metavar="STEPS")] = ()
     """What is made of the capture when its last picture is there: solve, or solve,export; not where a picture has a fault."""
+    to: Annotated[Line | None, Role.RUN, Spelling(metavar="URL")] = None
+    """The service to which pictures are sent as they are taken, and on which the capture is whole after the last; its key is that of the
+    environment variable RELIT_KEY. None: none."""
     retake: Annotated[tuple[Line, ...], FirstFault, Role.RUN, Spelling(metavar="SHOT")] = ()
     """A picture that is taken again, though it is there, such as 0017_light_016. May be repeated."""
     timeout: Positive = 30.0

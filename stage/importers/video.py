@@ -24,17 +24,19 @@ class FrameRange(NamedTuple):
     last: int | None
     """The last one, included; None: that of the video."""
     step: int
+    option: str = "--video-frames"
+    """The option that says it."""
 
     @classmethod
-    def parse(cls, text: str) -> "FrameRange":
+    def parse(cls, text: str, option: str = "--video-frames") -> "FrameRange":
         """Return the range that a text such as 12-600:6 says: first, last and step."""
         span, _, step = text.partition(":")
         first, dash, last = span.partition("-")
         if not (first.isdecimal() and (last.isdecimal() or not last) and (step.isdecimal() or not step)) or (dash and not last):
-            raise ManifestError(f"--video-frames {text}: give first, last and step, such as 12-600:6, 12-600 or 12")
-        found = cls(int(first), int(last) if last else None, int(step or 1))
+            raise ManifestError(f"{option} {text}: give first, last and step, such as 12-600:6, 12-600 or 12")
+        found = cls(int(first), int(last) if last else None, int(step or 1), option)
         if found.step < 1 or (found.last is not None and found.last < found.first):
-            raise ManifestError(f"--video-frames {text}: goes backwards or nowhere: give first, last and step, such as 12-600:6")
+            raise ManifestError(f"{option} {text}: goes backwards or nowhere: give first, last and step, such as 12-600:6")
         return found
 
 
@@ -46,6 +48,8 @@ class VideoFrames(NamedTuple):
     """A sentence for the user that says which frames were read."""
     assumed: tuple[str, ...]
     """Sentences for the entry `assumed` of the manifest."""
+    rate: float | None
+    """Frames of the video a second; None: it does not say."""
 
 
 def is_video(path: Path) -> bool:
@@ -64,13 +68,14 @@ def unpack(video: Path, folder: Path, frames: FrameRange) -> VideoFrames:
     """
     with _opened(video) as capture:
         code = int(capture.get(cv2.CAP_PROP_FOURCC))
+        rate = capture.get(cv2.CAP_PROP_FPS) or None
         codec = "".join(chr(code >> shift & 255) for shift in (0, 8, 16, 24)).strip("\0 ") or "unknown codec"
         count = 0
         while (frames.last is None or count <= frames.last) and capture.grab():
             count += 1
     last = count - 1 if frames.last is None else frames.last
     if count <= last or last < frames.first:
-        raise ManifestError(f"{video}: has {count} frames, 0 to {count - 1}, and --video-frames asks for {frames.first} to "
+        raise ManifestError(f"{video}: has {count} frames, 0 to {count - 1}, and {frames.option} asks for {frames.first} to "
                             f"{max(last, frames.first)}")
     numbers = range(frames.first, last + 1, frames.step)
     with storage("write", folder):
@@ -88,10 +93,10 @@ def unpack(video: Path, folder: Path, frames: FrameRange) -> VideoFrames:
                 write_png(temporary, picture[..., ::-1] if picture.ndim == 3 else picture, srgb=True)
     sentence = f"{len(numbers)} of {count if frames.last is None else 'its'} frames, {numbers[0]} to {numbers[-1]}, {codec}"
     if codec.upper() in LOSSLESS:
-        return VideoFrames(folder, f"{sentence}, lossless", ())
+        return VideoFrames(folder, f"{sentence}, lossless", (), rate)
     return VideoFrames(folder, f"{sentence}, compressed", (
         f"images: are frames of a compressed video ({codec}, 8 bits): fine stripes and dark places are coarser than the camera saw them, "
-        "their noise is not that of a camera, and colours have half the resolution in most videos",))
+        "their noise is not that of a camera, and colours have half the resolution in most videos",), rate)
 
 
 @contextmanager

@@ -53,6 +53,10 @@ class Camera(Protocol):
     def exposure_s(self) -> float | None:
         """Return the exposure time; None where the camera does not tell it or cannot be set to another."""
 
+    @property
+    def exposures_s(self) -> tuple[float, ...]:
+        """Return the exposure times to which the camera can be set; none where it has any, or does not tell them."""
+
     def present(self) -> list[str]:
         """Return the names of the files that are known: those that were there when the camera was opened, or were told then."""
 

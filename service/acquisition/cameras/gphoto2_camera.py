@@ -73,6 +73,11 @@ class Gphoto2Camera:
         told = self._value("shutterspeed")
         return None if told is None else seconds_of(told)
 
+    @property
+    def exposures_s(self) -> tuple[float, ...]:
+        """Return the exposure times that the camera offers."""
+        return tuple(self._times().values())
+
     def present(self) -> list[str]:
         """Return nothing: files come over the cable."""
         return []
@@ -161,8 +166,11 @@ class Gphoto2Camera:
             return False
         return self._value(name) == choice
 
+    def _times(self) -> dict[str, float]:
+        return {choice: seconds for choice in self._choices("shutterspeed") if (seconds := seconds_of(choice)) is not None}
+
     def _expose(self, exposure_s: float) -> None:
-        times = {choice: seconds for choice in self._choices("shutterspeed") if (seconds := seconds_of(choice)) is not None}
+        times = self._times()
         nearest = min(times, key=lambda choice: abs(np.log(times[choice] / exposure_s)), default=None)
         if nearest is None or abs(times[nearest] / exposure_s - 1) > EXPOSURE_PART:
             raise RequestError(f"exposures_s: {self._name} has no exposure time of {exposure_s:g} s" +

@@ -27,6 +27,7 @@ class VideoDevice:
     def __init__(self, detail: str, setup: Setup) -> None:
         self._name, self._setup, self._count = f"--camera video:{detail}", setup, 0
         self._live = detail.isdigit()
+        self.exposures_s: tuple[float, ...] = ()
         self._video = cv2.VideoCapture(int(detail) if self._live else detail)
         if not self._video.isOpened():
             raise RequestError(f"{self._name}: cannot be opened: check that it is connected and that no other program uses it")

@@ -26,6 +26,7 @@ class WatchedFolder:
         self._known = {path.name for path in self._files()} if setup.known is None else set(setup.known)
         self.settings: dict[str, str] = {}
         self.exposure_s: None = None
+        self.exposures_s: tuple[float, ...] = ()
 
     def present(self) -> list[str]:
         """Return the names of the files that are known."""

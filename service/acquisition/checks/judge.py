@@ -35,7 +35,7 @@ LEAST_LIGHT = 0.05
 """A lamp is judged if it gives, or should give, this part of the light that lamps give on the average."""
 UNLIT_PART = 0.03
 """A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
-SAME_PART = 0.2
+SAME_PART = 0.15
 """Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
 LEAST_MISFIT, AGREEMENT_WEIGHT = 1e-4, 4.0
 """A misfit below the first is as good as none; a correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
@@ -196,12 +196,15 @@ class Judge:
         least = LEAST_LIGHT * float((usual - dark).mean())
         if shot.lamp is not None:
             should = min(should, lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
-        if should < least:
+        faint = should < least
+        if faint and (shot.lamp is None or light < least):
             return []
         if light < UNLIT_PART * should:
             return [Fault(shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / should):.2g} % of the light that the others predict")]
         if shot.lamp is not None and (twin := self._twin(seen, others)) is not None:
             return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
+        if faint:
+            return self._ambient_faults(seen, others, used, BORDER_AMBIENT_PART)
         if light < least:
             return []
         motion = motion_between(seen.bands, expected_bands(used))
@@ -209,17 +212,18 @@ class Judge:
             return [moved]
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
-        if shot.lamp is not None and len(others) < LEAST_LAMPS:  # a mean of so few may be darker everywhere than the lamp between them
+        if shot.lamp is not None:
+            return self._ambient_faults(seen, others, used, AMBIENT_PART)
+        return [] if light <= AMBIENT_GAIN * should else [_ambient(shot, light / should - 1)]
+
+    def _ambient_faults(self, seen: Seen, others: list[Seen], used: list[tuple[np.float32, Seen]], part: float) -> list[Fault]:
+        """Return the fault of a picture under one lamp that more than a part of the usual picture is added to what is expected of it."""
+        if len(others) < LEAST_LAMPS:  # a mean of so few may be darker everywhere than the lamp between them
             return []
-        if shot.lamp is None:
-            more = light / should - 1 if light > AMBIENT_GAIN * should else 0.0
-        else:
-            more = _added(sample.blocks, expected, usual)
-        gain = sum(abs(float(weight)) for weight, _ in used)
-        inside = shot.lamp is not None and gain < INSIDE_GAIN and self._expectation.interpolated(seen, others)
-        if more > (0.0 if shot.lamp is None else AMBIENT_PART if inside else BORDER_AMBIENT_PART):
-            return [Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")]
-        return []
+        more = _added(seen.sample.blocks, expected_blocks(used), np.mean([each.sample.blocks for each in others], axis=0))
+        if sum(abs(float(weight)) for weight, _ in used) >= INSIDE_GAIN or not self._expectation.interpolated(seen, others):
+            part = BORDER_AMBIENT_PART
+        return [_ambient(seen.shot, more)] if more > part else []
 
     def _few_faults(self, seen: Seen, others: list[Seen], dark: np.ndarray | float) -> list[Fault]:
         """Return the fault of a picture under one of a few lamps, of which none is predicted."""
@@ -294,6 +298,10 @@ def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
 
 def _is_dark(shot: Shot) -> bool:
     return shot.pattern is None and not shot.levels.any()
+
+
+def _ambient(shot: Shot, more: float) -> Fault:
+    return Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")
 
 
 def _moved(shot: Shot, motion: Motion | None) -> Fault | None:

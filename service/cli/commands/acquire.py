@@ -25,14 +25,19 @@ def register(app: typer.Typer) -> None:
 
 
 def _capture(request: AcquireRequest) -> None:
-    from service.acquisition.acquire import acquire, refuse_to_ask
+    from service.acquisition.acquire import Acquisition, refuse_to_ask
 
     ask = _ask if sys.stdin.isatty() else refuse_to_ask
     if request.preview:
         _meter(request, ask)
         return
     with ProgressBar() as bar:
-        result = acquire(request, ask, _tell, bar)
+        sender = None
+        if request.to is not None:
+            from service.cli.sending import Sender
+
+            sender = Sender(request.to, request.out)
+        result = Acquisition(request, ask, _tell, bar).run(receiver=sender)
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
@@ -43,6 +48,8 @@ def _capture(request: AcquireRequest) -> None:
         print("ended    before the last picture: run the same command again to go on")
     else:
         _preview(request, result.taken)
+        if sender is not None:
+            print(f"sent     {sender.finish()}, at {request.to}", flush=True)
         if request.then and not result.faults:
             _follow(request)
         elif request.then:

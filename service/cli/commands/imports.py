@@ -11,6 +11,7 @@ from service.cli.groups import make_group
 from service.cli.remote import KeyOption
 from service.cli.request_commands import local_command
 from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
+from service.requests.imports.interleaved import InterleavedImport
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
 from service.requests.imports.patterns import (
     ExposureOrder,
@@ -49,7 +50,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands."""
     layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/importing.md shows each.")
     for function in (_diligent, _lp, _relightlab, _olat, _photos, _near_lights, _opencv_gray, _gray, _phase, _scanner, _tof, _histogram,
-                     _kinect, _laser, _scans):
+                     _kinect, _laser, _scans, _interleaved):
         local_command(layouts, function.__name__[1:].replace("_", "-"), function)
     layouts.command("guess")(_guess)
 
@@ -131,6 +132,12 @@ def _scans(request: ScansImport) -> None:
     from service.scans.importing import import_scans
 
     _print(import_scans(request), "set")
+
+
+def _interleaved(request: InterleavedImport) -> None:
+    from service.acquisition.performance import import_interleaved
+
+    _print(import_interleaved(request), "sequence")
 
 
 def _lp(request: LpImport) -> None:

@@ -1,7 +1,10 @@
 """The light meter against pictures whose radiance is known."""
 
 import json
+import subprocess
+import sys
 
+import cv2
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -14,6 +17,7 @@ from service.requests.acquire import AcquireRequest
 from stage.formats import images
 from tests.scenes.captures import make_scene, write_exr
 from tests.service.acquisition.test_acquire import LAMPS, controller
+from tests.service.acquisition.test_cameras import virtual_camera
 
 LEVEL_STEP = 2 ** (1 / 3)
 
@@ -117,3 +121,24 @@ def test_what_cannot_be_metered_is_refused(tmp_path, stage, relit):
                           given.trigger, "--preview").out
     assert "lamp     L4: 0" in said and "\nexposure " in said and stage.on == set()
     assert not (tmp_path / "other" / "capture.json").exists()
+
+
+@pytest.mark.parametrize(("grey", "proposed"), [(100, 0.05), (205, 0.01)])
+def test_a_virtual_camera_is_metered_and_left_at_the_longest_time_it_offers(tmp_path, stage, grey, proposed):
+    """Its pictures are the same at all times. Grey of 100 reads 13 % of full scale, so that six times the 0.01 s that it has, or less, do;
+    205 reads 61 %, and it has no time between 0.01 s and 0.02 s."""
+    (tmp_path / "card").mkdir()
+    cv2.imwrite(str(tmp_path / "card" / "a.jpg"), np.full((48, 64, 3), grey, np.uint8))
+    environment = virtual_camera(tmp_path / "card")
+    with controller(tmp_path, stage) as (rig, _):
+        request(tmp_path, stage, rig)
+        words = ["capture", tmp_path / "plan.json", "--rig", rig, "--camera", "gphoto2", "--out", tmp_path / "meter", "--preview"]
+        done = subprocess.run([sys.executable, "-m", "service.cli.main", *map(str, words)], env=environment, capture_output=True, text=True,
+                              timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert f"exposure {proposed:g} s, " in done.stdout and stage.on == set()
+    found = json.loads((tmp_path / "meter" / "meter.json").read_text())
+    assert found["proposed"]["exposure_s"] == proposed and found["proposed"]["factor"] == pytest.approx(proposed / 0.01)
+    assert found["proposed"]["sure"] and found["camera_settings"]["shutterspeed"] == f"{proposed:.4f}s"
+    linear = ((grey / 255 + 0.055) / 1.055) ** 2.4
+    assert [reading["bright"] for reading in found["readings"]] == pytest.approx([linear] * LAMPS, rel=0.05)  # JPEG

@@ -35,6 +35,7 @@ from service.requests.base.options import build, help_text, options_of, typed, v
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
 from service.requests.imports import lights
 from service.requests.imports import patterns as pattern_images
+from service.requests.imports.interleaved import InterleavedImport
 from service.requests.imports.scans import ScansImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
 from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
@@ -55,6 +56,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "import photos": [lights.PhotosImport],
     "import relightlab": [lights.RelightlabImport], "import gray": [pattern_images.GrayImport],
     "import phase": [pattern_images.PhaseImport], "import scans": [ScansImport],
+    "import interleaved": [InterleavedImport],
     "import scanner": [pattern_images.ScannerImport], "import tof": [TofImport], "import histogram": [HistogramImport],
     "import kinect": [KinectImport], "import laser": [pattern_images.LaserImport],
     "drive": [drive.DriveRequest], "rig check": [rig.RigCheckRequest], "rig from-capture": [rig.RigFromCaptureRequest],
