@@ -114,7 +114,8 @@ def test_a_library_lives_in_its_places(library, homes):
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
     allowed = ("stage.motion", "service.calibrate.solvers", "stage.results.mask_border", "stage.formats.avif", "stage.formats.camera_raw",
-               "stage.importers", "service.scans.registration.found_targets", "service.acquisition.cameras.video_device")
+               "stage.importers", "service.scans.registration.found_targets",
+               "service.acquisition.cameras.video_device", "service.acquisition.cameras.aravis_camera")
     assert {i.importer for i in imports() if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 
 

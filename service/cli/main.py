@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "inspect": ("export", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
                 "provenance, validators."),
     "basis": ("export", "A capture as a few coefficient images, for a browser or for RTI viewers."),
+    "publish": ("export", "Publish a capture as a folder of static files, which any web server serves."),
     "join": ("export", "One surface from solved maps and a depth of the same view: the detail of the normals, and the shape and "
              "place of the depth."),
     "depth": ("depth", "Depth from projected patterns, a laser, time of flight, or several cameras under projected texture."),

@@ -27,7 +27,7 @@ class AcquireRequest(DeviceRequest):
     flat, chart, mirror-ball, grey-ball, or a code of relit patterns."""
     camera: Annotated[Line, Spelling(metavar="CAMERA")]
     """The camera: watch:FOLDER or watch:FOLDER/*.jpg for the files that a tethering program writes, gphoto2 or gphoto2:PORT for a camera at
-    a USB port, video:0 for a video device."""
+    a USB port, aravis or aravis:NAME for a machine-vision camera, video:0 for a video device."""
     out: Annotated[Path, Role.OUTPUT, Spelling(metavar="CAPTURE")]
     """The folder of the capture."""
     rig: Annotated[Path | None, Role.INPUT, Spelling(metavar="RIG.json")] = None

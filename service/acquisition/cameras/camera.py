@@ -8,10 +8,10 @@ import numpy as np
 
 from service.errors import RequestError
 
-KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device"}
+KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device", "aravis": "aravis_camera"}
 """The module of each kind of camera, KIND or KIND:DETAIL. A new one is a module with a function `open_camera(detail, setup)`, and an entry
 here."""
-LIVE = ("gphoto2", "video")
+LIVE = ("gphoto2", "video", "aravis")
 """The kinds of cameras that show what they see before a picture is taken."""
 
 

@@ -1,18 +1,21 @@
-"""Cameras that no test can reach are stood in for by libgphoto2's virtual camera, and by a video file."""
+"""Cameras that no test can reach are stood in for by libgphoto2's virtual camera, by that which Aravis feigns, and by a video file."""
 
 import json
 import os
 import subprocess
 import sys
+from ctypes.util import find_library
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from service.acquisition.cameras.aravis_camera import FORMATS, LIBRARY
 from service.acquisition.cameras.camera import NoPictureError, Setup, open_camera
 from service.acquisition.cameras.gphoto2_camera import seconds_of
 from service.errors import RequestError
+from stage.importers.layout import color_space_of
 
 TAKEN = """
 import json, sys
@@ -82,3 +85,37 @@ def test_a_video_gives_its_frames_in_order_and_ends(tmp_path):
 def test_a_camera_that_is_not_there(tmp_path, given):
     with pytest.raises(RequestError, match="--camera"):
         open_camera(given, Setup(tmp_path, 1.0, (), None))
+
+
+@pytest.mark.parametrize("name", [name for name, (_, mosaic) in FORMATS.items() if mosaic is not None])
+def test_mosaics_are_those_that_genicam_names(name):
+    """BayerRG begins with a row of red and green, and has blue below green."""
+    colour = {"R": 200, "G": 120, "B": 40}
+    first = name[5:7]
+    second = {"RG": "GB", "BG": "GR", "GR": "BG", "GB": "RG"}[first]
+    bits, code = FORMATS[name]
+    raw = np.tile(np.array([[colour[c] for c in first], [colour[c] for c in second]], np.uint8 if bits == 8 else np.uint16), (6, 6))
+    assert (cv2.cvtColor(raw, code) == [200, 120, 40]).all()
+
+
+def test_the_camera_that_aravis_feigns_takes_pictures_at_exposures(tmp_path):
+    """Its picture is a ramp with all levels that moves; exposure times are those that it tells."""
+    if find_library(LIBRARY) is None:
+        pytest.skip("the library Aravis is not installed")
+    camera = open_camera("aravis:Fake_1", Setup(tmp_path / "spool", 5.0, (), None))
+    assert camera.settings["DeviceVendorName"] == "Aravis" and camera.settings["PixelFormat"] == "RGB8"
+    first, second = camera.take(0.02), camera.take(None)
+    assert first.pixels.shape == (512, 512, 3) and first.path != second.path and camera.exposure_s == pytest.approx(0.02)
+    assert color_space_of(first.path) == "lin_rec709_scene"  # a reading is proportional to light, and no code of a screen
+    assert first.pixels.min() == 0 and first.pixels.max() > 0.9
+    seen = camera.look()
+    assert seen.shape == (512, 512, 3) and seen.mean() > first.pixels.mean()
+    camera.close()
+    with pytest.raises(RequestError, match="aravis:Nobody: no camera is found"):
+        open_camera("aravis:Nobody", Setup(tmp_path / "spool", 5.0, (), None))
+
+
+def test_without_aravis_its_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.acquisition.cameras.aravis_camera._library", lambda: None)
+    with pytest.raises(RequestError, match="apt install libaravis"):
+        open_camera("aravis:Fake_1", Setup(tmp_path / "spool", 5.0, (), None))
