@@ -66,7 +66,9 @@ def import_interleaved(request: InterleavedImport) -> Imported:
         blocks = _blocks(frames, space)
         if (fault := repetition_fault(blocks, period, frames.names)) is not None:
             raise RequestError(f"{request.source}: {fault}")
-        rate = request.frame_rate or frames.rate or FRAME_RATE * len(period)
+        rate = frames.rate or FRAME_RATE * len(period)
+        if request.frame_rate is not None:
+            rate = request.frame_rate / FrameRange.parse(request.frames or "0", "--frames").step
         times = [place for place, shot in enumerate(shots) if shot.name.endswith(TRACKING)]
         reference = times[len(times) // 2] if times else 0  # the frame to which those of a step are aligned
         made = working / "sequence"

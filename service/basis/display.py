@@ -65,5 +65,6 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 def _scene(source: BasisCapture, front: np.ndarray, gains: np.ndarray) -> np.ndarray:
     """Return scene-linear values of evenly spread pixels, [3, lights in front, pixels] float32."""
     pixels = np.flatnonzero(source.inside)
-    values, _ = source.stack.pick(pixels[:: -(-len(pixels) // EXPOSURE_PIXELS)])
+    spread = np.linspace(0, len(pixels) - 1, min(EXPOSURE_PIXELS, len(pixels))).astype(int)  # no whole step, which could meet few columns
+    values, _ = source.stack.pick(pixels[spread])
     return np.asarray(values[:, front].astype(np.float32) * gains[:, front, None].astype(np.float32))

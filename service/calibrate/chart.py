@@ -164,6 +164,8 @@ def _corrected(source: Capture, target: Capture, found: list[KindColors]) -> tup
         if kind.colour is not None and not found[match].kind.shines_alike(kind):
             warnings.append(f"frames: {kind.words(target.manifest)}: the chart was not seen in it; the matrix of "
                             f"{found[match].kind.words(source.manifest)} is used")
+    if not rows:
+        raise ManifestError(f"{target.folder / FILE_NAME}: frames: none is lit by a light: there is none to correct")
     coloured = sum(_is_coloured(frame.light) for frame in target.manifest.frames)
     if coloured:
         warnings.append(f"lights: {coloured} frames declare lights with a colour, and the chart is now white under them: measure them "

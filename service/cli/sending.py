@@ -12,6 +12,7 @@ from service.errors import RequestError
 from service.requests.states import READY
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
+from stage.errors import StageError, storage
 
 KEY_VARIABLE = "RELIT_KEY"
 """The environment variable of the key of the service, as `relit submit` has it."""
@@ -42,7 +43,7 @@ class Sender:
         Raises:
             RequestError: the service does not answer, or refuses the key.
         """
-        with open(self._folder / JOURNAL_FILE, "rb") as journal:
+        with storage("read", self._folder / JOURNAL_FILE), open(self._folder / JOURNAL_FILE, "rb") as journal:
             token = hashlib.sha256(journal.readline()).hexdigest()  # the first line has the time at which the capture began
         try:
             found = self._client.captures.create(self._folder.resolve().name, token=token)
@@ -62,7 +63,7 @@ class Sender:
         self._waiting.put(name)
 
     def stop(self) -> None:
-        """Send what is waiting, and nothing more: the capture has ended before its last picture."""
+        """Send nothing more: the capture has ended before its last picture, and what waits is sent by the run that goes on with it."""
         self._waiting.put(None)
 
     def finish(self) -> str:
@@ -95,5 +96,5 @@ class Sender:
                 continue
             try:
                 self._client.captures.send(self._intake, [(self._folder / name, name)])
-            except ClientError:
+            except (ClientError, StageError, OSError):
                 self._failed = True

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 from stage.errors import ManifestError, storage
 
+FARTHEST = 1e6
+"""No image has so many pixels in a row."""
 NUMBER = r"(\d+(?:\.\d+)?)"
 RECTANGLE = re.compile(rf"(?:.*#)?xywh=(?:pixel:)?{NUMBER},{NUMBER},{NUMBER},{NUMBER}")
 
@@ -34,7 +36,7 @@ def read_annotations(path: Path | None, width: int, height: int) -> list[Annotat
         content = path.read_bytes()
     try:
         found = json.loads(content)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ManifestError(f"{path}: is no JSON: {error}") from error
     items = found.get("items") if isinstance(found, dict) else found
     if not isinstance(items, list):
@@ -63,7 +65,7 @@ def _place(target: Any) -> tuple[float, float, float, float] | None:
     for selector in _list(target.get("selector")) if isinstance(target, dict) else [{"value": target}]:
         if isinstance(selector, dict) and selector.get("type") == "PointSelector":
             point = selector.get("x"), selector.get("y")
-            if all(isinstance(value, int | float) and value >= 0 for value in point):
+            if all(type(value) in (int, float) and 0 <= value < FARTHEST for value in point):
                 return float(point[0] or 0), float(point[1] or 0), 0.0, 0.0
         elif isinstance(selector, dict) and (match := RECTANGLE.fullmatch(str(selector.get("value")))) is not None:
             x, y, width, height = map(float, match.groups())

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, spatial
+from scipy.sparse import csgraph
 
 PLANES = 27
 """Most planes: nine images of three."""
@@ -58,16 +59,17 @@ def components_of(values: np.ndarray, directions: np.ndarray) -> Components:
 
 def light_weights(directions: np.ndarray, sigma: float, wanted: np.ndarray) -> np.ndarray:
     """Return how much each captured light counts in a light from `wanted` [n, 3], [n, lights]; the sum is 1."""
-    weights = np.exp(-np.square(spatial.distance.cdist(wanted, directions)) / sigma**2)
+    squares = np.square(spatial.distance.cdist(wanted, directions))
+    weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / sigma**2)  # relative to the nearest, so that not all vanish
     weights /= weights.sum(axis=1, keepdims=True)
     weights[weights <= LEAST_WEIGHT] = 0
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def gaussian_width(directions: np.ndarray) -> float:
-    """Return the width of the Gaussians between lights: a part of the median distance of a light from its nearest neighbour."""
-    apart = spatial.distance.cdist(directions, directions)
-    np.fill_diagonal(apart, np.inf)
-    nearest = apart.min(axis=1)
-    nearest = nearest[np.isfinite(nearest) & (nearest > 0)]
-    return SPACING_PART * (float(np.median(nearest)) if len(nearest) else 1.0)
+    """Return the width of the Gaussians between lights: a part of the distance that most neighbours have.
+
+    Neighbours are those of the minimum spanning tree, whose upper quartile is the distance between groups where lights stand in pairs.
+    """
+    steps = csgraph.minimum_spanning_tree(spatial.distance.cdist(directions, directions)).data
+    return SPACING_PART * (float(np.quantile(steps, 0.75)) if len(steps) else 1.0)

@@ -13,8 +13,9 @@ import numpy as np
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, stack_bands
 from service.basis.display import Display, srgb
+from service.errors import RequestError
 from service.publish.annotations import Annotation
-from service.publish.components import gaussian_width, light_weights
+from service.publish.components import SPACING_PART, gaussian_width, light_weights
 from service.publish.pyramid import TILE, Pyramid, halvings, size_at, write_jpeg
 from service.publish.strips import Strips
 from service.reporting.progress import Timings
@@ -29,7 +30,8 @@ SMALL_SIDE = 1024
 THUMBNAIL_SIDE = 256
 RELIT = {"light from the left": (-0.7, 0.2, 0.69), "light from above": (0.0, 0.7, 0.71), "light from the right": (0.7, 0.2, 0.69),
          "light from below": (0.0, -0.7, 0.71), "raking light from the left": (-0.94, 0.0, 0.34)}
-"""The directions of the relit pictures, x right, y up, z towards the camera."""
+"""The directions of the relit pictures, x right, y up, z towards the camera; those that are farther from each captured light than these are
+from one another are left out."""
 LAYERS = {"diffuse_albedo": "albedo", "normal": "normals"}
 """The layers of maps that are shown."""
 
@@ -48,21 +50,20 @@ class _Images:
         camera = source.capture.camera
         self.width, self.height = camera.width, camera.height
         self._levels = 1 + halvings(self.width, self.height, TILE)
+        self._most = size_at(self.width, self.height, halvings(self.width, self.height, SMALL_SIDE))
 
     def pyramid(self, name: str) -> Pyramid:
         """Return the pyramid of an image, and write its info.json."""
-        small = [size_at(self.width, self.height, k) for k in range(self._levels)]
-        small = [size for size in small if max(size) <= SMALL_SIDE]
+        small = [size for k in range(self._levels) if max(size := size_at(self.width, self.height, k)) <= SMALL_SIDE]
         write_text(self._folder / name / "info.json", json.dumps({
             "@context": "http://iiif.io/api/image/3/context.json", **self.service(name), "protocol": "http://iiif.io/api/image",
-            "width": self.width, "height": self.height, "maxWidth": small[0][0], "maxHeight": small[0][1],
+            "width": self.width, "height": self.height, "maxWidth": self._most[0], "maxHeight": self._most[1],
             "sizes": [{"width": width, "height": height} for width, height in reversed(small)],
             "tiles": [{"width": TILE, "height": TILE, "scaleFactors": [1 << k for k in range(self._levels)]}]}, indent=1) + "\n")
-        largest = next(k for k in range(self._levels) if max(size_at(self.width, self.height, k)) <= SMALL_SIDE)
 
         def keep(halving: int, image: np.ndarray) -> None:
             write_jpeg(self._image(name, *size_at(self.width, self.height, halving)), image, self._quality)
-            if halving == largest:
+            if image.shape[1::-1] == self._most:
                 write_jpeg(self._folder / name / "full" / "max" / "0" / "default.jpg", image, self._quality)
 
         def tile(halving: int, column: int, row: int) -> Path:
@@ -81,7 +82,7 @@ class _Images:
     def body(self, picture: _Picture) -> dict[str, Any]:
         """Return an image as the body of an annotation."""
         return {"id": f"{self._url}/{picture.name}/full/max/0/default.jpg", "type": "Image", "format": "image/jpeg",
-                "label": {"en": [picture.label]}, "width": self.width, "height": self.height, "service": [self.service(picture.name)]}
+                "label": {"en": [picture.label]}, "width": self._most[0], "height": self._most[1], "service": [self.service(picture.name)]}
 
     def thumbnail(self, picture: _Picture) -> dict[str, Any]:
         """Return the smallest zoom of an image."""
@@ -100,8 +101,18 @@ def write_iiif(folder: Path, source: BasisCapture, display: Display, maps: Resul
     wanted = DEFAULT_PHOTOGRAPHS if request.photographs is None else request.photographs
     chosen = display.front[np.unique(np.linspace(0, len(display.front) - 1, min(wanted, len(display.front))).round().astype(int))]
     photographs = [_Picture(f"photograph_{index}", f"photograph, {source.stack.frames[index]}") for index in chosen]
-    relit = [_Picture(f"relit_{index}", label) for index, label in enumerate(RELIT)]
-    _write_pictures(images, [*relit, *photographs], source, display, chosen, device, timings)
+    directions = source.lights.direction[display.front]
+    width = gaussian_width(directions)
+    towards = {label: np.array(direction) / np.linalg.norm(direction) for label, direction in RELIT.items()}
+    between = [label for label, way in towards.items() if np.linalg.norm(directions - way, axis=1).min() <= width / SPACING_PART]
+    relit = [_Picture(f"relit_{index}", label) for index, label in enumerate(between)]
+    weights = np.zeros((len(relit) + len(chosen), 3, source.stack.shape[1]), np.float32)
+    if relit:
+        weights[:len(relit), :, display.front] = light_weights(directions, width, np.array([towards[label] for label in between]))[:, None]
+    weights[len(relit) + np.arange(len(chosen)), :, chosen] = 1
+    if not len(weights):
+        raise RequestError(f"--photographs 0: the lights of {source.where} are near none of those of the relit pictures: none is left")
+    _write_pictures(images, [*relit, *photographs], source, display, weights, device, timings)
     canvases = [("under light", [*relit, *photographs])]
     if maps is not None:
         layers = [_Picture(LAYERS[name], LAYERS[name]) for name in maps.names() if name in LAYERS]
@@ -115,15 +126,9 @@ def write_iiif(folder: Path, source: BasisCapture, display: Display, maps: Resul
     write_text(folder / MANIFEST_FILE, json.dumps(_manifest(images, canvases, source, request, annotations), indent=1) + "\n")
 
 
-def _write_pictures(images: _Images, pictures: list[_Picture], source: BasisCapture, display: Display, chosen: np.ndarray, device: str,
+def _write_pictures(images: _Images, pictures: list[_Picture], source: BasisCapture, display: Display, weights: np.ndarray, device: str,
                     timings: Timings) -> None:
-    """Write relit pictures, which come first, and photographs as the fit sees them."""
-    wanted = np.array(list(RELIT.values()))
-    wanted /= np.linalg.norm(wanted, axis=1, keepdims=True)
-    directions = source.lights.direction[display.front]
-    weights = np.zeros((len(wanted) + len(chosen), 3, source.stack.shape[1]), np.float32)
-    weights[:len(wanted), :, display.front] = light_weights(directions, gaussian_width(directions), wanted)[:, None]
-    weights[len(wanted) + np.arange(len(chosen)), :, chosen] = 1
+    """Write pictures as weighted sums [pictures, 3, lights padded] of what a display shows under each captured light."""
     pyramids = [images.pyramid(picture.name) for picture in pictures]
     with Strips(images.height, images.width, pyramids, np.zeros((len(pictures), 3), np.uint8)) as strips:
         for each in stack_bands(source, device, 6 * source.stack.shape[1] + 30 * len(weights), timings, "tiles"):

@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-import tempfile
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,6 +56,7 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
         RequestError: the folder holds something else, or an option does not fit the capture.
         StageError: capture, maps or annotations cannot be used.
     """
+    request = request.model_copy(update={"out": request.out.resolve()})
     _check(request.out)
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -81,7 +82,8 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
             if request.kind is PublishedAs.WEB:
                 write_page(folder, source, request, annotations)
         write_text(folder / PUBLICATION_FILE, json.dumps({
-            "schema": SCHEMA, "as": request.kind, "version": __version__, "provenance": source.provenance}, indent=1) + "\n")
+            "schema": SCHEMA, "as": request.kind, "version": __version__, "provenance": source.provenance,
+            "entries": sorted(path.name for path in folder.iterdir())}, indent=1) + "\n")
         sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
     timings.close()
     first = {PublishedAs.IIIF: MANIFEST_FILE, PublishedAs.OPENLIME: INFO_FILE, PublishedAs.WEB: PAGE_FILE}[request.kind]
@@ -94,8 +96,18 @@ def _check(out: Path) -> None:
     with storage("read", out):
         if out.exists() and not out.is_dir():
             raise RequestError(f"--to {out}: is a file: give a folder")
-        if out.is_dir() and any(out.iterdir()) and not (out / PUBLICATION_FILE).is_file():
-            raise RequestError(f"--to {out}: holds files that relit publish has not made: give another folder")
+        there = {path.name for path in out.iterdir()} - {PUBLICATION_FILE} if out.is_dir() else set()
+        if foreign := there - _entries(out / PUBLICATION_FILE):
+            raise RequestError(f"--to {out}: holds {min(foreign)}, which relit publish has not made: give another folder")
+
+
+def _entries(file: Path) -> set[str]:
+    """Return what lies in a publication, as its file says; nothing if it is none of ours."""
+    try:
+        found = json.loads(file.read_bytes())
+        return set(found["entries"]) if found["schema"] == SCHEMA else set()
+    except (FileNotFoundError, ValueError, LookupError, TypeError, RecursionError):
+        return set()
 
 
 @contextmanager
@@ -103,11 +115,11 @@ def _replacing(out: Path) -> Iterator[Path]:
     """Yield a folder beside `out`, which takes its place when the block ends without an error and is removed otherwise."""
     with storage("write", out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        temporary = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}")
+        temporary.mkdir()
     try:
         with storage("write", out):
             yield temporary
-            temporary.chmod(0o755)
             older = temporary.with_name(f"{temporary.name}.replaced")
             if out.exists():
                 os.rename(out, older)

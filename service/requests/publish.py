@@ -1,5 +1,6 @@
 """The options of `relit publish`."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -10,6 +11,8 @@ from stage.model import Line, NotNegativeCount
 
 LICENCES = ("http://creativecommons.org/licenses/", "http://creativecommons.org/publicdomain/", "http://rightsstatements.org/vocab/")
 """How addresses of rights begin that IIIF Presentation 3 allows; it has no https there."""
+ADDRESS = re.compile(r"https?://[^\s\"<>?#/]+(/[^\s\"<>?#]*)?")
+"""An address with a host, and without a query or a fragment."""
 DEFAULT_PHOTOGRAPHS = 8
 
 
@@ -33,8 +36,8 @@ class PublishRequest(StackOptions, Request):
     maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
     """iiif: folder with the maps.exr of the capture, whose albedo and normals are shown too."""
     annotations: Annotated[Path | None, Role.INPUT] = None
-    """iiif and web: Web Annotations (W3C) as JSON: an AnnotationPage, or a list. Points and rectangles in pixels of the image, with a
-    text."""
+    """iiif and web: Web Annotations (W3C) as JSON: an AnnotationPage, or a list. Points and rectangles in pixels of the image,
+    with `crop` of its part, with a text."""
     title: Line | None = None
     """iiif and web: title of the object; None: the name of the capture."""
     attribution: Line | None = None
@@ -60,8 +63,10 @@ class PublishRequest(StackOptions, Request):
             if self.url is None:
                 raise ValueError("--url is missing: a manifest of IIIF names its files by whole addresses: give that of the folder, as in "
                                  "https://museum.org/owl")
-            if not self.url.startswith(("http://", "https://")):
-                raise ValueError(f"--url is {self.url}: give an address that begins with http:// or https://")
-            if self.rights is not None and not self.rights.replace("https://", "http://").startswith(LICENCES):
+            if ADDRESS.fullmatch(self.url) is None:
+                raise ValueError(f"--url is {self.url}: give an address of a folder that begins with http:// or https://, as in "
+                                 "https://museum.org/owl")
+            rights = (self.rights or LICENCES[0]).replace("https://", "http://")
+            if not rights.startswith(LICENCES) or ADDRESS.fullmatch(rights) is None:
                 raise ValueError(f"--rights is {self.rights}: IIIF takes addresses that begin with {' or '.join(LICENCES)}")
         return self

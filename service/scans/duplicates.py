@@ -1,4 +1,7 @@
-"""Scans that are in a set twice, byte by byte: they tell nothing that the first one has not told, and would make it look surer."""
+"""Scans that are in a set twice, byte by byte: they tell nothing that the first one has not told, and would make it look surer.
+
+A scan of the same file that is said to stand elsewhere, or to have other targets, another σ or maps, is another scan.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,13 +26,13 @@ class Distinct(NamedTuple):
 
 
 def distinct(file: Path, listed: ScanSet) -> Distinct:
-    """Return a set, whose file is given, without the scans whose measurements are those of an earlier one in the same unit."""
+    """Return a set, whose file is given, without the scans that are an earlier one under another name."""
     same_as: dict[str, str] = {}
     for numbers in _alike(file, listed):
         first: dict[tuple[str, str], str] = {}
         for number in numbers:
             entry = listed.scans[number]
-            name = first.setdefault((digest(_measured(file, entry.path)), entry.unit), entry.name)
+            name = first.setdefault((digest(_measured(file, entry.path)), entry.model_dump_json(exclude={"name", "path"})), entry.name)
             if name != entry.name:
                 same_as[entry.name] = name
     if not same_as:
@@ -45,9 +48,8 @@ def _alike(file: Path, listed: ScanSet) -> Iterator[list[int]]:
     """Yield the numbers of scans whose files have one size; what is no file is left to those who read it."""
     by_size: dict[int, list[int]] = {}
     for number, entry in enumerate(listed.scans):
-        path = _measured(file, entry.path)
-        with storage("read", path):
-            if path.is_file():
+        with storage("read", file.parent / entry.path):
+            if (path := _measured(file, entry.path)).is_file():
                 by_size.setdefault(path.stat().st_size, []).append(number)
     return (numbers for numbers in by_size.values() if len(numbers) > 1)
 

@@ -37,6 +37,8 @@ def read_e57(path: Path) -> Iterator[E57Scan]:
         with pye57.E57(str(path)) as file:
             for number in range(file.scan_count):
                 header = file.get_header(number)
+                if not any(all(name in header.point_fields for name in axes) for axes in (AXES, SPHERICAL)):
+                    raise ValueError(f"scan {number} has neither {', '.join(AXES)} nor {', '.join(SPHERICAL)}")
                 coloured = all(name in header.point_fields for name in COLOURS)
                 values = file.read_scan(number, colors=coloured, transform=False, ignore_missing_fields=True)
                 pose = None
@@ -46,7 +48,7 @@ def read_e57(path: Path) -> Iterator[E57Scan]:
                     pose[:3, 3] = header.translation
                 yield E57Scan(_points(values), np.stack([values[name] for name in COLOURS], axis=1) if coloured else None, pose)
     except (pye57.libe57.E57Exception, ValueError, RuntimeError, KeyError) as error:
-        raise ResultError(f"{path}: is no E57 file that pye57 reads: {str(error).splitlines()[0]}") from error
+        raise ResultError(f"{path}: is no E57 file that pye57 reads: {str(error).partition(chr(10))[0]}") from error
 
 
 def _points(values: dict[str, np.ndarray]) -> np.ndarray:

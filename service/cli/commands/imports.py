@@ -1,5 +1,7 @@
 """relit import LAYOUT: make a capture of files that are laid out another way, and say how they were understood."""
 
+import io
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -61,7 +63,7 @@ def register(app: typer.Typer) -> None:
             _auto(folder, destination, layouts)
             return
         with TemporaryDirectory(prefix="relit-import-") as work:  # of links, so that the files of captures alone are sent
-            _upload(_auto(folder, destination or Path(work) / folder.resolve().name, layouts), to, key)
+            _upload(_auto(folder, destination or Path(work) / folder.resolve().name, layouts, kept=destination is not None), to, key)
 
     app.add_typer(layouts)
 
@@ -76,8 +78,12 @@ def _guess(folder: FolderArgument) -> None:
         print(f"then     {found.then}")
 
 
-def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> list[Path]:
-    """Run the import of a folder, or of each folder in it, record in its capture.json what the guess assumed, and return the captures."""
+def _auto(folder: Path, destination: Path | None, layouts: typer.Typer, *, kept: bool = True) -> list[Path]:
+    """Run the import of a folder, or of each folder in it, record in its capture.json what the guess assumed, and return the captures.
+
+    Args:
+        kept: whether they stay; nothing is said of places that do not.
+    """
     from stage.capture.manifest import FILE_NAME, read_manifest, write_manifest
     from stage.errors import ManifestError
     from stage.importers.guess import guess_each
@@ -93,12 +99,14 @@ def _auto(folder: Path, destination: Path | None, layouts: typer.Typer) -> list[
         target = destination if destination is None or len(guesses) == 1 else destination / found.source.name
         layout, source, *options = found.arguments
         _print_guess(found)
-        command.main([layout, source, *([] if target is None else [str(target)]), *options], standalone_mode=False)
+        with nullcontext() if kept else redirect_stdout(io.StringIO()):
+            command.main([layout, source, *([] if target is None else [str(target)]), *options], standalone_mode=False)
         path = (target or found.source) / FILE_NAME
         manifest = read_manifest(path)
         more = tuple(sentence for sentence in found.assumed if sentence not in manifest.assumed)
         write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), path)
-        print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")
+        if kept:
+            print(f"then     {found.then if target is None else found.then.replace(str(found.source), str(target), 1)}")
         made.append(path.parent)
     return made
 

@@ -13,11 +13,9 @@ export class Basis {
 
   /** Return the weight of each captured light, as [light, weight] of those that count, in a light from a unit vector. */
   weights([x, y, z]) {
-    const found = [];
-    for (let light = 0; light < this.lights.length / 3; light += 1) {
-      const [dx, dy, dz] = [this.lights[3 * light] - x, this.lights[3 * light + 1] - y, this.lights[3 * light + 2] - z];
-      found.push([light, Math.exp(-(dx * dx + dy * dy + dz * dz) / this.sigma ** 2)]);
-    }
+    const squares = Array.from({ length: this.lights.length / 3 }, (_, light) => (this.lights[3 * light] - x) ** 2 + (this.lights[3 * light + 1] - y) ** 2 + (this.lights[3 * light + 2] - z) ** 2);
+    const nearest = Math.min(...squares); // which all are relative to, so that none but the farthest vanish
+    const found = squares.map((square, light) => [light, Math.exp((nearest - square) / this.sigma ** 2)]);
     const sum = (each) => each.reduce((total, [, weight]) => total + weight, 0);
     const all = sum(found);
     const kept = found.filter(([, weight]) => weight > LEAST * all);

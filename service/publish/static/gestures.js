@@ -53,6 +53,7 @@ export function listen(canvas, state, { moves, changed }) {
     else lightAt(event);
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => down.delete(event.pointerId));
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault()); // the right button moves the picture
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
     zoom(2 ** (-event.deltaY / 300), event.clientX, event.clientY);

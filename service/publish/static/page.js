@@ -50,6 +50,13 @@ async function start() {
     });
   }
 
+  /** Write the code for another page that shows what is shown now. */
+  function embed() {
+    const title = scene.title.replaceAll("&", "&amp;").replaceAll("\"", "&quot;");
+    const code = `<iframe src="${location.origin}${location.pathname}?embed#${state.text()}" title="${title}" width="800" height="600" allowfullscreen></iframe>`;
+    byId("embed").querySelector("textarea").value = code;
+  }
+
   function paint() {
     const { width, height } = canvas.getBoundingClientRect();
     const ratio = globalThis.devicePixelRatio;
@@ -59,17 +66,18 @@ async function start() {
     const [x, y] = state.centre;
     const placeOf = (u, v) => [width / 2 + (u - x) * scale, height / 2 + (v - y) * scale];
     const part = { left: x - width / 2 / scale, right: x + width / 2 / scale, top: y - height / 2 / scale, bottom: y + height / 2 / scale };
-    const shown = tiles.covering(part, scale * ratio);
+    const { whole, shown } = tiles.covering(part, scale * ratio);
     const { factor, constant } = basis.sums(state.direction(), 2 ** (state.stops / 2.2));
     renderer.draw(shown.map(({ texture, box }) => {
       const [[left, top], [right, bottom]] = [placeOf(box[0], box[1]), placeOf(box[2], box[3])];
       return { texture, box: [2 * left / width - 1, 1 - 2 * top / height, 2 * right / width - 1, 1 - 2 * bottom / height] };
     }), factor, constant);
     if (shown.length > 0) {
-      byId("state").textContent = "";
-      canvas.dataset.ready = shown.at(-1).halving;
+      if (whole) byId("state").textContent = "";
+      canvas.dataset.ready = whole ? "whole" : "coarse";
     }
     putNotes(placeOf);
+    if (byId("embed").open) embed();
     if (info.pixelSizeInMM !== undefined) showScale(byId("scale"), info.pixelSizeInMM / scale);
     byId("lamp").setAttribute("cx", state.light[0]);
     byId("lamp").setAttribute("cy", -state.light[1]);
@@ -91,10 +99,7 @@ async function start() {
     full: () => (document.fullscreenElement === null ? byId("stage").requestFullscreen() : document.exitFullscreen()),
   };
   for (const [name, action] of Object.entries(buttons)) byId(name).addEventListener("click", action);
-  byId("embed").addEventListener("toggle", () => {
-    const address = `${location.origin}${location.pathname}?embed${location.hash}`;
-    byId("embed").querySelector("textarea").value = `<iframe src="${address}" title="${scene.title.replaceAll("\"", "&quot;")}" width="800" height="600" allowfullscreen></iframe>`;
-  });
+  byId("embed").addEventListener("toggle", embed);
   addEventListener("hashchange", () => {
     state.read();
     draw();

@@ -1,10 +1,12 @@
 /** The tiles of coefficient planes that a view needs: which they are, and those that have been loaded. */
 
 const SIDE = 256;
-const KEPT = 120; // of 256 × 256 × 9 × 4 bytes: 280 MB
+const KEPT = 120; // of 256 × 256 × 9 × 4 bytes: 280 MB; more only where one picture needs more
+const AGAIN_MS = 5000;
 
 export class Tiles {
   #loaded = new Map();
+  #wanted = new Set();
   #info;
   #renderer;
   #changed;
@@ -18,7 +20,7 @@ export class Tiles {
   }
 
   /**
-   * Return the tiles to draw, coarse ones first, and ask for those that are missing.
+   * Return the tiles to draw, coarse ones first, and whether they are all that belong to the picture; ask for those that are missing.
    * @param {{left: number, top: number, right: number, bottom: number}} part Of the image, pixels.
    * @param {number} scale Device pixels per pixel of the image.
    */
@@ -32,6 +34,7 @@ export class Tiles {
         wanted.push([halving, column, row]);
       }
     }
+    this.#wanted = new Set(wanted.map((each) => each.join("/")));
     for (const [first, column, row] of wanted) {
       for (let up = 0; first + up <= this.coarsest; up += 1) {
         const key = [first + up, column >> up, row >> up].join("/");
@@ -44,7 +47,8 @@ export class Tiles {
         break;
       }
     }
-    return [...found.values()].sort((a, b) => b.halving - a.halving);
+    const whole = [...this.#wanted].every((key) => this.#loaded.get(key)?.texture !== undefined);
+    return { whole, shown: [...found.values()].sort((a, b) => b.halving - a.halving) };
   }
 
   async #load(key, halving, column, row) {
@@ -54,13 +58,16 @@ export class Tiles {
       const urls = Array.from({ length: this.#renderer.terms }, (_, j) => `plane_${j}_files/${this.levels - 1 - halving}/${column}_${row}.jpg`);
       tile.texture = this.#renderer.texture(await Promise.all(urls.map(bitmapOf)));
     } catch (error) {
-      setTimeout(() => this.#loaded.delete(key), 2000); // so that it is asked for again
+      setTimeout(() => { // it is asked for again
+        this.#loaded.delete(key);
+        this.#changed();
+      }, AGAIN_MS);
       this.#failed(error);
       return;
     }
     for (const [old, { texture }] of this.#loaded) {
       if (this.#loaded.size <= KEPT) break;
-      if (texture === undefined || old === key) continue;
+      if (texture === undefined || this.#wanted.has(old)) continue;
       this.#renderer.forget(texture);
       this.#loaded.delete(old);
     }

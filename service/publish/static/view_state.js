@@ -26,9 +26,13 @@ export class ViewState {
     this.#limit();
     this.#asked ??= setTimeout(() => {
       this.#asked = null;
-      const text = Object.keys(NAMES).map((name) => `${name}=${[this[name]].flat().map((value) => +value.toFixed(3)).join(",")}`).join("&");
-      history.replaceState(null, "", `#${text}`);
+      history.replaceState(null, "", `#${this.text()}`);
     }, 250);
+  }
+
+  /** Return what the address says. */
+  text() {
+    return Object.keys(NAMES).map((name) => `${name}=${[this[name]].flat().map((value) => +value.toFixed(3)).join(",")}`).join("&");
   }
 
   /** Return the unit vector to the light. */

@@ -62,3 +62,18 @@ def test_black_stays_black_and_the_scale_is_told(relit, tmp_path):
     assert info["pixelSizeInMM"] == 0.2 and info["nplanes"] == 12  # as many as four lights of three channels have
     corner = shown(tmp_path / "out", scene.directions)[:, :20, :20]
     assert 255 * corner.max() < 1.5  # a step of JPEG
+
+
+def test_lights_in_pairs_show_their_images_and_something_between(relit, tmp_path):
+    """Their Gaussians are as wide as the distances between the pairs ask for."""
+    scene = capture(tmp_path / "cap", lights=4)
+    near = scene.directions + [0.01, 0, 0]
+    directions = np.concatenate([scene.directions, near / np.linalg.norm(near, axis=1, keepdims=True)])
+    white = np.ones_like(directions)
+    images = render(scene.normal, scene.albedo, directions, white)
+    write_capture(tmp_path / "pairs", scene._replace(directions=directions, irradiance=white, images=images))
+    relit.done("publish", tmp_path / "pairs", "--to", tmp_path / "out", "--as", "openlime")
+    between = shown(tmp_path / "out", np.array([[0.0, 0.25, 0.968], [0.0, 0.0, 1.0]]))
+    assert np.isfinite(between).all()
+    assert np.abs(between[0] - between[1])[scene.mask].mean() > 0.01
+    relit.done("publish", tmp_path / "pairs", "--to", tmp_path / "iiif", "--as", "iiif", "--url", "https://museum.org/cap")
