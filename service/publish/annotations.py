@@ -64,13 +64,18 @@ def _place(target: Any) -> tuple[float, float, float, float] | None:
     """Return x, y, width and height of a target, in pixels; None: it has no place that is known here."""
     for selector in _list(target.get("selector")) if isinstance(target, dict) else [{"value": target}]:
         if isinstance(selector, dict) and selector.get("type") == "PointSelector":
-            point = selector.get("x"), selector.get("y")
-            if all(type(value) in (int, float) and 0 <= value < FARTHEST for value in point):
-                return float(point[0] or 0), float(point[1] or 0), 0.0, 0.0
+            x, y = _number(selector.get("x")), _number(selector.get("y"))
+            if x is not None and y is not None:
+                return x, y, 0.0, 0.0
         elif isinstance(selector, dict) and (match := RECTANGLE.fullmatch(str(selector.get("value")))) is not None:
             x, y, width, height = map(float, match.groups())
             return x, y, width, height
     return None
+
+
+def _number(value: Any) -> float | None:
+    """Return a place along a row or a column, or None for what is none."""
+    return float(value) if type(value) in (int, float) and 0 <= value < FARTHEST else None
 
 
 def _list(value: Any) -> list[Any]:
