@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import sqlalchemy as sa
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.server.base import file_lock
 from service.server.database.engine import Database
@@ -94,7 +94,7 @@ class AdvisoryWorkerLock:
         if self._session is not None:
             try:
                 self._session.execute(sa.text("SELECT 1"))
-            except DBAPIError:
+            except SQLAlchemyError:  # one that broke in a look at another worker, too, which then waits to be rolled back
                 self.close()
             else:
                 return LockState.KEPT
@@ -120,7 +120,7 @@ class AdvisoryWorkerLock:
             yield taken
         finally:
             if taken:
-                with suppress(DBAPIError):  # a session that has ended holds nothing
+                with suppress(SQLAlchemyError):  # a session that has ended holds nothing
                     session.execute(sa.text("SELECT pg_advisory_unlock(hashtextextended(:name, :space))"), {"name": worker, "space": SPACE})
 
     def close(self) -> None:

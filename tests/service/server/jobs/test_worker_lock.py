@@ -3,6 +3,7 @@
 import pytest
 import sqlalchemy as sa
 
+from service.server.database.engine import UNANSWERED
 from service.server.jobs.worker_lock import KEEPALIVE, AdvisoryWorkerLock, FileWorkerLock, LockState, open_worker_lock
 from tests.service.server.jobs.harness import harness
 
@@ -54,6 +55,22 @@ def test_the_locks_of_the_dead_leave_no_files_and_one_that_was_removed_is_taken_
     (tmp_path / "one.lock").unlink()
     assert one.hold() is LockState.TAKEN
     assert not is_dead(two, "one")
+
+
+def test_a_session_that_ends_during_a_look_at_another_worker_is_taken_anew(on_postgres, tmp_path):
+    """As a restart of the server between both does."""
+    with harness(tmp_path, on_postgres) as made:
+        one, two = pair(made)
+        assert (one.hold(), two.hold()) == (LockState.TAKEN, LockState.TAKEN)
+        with made.database.engine.connect() as other:
+            other.execute(sa.text("SELECT pg_terminate_backend(l.pid) FROM pg_locks l JOIN pg_database d ON d.oid = l.database "
+                                  "WHERE l.locktype = 'advisory' AND d.datname = current_database() AND l.pid <> pg_backend_pid()"))
+        with pytest.raises(UNANSWERED):
+            is_dead(one, "two")
+        made.until(lambda: one.hold() is LockState.TAKEN, "held again")
+        assert one.hold() is LockState.KEPT
+        one.close()
+        two.close()
 
 
 @pytest.mark.long
