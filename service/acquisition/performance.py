@@ -36,7 +36,7 @@ class _Frames(NamedTuple):
     names: tuple[str, ...]
     mask: str | None
     rate: float | None
-    """Frames a second; None: nothing says it."""
+    """Frames a second of those that are used; None: nothing says it."""
     facts: tuple[tuple[str, str], ...]
     assumed: tuple[str, ...]
 
@@ -67,8 +67,6 @@ def import_interleaved(request: InterleavedImport) -> Imported:
         if (fault := repetition_fault(blocks, period, frames.names)) is not None:
             raise RequestError(f"{request.source}: {fault}")
         rate = frames.rate or FRAME_RATE * len(period)
-        if request.frame_rate is not None:
-            rate = request.frame_rate / FrameRange.parse(request.frames or "0", "--frames").step
         times = [place for place, shot in enumerate(shots) if shot.name.endswith(TRACKING)]
         reference = times[len(times) // 2] if times else 0  # the frame to which those of a step are aligned
         made = working / "sequence"
@@ -90,7 +88,7 @@ def import_interleaved(request: InterleavedImport) -> Imported:
     return Imported(target / SEQUENCE_FILE, (
         *frames.facts, ("period", f"{len(period)} frames, {len(times)} of them under full light" if not closed else
                         f"{len(period)} frames, {len(times) - 1} of them under full light; the first of the next period closes each"),
-        ("steps", f"{steps}, {rate / len(period):g} a second" + ("" if request.frame_rate or frames.rate else
+        ("steps", f"{steps}, {rate / len(period):g} a second" + ("" if frames.rate else
                                                                   ", as nothing says the camera's rate: --frame-rate does")),
         ("mask", frames.mask or "none: every pixel is taken"),
         ("then", f"relit {'solve' if rig.lights else 'depth'} {target}{' --align' if len(times) > 1 else ''} --out {target.name}-maps")))
@@ -116,7 +114,8 @@ def _frames(request: InterleavedImport, folder: Path) -> _Frames:
                 raise RequestError(f"--{option} {value}: {request.source} is a video: it is for a folder of images")
         video = unpack(request.source, folder, chosen if request.frames else FrameRange(0, None, 1))
         names = tuple(sorted(path.name for path in folder.iterdir()))
-        return _Frames(folder, names, None, video.rate and video.rate / chosen.step, (("video", video.sentence),), video.assumed)
+        recorded = request.frame_rate or video.rate
+        return _Frames(folder, names, None, recorded and recorded / chosen.step, (("video", video.sentence),), video.assumed)
     found = select(request.source, Selection(images=request.images, mask=request.mask))
     if found.ambient is not None:
         raise RequestError(f"{request.source}: {found.ambient} is an image of ambient light: take dark into the plan instead, or choose "
@@ -127,7 +126,7 @@ def _frames(request: InterleavedImport, folder: Path) -> _Frames:
             raise RequestError(f"{request.source}: has {len(names)} frames, 0 to {len(names) - 1}, and --frames asks for {request.frames}")
         names = names[chosen.first:None if chosen.last is None else chosen.last + 1:chosen.step]
     said = f"{len(names)} of {len(found.frames)} images in their order, {names[0]} to {names[-1]}"
-    return _Frames(request.source, names, found.mask, None, (("frames", said),), ())
+    return _Frames(request.source, names, found.mask, request.frame_rate and request.frame_rate / chosen.step, (("frames", said),), ())
 
 
 def _count(names: Sequence[str], length: int, closed: bool, request: InterleavedImport) -> int:

@@ -42,7 +42,7 @@ class Pyramid:
             whole: the file of the whole picture; None: there is none.
             small: takes the whole image [rows, cols, 3] of each zoom whose sides are at most `small_side`, with its number of halvings.
         """
-        self._size, self._tile, self._quality, self._small = (width, height), tile, quality, small
+        self._tile, self._quality, self._small = tile, quality, small
         self._pending: list[list[np.ndarray]] = [[] for _ in range(levels)]
         self._rows = [0] * levels  # that have been written
         self._kept: dict[int, list[np.ndarray]] = {k: [] for k in range(levels) if max(size_at(width, height, k)) <= small_side}

@@ -48,7 +48,8 @@ def read_e57(path: Path) -> Iterator[E57Scan]:
                     pose[:3, 3] = header.translation
                 yield E57Scan(_points(values), np.stack([values[name] for name in COLOURS], axis=1) if coloured else None, pose)
     except (pye57.libe57.E57Exception, ValueError, RuntimeError, KeyError) as error:
-        raise ResultError(f"{path}: is no E57 file that pye57 reads: {str(error).partition(chr(10))[0]}") from error
+        reason = str(error).partition("\n")[0]
+        raise ResultError(f"{path}: is no E57 file that pye57 reads: {reason}") from error
 
 
 def _points(values: dict[str, np.ndarray]) -> np.ndarray:

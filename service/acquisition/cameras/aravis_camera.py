@@ -152,13 +152,11 @@ class AravisCamera:
     def _pixels(self, buffer: int) -> np.ndarray:
         library = _library()
         assert library is not None
-        library.arv_buffer_get_status.argtypes = [c_void_p]
         if library.arv_buffer_get_status(buffer) != 0:
             raise NoPictureError("the picture came incomplete: check the network, its packet size and the cable")
         size = c_size_t()
-        library.arv_buffer_get_data.restype, library.arv_buffer_get_data.argtypes = c_void_p, [c_void_p, POINTER(c_size_t)]
         place = library.arv_buffer_get_data(buffer, byref(size))
-        width, height = (getattr(library, f"arv_buffer_get_image_{side}")(c_void_p(buffer)) for side in ("width", "height"))
+        width, height = library.arv_buffer_get_image_width(buffer), library.arv_buffer_get_image_height(buffer)
         kind = np.uint8 if self._bits == 8 else np.uint16
         channels, left = divmod(size.value // np.dtype(kind).itemsize, width * height)
         if channels not in (1, 3) or left:
@@ -178,9 +176,16 @@ class AravisCamera:
 
 @cache
 def _library() -> ctypes.CDLL | None:
-    """Return Aravis; None: it is not installed."""
+    """Return Aravis with the signatures of functions that take no error; None: it is not installed."""
     found = find_library(LIBRARY)
-    return None if found is None else ctypes.CDLL(found)
+    if found is None:
+        return None
+    library = ctypes.CDLL(found)
+    for name in ("arv_buffer_get_status", "arv_buffer_get_image_width", "arv_buffer_get_image_height"):
+        getattr(library, name).argtypes = [c_void_p]
+    library.arv_buffer_get_data.restype, library.arv_buffer_get_data.argtypes = c_void_p, [c_void_p, POINTER(c_size_t)]
+    library.g_object_unref.argtypes = [c_void_p]  # of GObject, which Aravis loads
+    return library
 
 
 def _call(name: str, result: Any, types: list[Any], *arguments: Any) -> Any:
@@ -200,7 +205,9 @@ def _call(name: str, result: Any, types: list[Any], *arguments: Any) -> Any:
 
 
 def _unref(thing: int) -> None:
-    ctypes.CDLL(find_library("gobject-2.0")).g_object_unref(c_void_p(thing))
+    library = _library()
+    assert library is not None
+    library.g_object_unref(thing)
 
 
 def open_camera(detail: str, setup: Setup) -> AravisCamera:

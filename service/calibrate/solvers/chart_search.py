@@ -7,6 +7,7 @@ Source: OpenCV's module mcc without its neural network, which groups quadrilater
 import cv2
 import numpy as np
 
+from service.calibrate.solvers.chart_reference import GRIDS
 from stage.errors import CalibrationError
 
 KINDS = {24: cv2.mcc.MCC24, 140: cv2.mcc.SG140}
@@ -51,7 +52,7 @@ def find_chart(picture: np.ndarray, patches: int) -> np.ndarray:
         if detector.process(np.ascontiguousarray(shown), 1):
             outlines = np.array(detector.getBestColorChecker().getColorCharts()).reshape(-1, 4, 2)
             centres = (outlines.mean(axis=1) + 0.5) * max(step, 1.0)
-            columns = {24: 6, 140: 14}[patches]
+            columns = GRIDS[patches][0]
             return centres[[0, columns - 1, patches - 1, patches - columns]].astype(np.float64)
     raise CalibrationError("no chart is found in the picture: give the centres of its corner patches as --corners")
 
