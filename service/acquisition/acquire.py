@@ -18,6 +18,9 @@ from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
 from service.acquisition.plans.shots import TRACKING, Shot, shots_of
 from service.acquisition.projector import Projector
+from service.acquisition.projector_response import measure, shown_through
+from service.calibrate.response import Response
+from service.depth.patterns.projection import stored
 from service.errors import RequestError
 from service.play.play import ended_by_signals
 from service.reporting.progress import Progress, Timings
@@ -27,6 +30,7 @@ from stage.files import write_text
 from stage.formats import images
 from stage.importers.layout import color_space_of
 from stage.patterns.base import UniformPattern
+from stage.patterns.codes import draw
 from stage.rig.controllers import Controllers
 from stage.rig.cues import rig_digest
 from stage.rig.rig import Rig, read_rig
@@ -89,9 +93,13 @@ class Acquisition:
         """
         self._request, self._ask, self._tell, self._timings = request, ask, tell, Timings(progress)
         self._projector: Projector | None = None
+        self.response: Response | None = None
+        """The response of the projector, once the plan has measured it."""
         self.rig: Rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
         self.plan: Plan = read_plan(request.plan)
         self.shots: tuple[Shot, ...] = shots_of(self.plan, self.rig, request.projector)
+        if request.gamma != 1 and any(shot.grey is not None for shot in self.shots):
+            raise RequestError(f"--gamma: is {request.gamma:g}, and the plan measures the projector's response: leave one of them out")
         head = {"plan": self.plan.model_dump(mode="json", by_alias=True), "rig": rig_digest(self.rig), "camera": request.camera}
         self.journal = Journal(request.out, head)
         self._camera: Camera = open_camera(request.camera, Setup(
@@ -129,7 +137,7 @@ class Acquisition:
                 self._adopt()
                 self._withdraw()
                 if 0 < len(self.journal.taken) < len(self.shots):
-                    self._compare(lights)
+                    self._compare(lights, stopping)
                 self._timings.stage("capture", len(self.shots))
                 for number, shot in enumerate(self.shots, start=1):
                     if shot.key not in self.journal.taken:
@@ -151,8 +159,8 @@ class Acquisition:
     def _open_projector(self) -> None:
         """Serve the projector's page if a pattern is still to be shown, and wait for its window."""
         request = self._request
-        if request.projector is not None and any(shot.pattern is not None and shot.key not in self.journal.taken for shot in self.shots):
-            self._projector = Projector(request.projector, request.projector_port, request.gamma, request.timeout, request.out / SPOOL)
+        if request.projector is not None and any(shot.projected and shot.key not in self.journal.taken for shot in self.shots):
+            self._projector = Projector(request.projector, request.projector_port, request.timeout, request.out / SPOOL)
             self._tell(f"open {self._projector.address} in a browser on the projector's screen, and click into it")
             self._projector.wait()
 
@@ -160,7 +168,19 @@ class Acquisition:
         """Switch the lamps of a shot, and show its pattern; other shots find the projector black."""
         lights.set(shot.levels)
         if self._projector is not None:
-            self._projector.show(shot.pattern or UniformPattern(code="black"))
+            self._projector.show(self._image(shot))
+
+    def _image(self, shot: Shot) -> np.ndarray:
+        """Return what the projector shows for a shot, [rows, cols] uint8; its response is measured when the first pattern is shown."""
+        assert self._request.projector is not None
+        if shot.grey is not None:
+            return stored(np.full(self._request.projector[::-1], shot.grey), 8, 1.0)
+        if shot.pattern is not None and self.response is None and (greys := [each for each in self.shots if each.grey is not None]):
+            pictures = {each.grey: self._request.out / self.journal.taken[each.key]["file"] for each in greys
+                        if each.grey is not None and each.key in self.journal.taken}
+            self.response = measure(pictures, self._request.color_space, self._request.saturation or FULL_SCALE)
+        levels = draw(shot.pattern or UniformPattern(code="black"), self._request.projector)
+        return stored(levels, 8, self._request.gamma) if self.response is None else shown_through(self.response, levels)
 
     def _recall(self) -> None:
         """Take note of the pictures that an earlier run has taken."""
@@ -191,17 +211,20 @@ class Acquisition:
         for key in self._request.retake:
             if key not in shots:
                 raise RequestError(f"--retake {key}: the plan has no such picture: its last one is {self.shots[-1].key}")
+            if shots[key].grey is not None and any(shot.pattern is not None and shot.key in self.journal.taken for shot in self.shots):
+                raise RequestError(f"--retake {key}: patterns have been shown by the response that it measured: begin a new capture")
             if key in self.journal.taken:
                 self.journal.picture(key, "rejected", {**self._files.withdraw(shots[key], self.journal.taken[key], 0), "faults": []})
                 self.judge.forget(shots[key])
                 self.faults.pop(key, None)
 
-    def _compare(self, lights: Lights) -> None:
+    def _compare(self, lights: Lights, stopping: threading.Event) -> None:
         """Take the last tracking picture of an earlier run again, or else its last picture, and refuse to go on if something has moved."""
         there = [shot for shot in self.shots if shot.key in self.journal.taken]
         shot = next((shot for shot in reversed(there) if shot.name.endswith(TRACKING)), there[-1])
         self._light(shot, lights)
-        time.sleep(self.plan.settle_s)
+        if stopping.wait(self.plan.settle_s):
+            return
         try:
             picture = self._camera.take(shot.exposure_s)
         except NoPictureError as error:
@@ -310,7 +333,10 @@ class Acquisition:
         text = report(self._request, inputs=inputs,
                       rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots), pictures=len(self.journal.taken),
                       missing=missing, faults=[fault._asdict() for fault in faults],
-                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own, seconds=self._timings.close())
+                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own,
+                      projector_response=None if self.response is None else {
+                          "gamma": float(f"{self.response.gamma:.4g}"), "spread": float(f"{self.response.spread:.3g}"),
+                          "values": [float(f"{value:.7g}") for value in self.response.values]}, seconds=self._timings.close())
         write_text(self._request.out / REPORT_FILE, text)
 
 

@@ -78,6 +78,8 @@ class CaptureFiles:
             if shot.name == FLAT:
                 flat = name
                 continue
+            if shot.grey is not None:
+                continue
             names.append(name)
             frames.append({"image": name, "light": shot.light, "pattern": shot.pattern, "exposure_s": shot.exposure_s})
         if not frames:

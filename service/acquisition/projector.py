@@ -5,16 +5,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import uvicorn
 from fastapi import FastAPI, Query, Response
 from fastapi.responses import FileResponse
 
-from service.depth.patterns.projection import stored
 from service.errors import RequestError
 from service.twin.local_page import HEADERS, page_address, page_socket
 from stage.files import replacing
 from stage.formats.images import write_png
-from stage.patterns.codes import Pattern, draw
 
 STATIC = Path(str(files("service"))) / "acquisition" / "static"
 POLL_S = 10.0
@@ -24,20 +23,19 @@ POLL_S = 10.0
 class Projector:
     """Shows patterns through a page that is served on the loopback."""
 
-    def __init__(self, resolution: tuple[int, int], port: int, gamma: float, timeout_s: float, spool: Path) -> None:
+    def __init__(self, resolution: tuple[int, int], port: int, timeout_s: float, spool: Path) -> None:
         """Serve the page; patterns are shown once it is open.
 
         Args:
             resolution: width and height of the projector in pixels.
             port: of the page; 0: any free one.
-            gamma: of the projector: a level of linear light is shown as level^(1/gamma).
             timeout_s: the longest time until a pattern has been painted.
             spool: a folder for the image that is shown.
 
         Raises:
             RequestError: the port is in use.
         """
-        self._resolution, self._gamma, self._timeout, self._image = resolution, gamma, timeout_s, spool / "pattern.png"
+        self._resolution, self._timeout, self._image = resolution, timeout_s, spool / "pattern.png"
         self._changed = threading.Condition()
         self._number, self._shown, self._closing = 0, 0, False
         self._window: tuple[int, int] | None = None
@@ -66,14 +64,14 @@ class Projector:
         raise RequestError(f"--projector: the window of {self.address} has {width}x{height} pixels, the projector {columns}x{rows}: "
                            f"{advice}")
 
-    def show(self, pattern: Pattern) -> None:
-        """Show a pattern, and return when the page has painted it.
+    def show(self, levels: np.ndarray) -> None:
+        """Show an image, [rows, cols] uint8 as the projector gets it, and return when the page has painted it.
 
         Raises:
             RequestError: it has not painted it in time.
         """
         with replacing(self._image, flush=False) as temporary:
-            write_png(temporary, stored(draw(pattern, self._resolution), 8, self._gamma), srgb=False)
+            write_png(temporary, levels, srgb=False)
         with self._changed:
             self._number += 1
             self._changed.notify_all()

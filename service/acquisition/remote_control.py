@@ -19,7 +19,7 @@ from service.acquisition.journal import JOURNAL_FILE, lines_of, record
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.live_view import LiveView
 from service.acquisition.meter import PICTURE_FILE
-from service.acquisition.plans.plan import NAMED, Plan, read_plan
+from service.acquisition.plans.plan import NAMED, Plan, needs_projector, read_plan
 from service.acquisition.plans.shots import FLAT, Shot, shots_of
 from service.acquisition.preview import PREVIEW_FILE
 from service.errors import RequestError
@@ -38,6 +38,8 @@ from stage.rig.rig import read_rig
 
 NAME = r"\w[\w-]{0,63}"
 """A name of a capture, which is that of its folder."""
+CALIBRATIONS = {"ball": {"mirror-ball": "mirror-ball", "grey-ball": "grey-ball"}, "chart": {"chart": "chart"}}
+"""For each step of what belongs to a capture, the kinds of `relit calibrate` by the folder of their pictures."""
 SPOOL = ".live"
 """The folder of live pictures, in that of the captures."""
 LINES = 40
@@ -67,7 +69,7 @@ class RemoteControl:
                  "--projector-port": projector_port}
         self._words = [str(word) for option, value in given.items() if value is not None for word in (option, value)]
         self._patterns = () if self._projector is None else tuple(map(str, PatternCode))
-        self._plans = (*(name for name in NAMED if name not in tuple(PatternCode)), *self._patterns)
+        self._plans = tuple(name for name in NAMED if self._projector is not None or not needs_projector(NAMED[name]))
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._terminal = -1
@@ -77,6 +79,8 @@ class RemoteControl:
         self._name, self._plan, self._metering = "", "", False
         self._shots: tuple[Shot, ...] = ()
         self._live: LiveView | None = None
+        self._calibrating: str | None = None
+        self._calibrated: dict[tuple[str, str], int] = {}  # when the pictures had been taken that a step has calibrated
 
     def described(self) -> dict[str, Any]:
         """Return the name of the rig, its lamps with their directions, the names of plans, and whether the camera has a live view."""
@@ -133,11 +137,25 @@ class RemoteControl:
                 os.close(self._terminal)
             self._terminal, terminal = os.openpty()  # the program asks a person where its input is a terminal
             try:
-                self._process = subprocess.Popen([sys.executable, "-m", "service.cli.main", "capture", *words], stdin=terminal, text=True,
-                                                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
+                self._run("capture", *words, terminal=terminal)
             finally:
                 os.close(terminal)
-            threading.Thread(target=self._listen, args=[self._process], name="relit-set", daemon=True).start()
+
+    def calibrate(self, step: str) -> None:
+        """Measure the lights by the ball, or the colours by the chart, that belongs to the capture that is shown, and write its manifest.
+
+        Raises:
+            RequestError: a capture is running, or there is no such calibration.
+        """
+        with self._lock:
+            self._refuse_beside_another()
+            kind, source = self._calibrations().get(step, ("", Path()))
+            if not kind or self._version() is None:
+                raise RequestError(f"step: {self._name} has all its pictures and those of a ball or a chart before it is calibrated: "
+                                   f"{step!r} is not there")
+            self._lines.clear()
+            self._calibrating = step
+            self._run("calibrate", kind, str(source), "--apply-to", str(self._capture))
 
     def confirm(self) -> None:
         """Tell the capture that a person has done what it asked for."""
@@ -149,7 +167,6 @@ class RemoteControl:
         with self._lock:
             if self._process is not None and self._running():
                 self._process.send_signal(signal.SIGINT)
-                self._answer()  # nothing else ends the wait for a person
 
     def look(self, on: bool) -> None:
         """Begin or end the live view.
@@ -196,12 +213,13 @@ class RemoteControl:
         shots = [{"shot": shot.key, "step": _step_of(shot), "lamp": shot.lamp, "taken": shot.key in taken,
                   "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
-        whole = not running and self._shots and len(taken) == len(self._shots) and (self._capture / FILE_NAME).exists()
-        live = self._live
+        live, version = self._live, self._version()
         return {"name": self._name, "plan": self._plan, "running": running, "metering": self._metering and running, "prompt": self._prompt,
                 "code": self._code(), "projector": self._address if running else None,
                 "shots": shots, "files": found, "lines": list(self._lines), "folder": str(self._capture),
-                "version": str((self._capture / JOURNAL_FILE).stat().st_mtime_ns) if whole else None,
+                "version": version, "calibrating": self._calibrating if running else None,
+                "calibrations": {step: version is not None and self._calibrated.get((self._name, step)) == self._taken_at()
+                                 for step in self._calibrations()},
                 "captures": sorted(path.parent.name for path in self._folder.glob(f"*/{JOURNAL_FILE}")),
                 "live": None if live is None else live.state()}
 
@@ -231,6 +249,30 @@ class RemoteControl:
         self._name, self._plan, self._metering = name, plan, False
         self._lines.clear()
         self._process = self._prompt = self._address = None
+
+    def _run(self, *words: str, terminal: int | None = None) -> None:
+        """Start a command, whose lines are listened to."""
+        self._process = subprocess.Popen([sys.executable, "-m", "service.cli.main", *words], text=True,
+                                         stdin=subprocess.DEVNULL if terminal is None else terminal, stdout=subprocess.PIPE,
+                                         stderr=subprocess.STDOUT, start_new_session=True)
+        threading.Thread(target=self._listen, args=[self._process], name="relit-set", daemon=True).start()
+
+    def _version(self) -> str | None:
+        """Return a word that is another one when the capture is; None where not all of its pictures are there, or it is being made."""
+        taken: dict[str, dict[str, Any]] = {}
+        for line in lines_of(self._capture):
+            record(taken, line)
+        if self._running() or not self._shots or len(taken) < len(self._shots) or not (self._capture / FILE_NAME).exists():
+            return None
+        return f"{self._taken_at()}-{(self._capture / FILE_NAME).stat().st_mtime_ns}"
+
+    def _taken_at(self) -> int:
+        return (self._capture / JOURNAL_FILE).stat().st_mtime_ns
+
+    def _calibrations(self) -> dict[str, tuple[str, Path]]:
+        """Return the kind of `relit calibrate`, and the capture that it reads, of each step that belongs to the capture that is shown."""
+        return {step: (kind, folder) for step, kinds in CALIBRATIONS.items() for name in (self._name, f"{self._name}-{step}")
+                for place, kind in kinds.items() if self._name and ((folder := self._folder / name / place) / FILE_NAME).exists()}
 
     def _answer(self) -> None:
         if self._prompt is not None and self._running():
@@ -264,7 +306,9 @@ class RemoteControl:
                 self._lines.append(text)
                 if text.startswith(PLEASE) and (address := re.search(r"http://\S+", text)) is not None:
                     self._address = address[0]
-        process.wait()
+        if process.wait() == 0 and self._calibrating is not None:
+            self._calibrated[self._name, self._calibrating] = self._taken_at()
+        self._calibrating = None
 
 
 def _named(kind: str, sentence: str) -> str:

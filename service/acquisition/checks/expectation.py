@@ -91,6 +91,6 @@ def comparable(shot: Shot, other: Shot) -> bool:
 
 def same_kind(shot: Shot, other: Shot) -> bool:
     """Return whether the picture of a shot says what that of another one should be."""
-    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.pattern is not None:
+    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.projected:
         return False
     return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)

@@ -35,6 +35,8 @@ LEAST_LIGHT = 0.05
 """A lamp is judged if it gives, or should give, this part of the light that lamps give on the average."""
 UNLIT_PART = 0.03
 """A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
+GLOW_GAIN = 2.0
+"""A block reads more than in the dark if it is above it by more than this factor of the most that one is below it: noise is symmetric."""
 SAME_PART = 0.15
 """Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
 LEAST_MISFIT, AGREEMENT_WEIGHT = 1e-4, 4.0
@@ -89,8 +91,10 @@ class Judge:
             return [Fault(shot.key, FaultKind.DOUBLED, f"is the picture of {doubled} again")]
         if seen.sample.digest is not None:
             self._digests[seen.sample.digest] = shot.key
-        found = [*self._exposure_faults(seen), *self._faults(seen, self._others(seen, self._sound()))]
-        return found[:1]
+        found = [*self._exposure_faults(seen), *self._faults(seen, self._others(seen, self._sound()))][:1]
+        if found and found[0].kind is FaultKind.UNLIT and self._glows(seen):
+            return []  # as behind the object: all pictures together tell such a lamp from one that failed
+        return found
 
     def accept(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float, faults: Sequence[Fault] = ()) -> None:
         """Take note of the picture that a shot has from now on, with the faults that were found when it came."""
@@ -280,6 +284,14 @@ class Judge:
         used = self._expectation.weights(seen, self._others(seen, keys))
         return used is None or any(each.shot.key == other for _, each in used)
 
+    def _glows(self, seen: Seen) -> bool:
+        """Return whether a picture under a lamp reads more than the dark one somewhere; False without a dark one."""
+        dark = self._dark(seen.shot)
+        if seen.shot.lamp is None or isinstance(dark, float):
+            return False
+        above = seen.sample.blocks - dark
+        return bool(above.max() > GLOW_GAIN * -above.min())
+
     def _dark(self, shot: Shot) -> np.ndarray | float:
         """Return the mean picture without any lamp, [blocks]; 0 where there is none."""
         dark = [each.sample.blocks for each in self._seen.values()
@@ -297,7 +309,7 @@ def _agreement(differences: np.ndarray, cosines: np.ndarray) -> float:
 
 
 def _is_dark(shot: Shot) -> bool:
-    return shot.pattern is None and not shot.levels.any()
+    return not shot.projected and not shot.levels.any()
 
 
 def _ambient(shot: Shot, more: float) -> Fault:

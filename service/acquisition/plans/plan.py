@@ -1,5 +1,6 @@
 """The plan of a capture, plan.json with schema relit.plan/1: the sequences of pictures that are taken one after another."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -84,8 +85,17 @@ class PatternSequence(Sequence):
     """The projector coordinate to code."""
 
 
-AnySequence = Annotated[OlatSequence | GradientSequence | DarkSequence | FlatSequence | BallSequence | ChartSequence | PatternSequence,
-                        Field(discriminator="take")]
+class ResponseSequence(Sequence):
+    """Pictures of even grey that a projector shows, which measure its response: the patterns after them are shown in linear light."""
+
+    take: Literal["projector-response"]
+    """The kind of the sequence."""
+    levels: Annotated[int, Field(ge=3, le=256)] = 17
+    """Number of levels, at even distances from black to full."""
+
+
+AnySequence = Annotated[OlatSequence | GradientSequence | DarkSequence | FlatSequence | BallSequence | ChartSequence | PatternSequence
+                        | ResponseSequence, Field(discriminator="take")]
 
 
 class Plan(Strict):
@@ -113,9 +123,15 @@ NAMED: dict[str, tuple[AnySequence, ...]] = {
     "mirror-ball": (BallSequence(take="mirror-ball", prompt="put the mirror ball in the place of the object"),),
     "grey-ball": (BallSequence(take="grey-ball", prompt="put the grey ball in the place of the object"),),
     "chart": (ChartSequence(take="chart", prompt="put the colour chart in the place of the object"),),
+    "projector-response": (ResponseSequence(take="projector-response"),),
     **{str(code): (PatternSequence(take="patterns", code=code),) for code in PatternCode},
 }
 """The sequences that a name stands for."""
+
+
+def needs_projector(sequences: Iterable[AnySequence]) -> bool:
+    """Return whether one of some sequences is shown by a projector."""
+    return any(isinstance(sequence, PatternSequence | ResponseSequence) for sequence in sequences)
 
 
 def read_plan(given: str) -> Plan:

@@ -16,6 +16,8 @@ from service.acquisition.plans.plan import (
     OlatSequence,
     PatternSequence,
     Plan,
+    ResponseSequence,
+    needs_projector,
 )
 from service.depth.patterns.projection import patterns_of
 from service.errors import RequestError
@@ -50,6 +52,8 @@ class Shot(NamedTuple):
     """The entry `light` of its frame; None: a pattern lights it, or it is the flat image."""
     pattern: Pattern | None = None
     """The entry `pattern` of its frame, and what the projector shows."""
+    grey: float | None = None
+    """The level, 0 to 1 of full, that the projector shows everywhere; of no frame. None: none."""
     exposure_s: float | None = None
     """The exposure time; None: the one that the camera has."""
     prompt: str | None = None
@@ -59,6 +63,11 @@ class Shot(NamedTuple):
     def key(self) -> str:
         """Return the name of the shot within the plan."""
         return f"{self.folder}/{self.name}" if self.folder else self.name
+
+    @property
+    def projected(self) -> bool:
+        """Return whether the projector lights the picture."""
+        return self.pattern is not None or self.grey is not None
 
 
 def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[Shot, ...]:
@@ -70,7 +79,7 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
     Raises:
         RequestError: the plan names a lamp that the rig lacks, shows patterns without a projector, or has no picture of the object.
     """
-    if not rig.lights and not all(isinstance(sequence, PatternSequence) for sequence in plan.sequences):
+    if not rig.lights and not all(needs_projector([sequence]) for sequence in plan.sequences):
         raise RequestError("the plan has pictures under lamps: give the file of the lamps, --rig rig.json")
     found: list[Shot] = []
     since = 0  # shots of lamps since the first tracking frame
@@ -91,6 +100,9 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
             found[before] = found[before]._replace(prompt=sequence.prompt)
     if since:
         found.append(found[next(index for index, shot in enumerate(found) if shot.name == TRACKING)]._replace(prompt=None))
+    first = next((index for index, shot in enumerate(found) if shot.pattern is not None), len(found))
+    if any(shot.grey is not None for shot in found[first:]):
+        raise RequestError("the plan measures the projector's response after patterns that are shown through it: put it before them")
     if sum(shot.name == FLAT for shot in found) > 1:
         raise RequestError("the plan has several flat images: a capture has one, so give one sequence flat with one exposure")
     return tuple(_named(found))
@@ -113,9 +125,13 @@ def _sequence(sequence: AnySequence, rig: Rig, projector: tuple[int, int] | None
             yield Shot(FLAT, "", full)
         case ChartSequence():
             yield Shot("chart", "chart", full, light=FullLight(type="full"))
+        case (PatternSequence() | ResponseSequence()) if projector is None:
+            raise RequestError(f"{where}: shows patterns: give the pixels of the projector, --projector 1280x800")
+        case ResponseSequence():
+            for level in np.linspace(0, 1, sequence.levels).tolist():
+                yield Shot("grey", sequence.take, dark, grey=level)
         case PatternSequence():
-            if projector is None:
-                raise RequestError(f"{where}: shows patterns: give the pixels of the projector, --projector 1280x800")
+            assert projector is not None
             try:
                 patterns = patterns_of(PatternsRequest(code=sequence.code, axis=sequence.axis, projector=projector, out=Path()))
             except ValueError as error:

@@ -1,9 +1,12 @@
 """relit capture: a capture taken on the set."""
 
 import math
+import select
 import shlex
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import typer
 
@@ -17,6 +20,8 @@ from service.requests.solve import SolveRequest
 
 MAPS, ASSET = "maps", "asset.usdz"
 """Where the results of --then lie in the capture."""
+POLL_S = 0.1
+"""The longest time until Ctrl-C ends the wait for a person."""
 
 
 def register(app: typer.Typer) -> None:
@@ -27,7 +32,8 @@ def register(app: typer.Typer) -> None:
 def _capture(request: AcquireRequest) -> None:
     from service.acquisition.acquire import Acquisition, refuse_to_ask
 
-    ask = _ask if sys.stdin.isatty() else refuse_to_ask
+    stop = threading.Event()
+    ask = partial(_ask, stop) if sys.stdin.isatty() else refuse_to_ask
     if request.preview:
         _meter(request, ask)
         return
@@ -37,11 +43,14 @@ def _capture(request: AcquireRequest) -> None:
             from service.cli.sending import Sender
 
             sender = Sender(request.to, request.out)
-        result = Acquisition(request, ask, _tell, bar).run(receiver=sender)
+        acquisition = Acquisition(request, ask, _tell, bar)
+        result = acquisition.run(stop, sender)
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
         print(f"fault    {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
+    if acquisition.response is not None:
+        print(f"response that of the projector is near a gamma of {acquisition.response.gamma:.2f}; patterns are shown in linear light")
     print(f"capture  {result.path}")
     print(f"pictures {result.there} of {result.shots}, {result.taken} taken now; the lamps are dark")
     if result.there < result.shots:
@@ -121,11 +130,14 @@ def _commands(request: AcquireRequest, steps: Sequence[Then]) -> str:
     return " && ".join(shlex.join(map(str, words[step])) for step in steps)
 
 
-def _ask(what: str) -> None:
+def _ask(stop: threading.Event, what: str) -> None:
     from service.acquisition.lights.lights import THEN_ENTER
 
     _tell(f"{what}{THEN_ENTER}")
-    sys.stdin.readline()
+    while not stop.is_set():
+        if select.select([sys.stdin], [], [], POLL_S)[0]:
+            sys.stdin.readline()
+            return
 
 
 def _tell(what: str) -> None:

@@ -25,6 +25,9 @@ class Stage(Protocol):
     def start(self, name: str, plan: str, *, preview: bool, retake: Sequence[str]) -> None:
         """Start a capture."""
 
+    def calibrate(self, step: str) -> None:
+        """Measure lights or colours by a ball or a chart that was taken."""
+
     def look(self, on: bool) -> None:
         """Begin or end the live view."""
 
@@ -66,6 +69,14 @@ class Named(BaseModel):
     name: str
 
 
+class Step(BaseModel):
+    """What a capture is to be calibrated by: ball or chart."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    step: str
+
+
 class Live(BaseModel):
     """Whether the live view is to be seen."""
 
@@ -105,6 +116,12 @@ def run(stage: Given, given: Run) -> None:
 def show(stage: Given, given: Named) -> None:
     """Show a capture that was taken before."""
     stage.open(given.name)
+
+
+@router.post("/calibrate", status_code=204)
+def calibrate(stage: Given, given: Step) -> None:
+    """Measure lights or colours by a ball or a chart that was taken."""
+    stage.calibrate(given.step)
 
 
 @router.post("/look", status_code=204)

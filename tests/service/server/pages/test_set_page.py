@@ -165,6 +165,9 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         page.get_by_role("button", name="0006_light_004", exact=True).click()
         page.locator("#picture[data-shown*='0006_light_004']").wait_for()
 
+        page.get_by_role("button", name="Colour chart: Correct the colours").press("Enter")
+        page.locator("#problem", has_text="no chart is found").wait_for()
+
         mend.press("Enter")
         page.locator("tr[data-shot='0005_light_003']", has_text="good, taken 4 times").wait_for()
         page.locator("#now", has_text="0 with a fault").wait_for()

@@ -39,7 +39,7 @@ function nextOf(state, outcome, faulty) {
   const total = state.shots.length;
   const there = state.shots.filter((shot) => shot.taken).length;
   if (state.running) {
-    const words = state.prompt !== null ? "A person is asked to do something." : state.metering ? "Metering the light …" : `Taking the pictures: ${there} of ${total} …`;
+    const words = state.prompt !== null ? "A person is asked to do something." : state.metering ? "Metering the light …" : state.calibrating !== null ? "Measuring …" : `Taking the pictures: ${there} of ${total} …`;
     return { words, offered: ["stop"], prominent: state.prompt === null ? "stop" : null };
   }
   if (!begun(state)) {

@@ -1,19 +1,21 @@
 /** The list of what belongs to a capture: what is there, what is planned, and what its absence means. */
 
+import { attempt, post } from "../api.js";
 import { byId, element } from "../element.js";
 import { fill, open, planned, start } from "./plan_form.js";
 
 const STEPS = [
   { id: "dark", name: "Dark", takes: ["dark"], lacks: "What the camera reads in the dark stays in the pictures." },
   { id: "flat", name: "White card", takes: ["flat"], lacks: "What lens and lamps darken towards the edges stays in the pictures." },
-  { id: "ball", name: "Ball", takes: ["mirror-ball", "grey-ball"], alone: true, lacks: "The directions of the lights are those of the rig file." },
-  { id: "chart", name: "Colour chart", takes: ["chart"], alone: true, lacks: "The colours are those of the camera." },
+  { id: "ball", name: "Ball", takes: ["mirror-ball", "grey-ball"], alone: true, lacks: "The directions of the lights are those of the rig file.", use: "Measure the lights", used: "The lights are measured by it." },
+  { id: "chart", name: "Colour chart", takes: ["chart"], alone: true, lacks: "The colours are those of the camera.", use: "Correct the colours", used: "The colours are corrected by it." },
 ];
+const PROJECTOR = { id: "projector-response", name: "Projector", takes: ["projector-response"], lacks: "The projector is taken to give light in proportion to what it is sent." };
 const OBJECT = { id: "object", name: "Object", takes: ["olat"], lacks: "There is nothing to solve." };
 
 /** Return the sequences of a plan with a further one, in the order in which they are taken. */
 function withStep(sequences, step) {
-  const rank = (word) => (STEPS.findIndex(({ takes }) => takes.includes(word)) + 1) || STEPS.length + 1;
+  const rank = (word) => ([...STEPS, PROJECTOR].findIndex(({ takes }) => takes.includes(word)) + 1) || STEPS.length + 2;
   return [...sequences, step.takes[0]].sort((one, other) => rank(one) - rank(other)).join(",");
 }
 
@@ -34,14 +36,17 @@ function stateOf(step, state, changed) {
   const alone = `${name}-${step.id}`;
   const button = (words, action) => element("button", { type: "button", class: "quiet", disabled: state.running, "aria-label": `${step.name}: ${words}`, onclick: action }, words);
   const plan = (words, values) => button(words, () => { fill(values); changed(); });
+  const usable = state.name === name && state.version !== null && step.id in state.calibrations;
+  const done = usable && state.calibrations[step.id] ? ` ${step.used}` : "";
+  const calibrating = usable && !done ? button(step.use, () => attempt(() => post("/set/calibrate", { step: step.id }))) : null;
   if (there > 0 || (begun && isPlanned)) {
-    const words = `${there} of ${shots.length} ${shots.length === 1 ? "picture" : "pictures"}${faulty ? `, ${faulty} with a fault` : ""}`;
-    return { mark: faulty ? "wrong" : there === shots.length ? "there" : "", words, button: null };
+    const words = `${there} of ${shots.length} ${shots.length === 1 ? "picture" : "pictures"}${faulty ? `, ${faulty} with a fault` : ""}.`;
+    return { mark: faulty ? "wrong" : there === shots.length ? "there" : "", words: words + done, button: calibrating };
   }
   if (isPlanned) {
     return { mark: "", words: "In the plan.", button: sequences.length > 1 ? plan("Leave out", { name, plan: sequences.filter((word) => !step.takes.includes(word)).join(",") }) : null };
   }
-  if (state.captures.includes(alone)) return { mark: "there", words: `There, as the capture ${alone}.`, button: button("Show", () => open(alone)) };
+  if (state.captures.includes(alone)) return { mark: "there", words: `There, as the capture ${alone}.${done}`, button: calibrating ?? button("Show", () => open(alone)) };
   if (!begun) return { mark: "", words: step.lacks, button: plan("Add", { name, plan: withStep(sequences, step) }) };
   return step.alone ? { mark: "", words: step.lacks, button: button("Take it now", () => start({ name: alone, plan: step.takes[0] })) }
     : { mark: "", words: step.lacks, button: plan("New capture with it", { name: following(name, state.captures), plan: withStep(sequences, step) }) };
@@ -53,7 +58,7 @@ function stateOf(step, state, changed) {
  * @param {function(): void} changed Called when the plan has been changed here.
  */
 export function mountSteps(patterns, changed) {
-  const list = [...STEPS, { ...OBJECT, takes: ["olat", "gradients", "polarised", ...patterns] }];
+  const list = [...STEPS, ...(patterns.length ? [PROJECTOR] : []), { ...OBJECT, takes: ["olat", "gradients", "polarised", ...patterns] }];
   return (state) => {
     const focused = byId("steps").contains(document.activeElement) ? document.activeElement.closest("li").dataset.step : null;
     byId("steps").replaceChildren(...list.map((step) => {
