@@ -3,7 +3,7 @@
 import shlex
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -114,13 +114,13 @@ class Acquisition:
         self.retaken: list[Fault] = []
         """The faults of pictures that were taken again, and of pictures that came late."""
         self._own: list[float] = []
-        self._receiver: Receiver | None = None
+        self._receivers: list[Receiver] = []
 
-    def run(self, stop: threading.Event | None = None, receiver: Receiver | None = None) -> AcquireResult:
+    def run(self, stop: threading.Event | None = None, receivers: Sequence[Receiver] = ()) -> AcquireResult:
         """Take all pictures that are missing; ends early when `stop` is set or the program is interrupted, with the lamps dark.
 
         Args:
-            receiver: gets the name of each picture of the capture itself; opened before a lamp is switched.
+            receivers: get the name of each picture of the capture itself; opened before a lamp is switched.
 
         Raises:
             RequestError: the lamps or the camera do not answer any more; the pictures that were taken are kept.
@@ -128,9 +128,9 @@ class Acquisition:
         with ended_by_signals(stop or threading.Event()) as stopping:
             lights = None
             try:
-                if receiver is not None:
+                for receiver in receivers:
                     receiver.open()
-                    self._receiver = receiver
+                    self._receivers.append(receiver)
                 self._recall()
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
                 self._open_projector()
@@ -147,10 +147,13 @@ class Acquisition:
                     self._timings.advance(number)
                 else:
                     self._review(lights, stopping)
+            except BaseException:
+                self._give_up()
+                raise
             finally:
                 self._close(lights)
-        if self._receiver is not None and len(self.journal.taken) < len(self.shots):
-            self._receiver.stop()
+        if len(self.journal.taken) < len(self.shots):
+            self._give_up()
         faults = tuple(fault for found in self.faults.values() for fault in found)
         self._report(faults)
         return AcquireResult(self._request.out, len(self._own), len(self.journal.taken), len(self.shots), faults, tuple(self.retaken),
@@ -296,9 +299,14 @@ class Acquisition:
         self._send(shot, new=True)
 
     def _send(self, shot: Shot, *, new: bool) -> None:
-        """Name the picture of a shot of the capture itself to the receiver, if there is one."""
-        if self._receiver is not None and not shot.folder:
-            self._receiver.send(self.journal.taken[shot.key]["file"], new=new)
+        """Name the picture of a shot of the capture itself to the receivers."""
+        for receiver in self._receivers if not shot.folder else ():
+            receiver.send(self.journal.taken[shot.key]["file"], new=new)
+
+    def _give_up(self) -> None:
+        """Tell the receivers that the capture has ended before its last picture."""
+        for receiver in self._receivers:
+            receiver.stop()
 
     def _review(self, lights: Lights, stopping: threading.Event) -> None:
         """Take those pictures again, the worst first, in which all of them together show a fault that none showed when it came."""

@@ -15,7 +15,7 @@ from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
 from service.viewing.held_out import KEY_LIGHTS, key_weights
 from stage.results.light_basis import layer_name, layer_types, numbers, write_facts, write_layers
-from stage.stack.ingest import TOP_EXPONENT
+from stage.stack.stack_file import TOP_EXPONENT
 
 DEFAULT_COUNT = 16
 

@@ -25,8 +25,8 @@ from service.viewing.transfer import COLS, FULL, ROWS, grid_directions, transfer
 from stage.capture.point_lights import DistantLights
 from stage.results.light_basis import numbers
 from stage.results.matte import Matte
-from stage.stack.ingest import TOP_EXPONENT
 from stage.stack.stack import Stack
+from stage.stack.stack_file import TOP_EXPONENT
 
 LEAST_LIGHTS = 4
 """The least number of lights for relighting: fewer do not surround any direction."""

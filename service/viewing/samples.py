@@ -18,8 +18,8 @@ from service.viewing.reduction import row_bands, step_within
 from service.viewing.result_layers import ResultLayers
 from stage.capture.point_lights import DistantLights, PlacedLights
 from stage.results.maps import LOBES, SurfaceMaps
-from stage.stack.ingest import TOP_EXPONENT
 from stage.stack.stack import Stack
+from stage.stack.stack_file import TOP_EXPONENT
 
 MOST_BYTES = 64_000_000
 """Most bytes of all samples; of larger images every second, third … pixel is taken in both directions."""

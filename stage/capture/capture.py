@@ -1,6 +1,6 @@
 """A capture folder: its manifest, and the checks of the files that the manifest names."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from stage.capture.camera import Camera
-from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
+from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, Light, OffLight, PointLight
 from stage.capture.manifest import FILE_NAME, Frame, Manifest, read_manifest
 from stage.colour import radiance as radiances
 from stage.colour.colour_spaces import is_linear
@@ -28,6 +28,12 @@ HEADER_THREADS = 8
 """The number of threads that read file headers while a capture is opened."""
 
 LightKind = TypeVar("LightKind", DistantLight, PointLight, ExtendedLight, GradientLight, EnvironmentLight, OffLight, FullLight)
+
+
+def source_places(lights: Sequence[Light | None]) -> list[int]:
+    """Return the places, in the frames of a capture, of those whose light is a measurement, as `Capture.sources` has them."""
+    kinds = (*SOURCES, FullLight) if any(isinstance(light, GradientLight) for light in lights) else SOURCES
+    return [index for index, light in enumerate(lights) if isinstance(light, kinds)]
 
 
 def check_same_pixels(path: Path, camera: Camera, capture: "Capture") -> None:
@@ -142,8 +148,8 @@ class Capture:
 
         In a capture with gradient frames a `full` frame is a measurement too, because gradient frames are compared with it.
         """
-        kinds = (*SOURCES, FullLight) if self.lit_by(GradientLight) else SOURCES
-        return [frame for frame in self.manifest.frames if isinstance(frame.light, kinds)]
+        frames = self.manifest.frames
+        return [frames[index] for index in source_places([frame.light for frame in frames])]
 
     @property
     def is_polarised(self) -> bool:

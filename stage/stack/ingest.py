@@ -6,10 +6,12 @@ import math
 import os
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,11 +24,11 @@ from stage.errors import ManifestError, storage
 from stage.files import replacing
 from stage.motion.tracking import Tracking
 from stage.stack import stack as stacks
-from stage.stack import stack_checksums
 from stage.stack.align import VERSION, Alignment, Warp
-from stage.stack.correction import CodedRadiance, Correction, Radiance
+from stage.stack.correction import Correction
 from stage.stack.fingerprint import Fingerprints
-from stage.stack.stack import CHANNELS, LIGHT_PAD, PIXEL_PAD, Stack
+from stage.stack.stack import Stack
+from stage.stack.stack_file import StackFile
 
 LAYOUT = 3
 """The version of the cache; a change of the layout or the arithmetic raises it, so that older caches are rebuilt."""
@@ -39,17 +41,21 @@ DECODE_BYTES = 2 << 30
 CODED_BYTES_PER_PIXEL, BYTES_PER_PIXEL, ALIGNED_BYTES_PER_PIXEL = 20, 40, 160
 """The bytes of a pixel while its image is looked up in a table (file, codes, a plane to write), while it is corrected (half and float RGB,
 masks, planes to write), and while it is warped."""
-LOOK_UP_CODES = 1 << 16
-"""Codes that are looked up at one time: their positions are half a megabyte, which stays in the second-level cache."""
-LARGEST_FACTOR = 126
-"""Exponents below this make a factor that is a normal float32, with which a product is exact; `ldexp` takes eight times as long."""
 FLOATING = {".exr", ".hdr"}
 """Suffixes of images without integers: no value of theirs is known to be clipped unless the capture says so."""
-TOP_EXPONENT = 15
-"""The brightest value of a light is stored in [2^14, 2^15): below 65504, the largest half, with 29 stops of normal values."""
+
+FINGERPRINTS = "files.json"
+"""The file of the content hashes in the folder of the cache."""
 
 FrameProgress = Callable[[int, int], None]
 """A function that is called after every frame with the count of decoded frames and the count of all frames."""
+
+
+class Begun(Protocol):
+    """A stack that was begun before all its images were there; stage.stack.early has it."""
+
+    def take(self, ingest: "Ingest", path: Path) -> tuple[StackFile, set[int]] | None:
+        """Move the file to a path, and return it with the lights whose planes are those of the frames; None where it is of no use."""
 
 
 @dataclass(frozen=True)
@@ -82,15 +88,16 @@ class Ingest:
         if not frames:
             raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
         folder = cache if cache is not None else capture.folder / CACHE_FOLDER
-        fingerprints = Fingerprints(capture.folder, folder / "files.json")
+        fingerprints = Fingerprints(capture.folder, folder / FINGERPRINTS)
         hint = "" if cache is not None else " (--cache names another folder for it)"
-        return cls(capture, frames, tracking, folder, hint, fingerprints, _key(capture, frames, tracking, fingerprints))
+        return cls(capture, frames, tracking, folder, hint, fingerprints, stack_key(capture, frames, tracking, fingerprints))
 
-    def stack(self, progress: FrameProgress | None = None) -> Stack:
+    def stack(self, progress: FrameProgress | None = None, early: "Begun | None" = None) -> Stack:
         """Return the stack from the cache, and build it first when the cache does not hold it.
 
         Args:
             progress: called after every decoded frame, or once with all frames when the cache holds the stack.
+            early: images that were decoded when they came; its file becomes that of the stack.
 
         Raises:
             ManifestError: a frame lies too far outside the tracking frames.
@@ -104,7 +111,7 @@ class Ingest:
         alignment = None if self.tracking is None else Alignment(self.capture, self.tracking, self.frames)
         with storage(f"make the stack cache{self.hint} in", self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-        built = _build(self.capture, self.frames, alignment, self.folder, self.key, progress)
+        built = _build(self, alignment, early if self.tracking is None else None, progress)
         self.fingerprints.remember()
         _drop_others(self.folder, self.key)
         return built
@@ -116,8 +123,8 @@ def open_stack(capture: Capture, *, cache: Path | None = None, tracking: Trackin
     return Ingest.of(capture, cache=cache, tracking=tracking).stack(progress)
 
 
-def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, fingerprints: Fingerprints) -> str:
-    """Return a hash of everything that the stored values depend on."""
+def stack_key(capture: Capture, frames: list[Frame], tracking: Tracking | None, fingerprints: Fingerprints) -> str:
+    """Return a hash of everything that the stored values of frames depend on."""
     manifest = capture.manifest
     off = [frame for frame, _ in capture.lit_by(OffLight)]
     corrections = [name for name in (manifest.dark, manifest.flat) if name is not None]
@@ -155,48 +162,36 @@ def _key(capture: Capture, frames: list[Frame], tracking: Tracking | None, finge
     return digest if tracking is None else ALIGNED + digest
 
 
-def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, folder: Path, key: str,
-           progress: FrameProgress | None) -> Stack:
+def _build(ingest: Ingest, alignment: Alignment | None, early: Begun | None, progress: FrameProgress | None) -> Stack:
+    capture, frames, folder, key = ingest.capture, ingest.frames, ingest.folder, ingest.key
     pixel_count = capture.camera.width * capture.camera.height
-    lights, pixels = stacks.padded(len(frames), LIGHT_PAD), stacks.padded(pixel_count, PIXEL_PAD)
-    scale = np.zeros(lights, dtype=np.float32)
-    saturated = np.zeros((lights // 8, pixels), dtype=np.uint8)
-    padding = 2 * (pixels - pixel_count)
-    checksums = np.full((CHANNELS, lights), stack_checksums.of_plane(np.zeros(pixel_count, dtype=np.float16), padding))
     correction = Correction.of(capture, full_scale=True)
-    done = 0
     lock = threading.Lock()
 
-    values = stacks.values_path(folder, key)
-    with replacing(values, flush=False) as temporary, open(temporary, "r+b") as file:  # the index has checksums of all planes
-        np.lib.format.write_array_header_1_0(
-            file, {"descr": "<f2", "fortran_order": False, "shape": (CHANNELS, lights, pixels)})
-        start = file.tell()
-        with storage("make the stack cache", values):
-            _reserve(file.fileno(), start + 2 * CHANNELS * lights * pixels)
+    with replacing(stacks.values_path(folder, key), flush=False) as temporary:  # the index has checksums of all planes
+        begun = None if early is None else early.take(ingest, temporary)
+        if begun is None:
+            with storage("make the stack cache", stacks.values_path(folder, key)):
+                begun = StackFile(temporary, len(frames), pixel_count), set()
+        file, there = begun
+        done = len(there)
 
         def take(light: int, warp: Warp | None) -> None:
             nonlocal done
-            radiance = correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light]))
-            planes, scale[light] = half_planes(radiance)
-            for channel, plane in enumerate(planes):
-                checksums[channel, light] = stack_checksums.of_plane(plane, padding)
-                _write_all(file.fileno(), plane, start + 2 * (channel * lights + light) * pixels)
+            file.write(light, correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light])))
             with lock:
-                if radiance.saturated is not None and radiance.saturated.any():
-                    saturated[light // 8, :pixel_count] |= radiance.saturated.reshape(-1).astype(np.uint8) << (light % 8)
                 done += 1
                 if progress is not None:
                     progress(done, len(frames))
 
-        batches: Iterable[tuple[Sequence[int], Warp | None]] = [(range(len(frames)), None)]
+        batches: Iterable[tuple[Sequence[int], Warp | None]] = [([light for light in range(len(frames)) if light not in there], None)]
         if alignment is not None:
             batches = alignment.batches(correction)
         bytes_per_pixel = ALIGNED_BYTES_PER_PIXEL
         if alignment is None:
             bytes_per_pixel = CODED_BYTES_PER_PIXEL if correction.has_codes(frames[0]) else BYTES_PER_PIXEL
         workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
-        with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
+        with closing(file), ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
             try:
                 for batch, warp in batches:
                     for job in [pool.submit(take, light, warp) for light in batch]:
@@ -204,79 +199,24 @@ def _build(capture: Capture, frames: list[Frame], alignment: Alignment | None, f
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-    names = tuple(frame.image for frame in frames)
     motion = None if alignment is None else alignment.statistics()
-    built = Stack(folder, key, names, scale, pixel_count, motion, clipped=dict(capture.clipped))
+    return _complete(capture, frames, folder, key, file, motion)
+
+
+def _complete(capture: Capture, frames: list[Frame], folder: Path, key: str, file: StackFile, motion: dict[str, Any] | None) -> Stack:
+    """Write the saturation bits and the index of a stack whose values are in place."""
+    pixel_count = capture.camera.width * capture.camera.height
+    built = Stack(folder, key, tuple(frame.image for frame in frames), file.scale, pixel_count, motion, clipped=dict(capture.clipped))
+    marked = bool(file.saturated.any())
     try:
-        if saturated.any():
+        if marked:
             with replacing(stacks.saturated_path(folder, key)) as temporary:
-                np.save(temporary, saturated)
-        stacks.write_index(built, checksums.ravel().tolist(), zlib.crc32(saturated.data) if saturated.any() else None)
+                np.save(temporary, file.saturated)
+        stacks.write_index(built, file.checksums.ravel().tolist(), zlib.crc32(file.saturated.data) if marked else None)
     except BaseException:
         stacks.remove(folder, key)
         raise
     return built
-
-
-def half_planes(radiance: Radiance | CodedRadiance) -> tuple[Iterator[np.ndarray], float]:
-    """Return the half planes of the channels of an image, [pixels] each, and the radiance of a stored 1.0, a power of two so that half
-    images keep their bits."""
-    values: np.ndarray
-    if isinstance(radiance, CodedRadiance):
-        codes, values = radiance.codes, radiance.values
-        least, most = int(codes.min()), int(codes.max())
-        # where codes are the bits of half values, `most` is the lowest value below zero if there is one, and this the highest
-        signed = int(codes.view(np.int16).max()) % len(values) if codes.dtype == np.uint16 else most
-        present = values[[least, most, signed]]
-    else:
-        codes, values = None, radiance.pixels
-        present = values
-    peak = max(float(present.max()), -float(present.min()))
-    exponent = math.frexp(peak)[1] - TOP_EXPONENT if peak else 0
-
-    def planes() -> Iterator[np.ndarray]:
-        if codes is None:
-            for channel in range(CHANNELS):
-                yield _scaled(values[..., channel], exponent).reshape(-1)
-            return
-        half = _scaled(values, exponent)
-        for channel in range(CHANNELS):
-            yield _look_up(half, codes[..., channel])
-
-    return planes(), math.ldexp(1.0, exponent)
-
-
-def _scaled(values: np.ndarray, exponent: int) -> np.ndarray:
-    """Return values divided by a power of two as half; those of codes that the image does not have may overflow."""
-    factor = np.float32(math.ldexp(1.0, -exponent)) if abs(exponent) < LARGEST_FACTOR else None
-    with np.errstate(over="ignore"):
-        return (np.ldexp(values, -exponent) if factor is None else values * factor).astype(np.float16)
-
-
-def _look_up(table: np.ndarray, codes: np.ndarray) -> np.ndarray:
-    """Return the entries of a table for codes, [codes], a piece at a time: NumPy makes 64-bit positions of all codes that it is given."""
-    flat = np.ascontiguousarray(codes).reshape(-1)
-    found = np.empty(len(flat), dtype=table.dtype)
-    for first in range(0, len(flat), LOOK_UP_CODES):
-        piece = slice(first, first + LOOK_UP_CODES)
-        np.take(table, flat[piece], out=found[piece], mode="clip")  # checks of the range would make a copy
-    return found
-
-
-def _write_all(descriptor: int, plane: np.ndarray, offset: int) -> None:
-    """Write a plane with pwrite; a full disk is an error here, whereas a write to a mapped file would kill the process."""
-    view = memoryview(plane.data).cast("B")
-    while view:
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written
-
-
-def _reserve(descriptor: int, size: int) -> None:
-    """Reserve the space of the stack before the first frame is decoded, so that a full disk is known at once."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(descriptor, 0, size)
-    else:
-        os.ftruncate(descriptor, size)
 
 
 def _drop_others(folder: Path, key: str) -> None:

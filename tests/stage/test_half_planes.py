@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from stage.stack.correction import CodedRadiance, Radiance
-from stage.stack.ingest import half_planes
+from stage.stack.stack_file import half_planes
 
 
 def stored(radiance):

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -17,6 +18,9 @@ from service.errors import USER_ERRORS, sentence
 from service.requests.acquire import AcquireRequest, Then
 from service.requests.export import ExportRequest
 from service.requests.solve import SolveRequest
+
+if TYPE_CHECKING:
+    from service.acquisition.early_ingest import EarlyIngest
 
 MAPS, ASSET = "maps", "asset.usdz"
 """Where the results of --then lie in the capture."""
@@ -31,6 +35,7 @@ def register(app: typer.Typer) -> None:
 
 def _capture(request: AcquireRequest) -> None:
     from service.acquisition.acquire import Acquisition, refuse_to_ask
+    from service.acquisition.early_ingest import EarlyIngest
 
     stop = threading.Event()
     ask = partial(_ask, stop) if sys.stdin.isatty() else refuse_to_ask
@@ -44,7 +49,8 @@ def _capture(request: AcquireRequest) -> None:
 
             sender = Sender(request.to, request.out)
         acquisition = Acquisition(request, ask, _tell, bar)
-        result = acquisition.run(stop, sender)
+        early = EarlyIngest(request.out, acquisition.shots)
+        result = acquisition.run(stop, [early] if sender is None else [sender, early])
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
@@ -56,7 +62,7 @@ def _capture(request: AcquireRequest) -> None:
     if result.there < result.shots:
         print("ended    before the last picture: run the same command again to go on")
     else:
-        _preview(request, result.taken)
+        _preview(request, early, result.taken)
         if sender is not None:
             print(f"sent     {sender.finish()}, at {request.to}", flush=True)
         if request.then and not result.faults:
@@ -87,13 +93,15 @@ def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
     print(f"meter    {found.path}, {found.picture}; the lamps are dark")
 
 
-def _preview(request: AcquireRequest, taken: int) -> None:
+def _preview(request: AcquireRequest, early: "EarlyIngest", taken: int) -> None:
     """Write the preview, unless there is one of the same pictures; a capture that has none is as good as others."""
     from service.acquisition.preview import PREVIEW_FILE, write_preview
 
     if taken == 0 and (request.out / PREVIEW_FILE).exists():
+        early.stop()
         return
     try:
+        early.finish()
         print(f"preview  {write_preview(request.out, request.device)}", flush=True)
     except USER_ERRORS as error:
         print(f"preview  none: {sentence(error)}", flush=True)

@@ -58,63 +58,63 @@ def install(app: FastAPI) -> None:
 
 
 @router.get("/")
-async def home() -> Response:
+async def home(request: Request) -> Response:
     """Show the object that was prepared last, to be lit; without one, the captures."""
-    return _page("home.html")
+    return _page(request, "home.html")
 
 
 @router.get("/captures")
-async def captures() -> Response:
+async def captures(request: Request) -> Response:
     """Show the captures and environments, and take new ones."""
-    return _page("captures.html")
+    return _page(request, "captures.html")
 
 
 @router.get("/captures/{capture}")
-async def capture(capture: CaptureId) -> Response:
+async def capture(request: Request, capture: CaptureId) -> Response:
     """Show a capture and its lights, and the forms of the jobs that begin with it."""
-    return _page("capture.html", identifier=capture, forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+    return _page(request, "capture.html", identifier=capture, forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
 
 
 @router.get("/jobs")
-async def jobs() -> Response:
+async def jobs(request: Request) -> Response:
     """Show the jobs as they change, and the forms of the jobs that begin with neither a capture nor maps."""
-    return _page("jobs.html", forms=[form_of(kind, model) for kind, model in FREE_JOBS.items()])
+    return _page(request, "jobs.html", forms=[form_of(kind, model) for kind, model in FREE_JOBS.items()])
 
 
 @router.get("/jobs/{job}")
-async def job(job: JobId) -> Response:
+async def job(request: Request, job: JobId) -> Response:
     """Show a job and its results, and the forms of the jobs that begin with its maps."""
-    return _page("job.html", identifier=job, forms=[form_of(kind, model) for kind, model in MAPS_JOBS.items()])
+    return _page(request, "job.html", identifier=job, forms=[form_of(kind, model) for kind, model in MAPS_JOBS.items()])
 
 
 @router.get("/light/{capture}")
-async def light(capture: CaptureId) -> Response:
+async def light(request: Request, capture: CaptureId) -> Response:
     """Relight a capture live."""
-    return _page("light.html", identifier=capture)
+    return _page(request, "light.html", identifier=capture)
 
 
 @router.get("/maps/{job}")
-async def maps(job: JobId) -> Response:
+async def maps(request: Request, job: JobId) -> Response:
     """Show the maps that a job has solved or decoded."""
-    return _page("maps.html", identifier=job)
+    return _page(request, "maps.html", identifier=job)
 
 
 @router.get("/asset/{job}")
-async def asset(job: JobId) -> Response:
+async def asset(request: Request, job: JobId) -> Response:
     """Show the asset that a job has exported."""
-    return _page("asset.html", identifier=job)
+    return _page(request, "asset.html", identifier=job)
 
 
 @router.get("/drive/{job}")
-async def drive(job: JobId) -> Response:
+async def drive(request: Request, job: JobId) -> Response:
     """Show the levels of the lamps that a job has driven."""
-    return _page("drive.html", identifier=job)
+    return _page(request, "drive.html", identifier=job)
 
 
 @set_router.get("/set")
-async def stage() -> Response:
+async def stage(request: Request) -> Response:
     """Take captures at the stage of this machine."""
-    return _page("set.html")
+    return _page(request, "set.html")
 
 
 @router.get("/favicon.ico")
@@ -123,5 +123,6 @@ async def icon(request: Request) -> Response:
     return Response((HOME / "static" / "icon.svg").read_bytes(), media_type="image/svg+xml", headers={"X-Content-Type-Options": "nosniff"})
 
 
-def _page(template: str, **values: Any) -> Response:
-    return Response(templates.get_template(template).render(**values), media_type="text/html", headers=HEADERS)
+def _page(request: Request, template: str, **values: Any) -> Response:
+    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), **values)
+    return Response(text, media_type="text/html", headers=HEADERS)

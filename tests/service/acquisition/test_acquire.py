@@ -205,8 +205,8 @@ def test_a_picture_with_a_fault_is_taken_again(tmp_path, stage, kind):
 
 @pytest.mark.long
 def test_faults_at_random_pictures_are_named_with_them_and_none_else(tmp_path, monkeypatch):
-    """Also those that follow one another, and those of pictures that are taken again; a late picture is missing first. A dropped one after a
-    late one of the same lamp would not be missed, as the late one stands for it."""
+    """Also those that follow one another, and those of pictures that are taken again; a late picture is missing first. A dropped
+    one after a late one of the same lamp would not be missed, as the late one stands for it."""
     for seed in range(20):
         random, folder = np.random.default_rng(seed), tmp_path / str(seed)
         folder.mkdir()

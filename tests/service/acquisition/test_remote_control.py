@@ -1,4 +1,4 @@
-"""What the page of the set asks for beside captures: the lights measured by a ball that was taken with a capture, the colours by a chart."""
+"""What the page of the set asks for beside captures: lights that the ball of a capture measures, and colours that its chart corrects."""
 
 import json
 from types import SimpleNamespace

@@ -10,8 +10,11 @@ from service.acquisition.checks.fault import FaultKind
 from service.acquisition.preview import PREVIEW_FILE, write_preview
 from service.errors import RequestError
 from service.relight.sheet import MARGIN, TITLE
+from stage.capture.capture import Capture
 from stage.formats import images
 from stage.results.maps import SurfaceMaps
+from stage.stack.early import EarlyStack
+from stage.stack.ingest import Ingest
 from tests.scenes.captures import make_scene, render, write_capture
 from tests.service.acquisition.test_acquire import Stage, controller
 
@@ -81,3 +84,18 @@ def test_a_capture_with_a_fault_is_not_solved(tmp_path, stage, relit):
 
 def test_steps_in_another_order_are_refused(tmp_path, stage, relit):
     assert "give solve, or solve,export" in relit.refused(*arguments(tmp_path, stage, tmp_path / "rig.json"), "--then", "export")
+
+
+def test_the_stack_is_there_when_the_last_picture_is(tmp_path, stage, relit, monkeypatch):
+    """Each picture was decoded while the next was taken: none is left, but one that was taken again in the end."""
+    decoded = []
+    monkeypatch.setattr(EarlyStack, "add", lambda early, capture, frame, light, add=EarlyStack.add: (
+        decoded.append(frame.image), add(early, capture, frame, light)))
+    left = []
+    monkeypatch.setattr(Ingest, "stack", lambda ingest, progress=None, early=None, stack=Ingest.stack: stack(
+        ingest, lambda done, count: left.append((done, count)), early))
+    with controller(tmp_path, stage) as (rig, _):
+        assert relit(*arguments(tmp_path, stage, rig)).code == 0
+    lights = [frame.image for frame in Capture.open(tmp_path / "capture").sources()]
+    assert decoded == lights and set(left) == {(len(lights), len(lights))}  # the preview finds it too
+    assert not list((tmp_path / "capture" / ".relit").glob(".early*"))

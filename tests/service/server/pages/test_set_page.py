@@ -102,6 +102,7 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
     with stage(tmp_path, sample=PICTURES is not None, serve=("--device", "cpu")) as (server, captures):
         with opened(browser, server, bypass_csp=True, color_scheme="light") as page:  # axe is injected
             assert page.get_by_role("button", name="Live view").count() == 0  # a watched folder has none
+            assert page.get_by_role("navigation").get_by_role("link", name="Set").get_attribute("href") == "/set"
             assert_accessible(page)
             assert "The colours are those of the camera." in page.locator("[data-step=chart]").inner_text()
             page.get_by_label("Capture", exact=True).fill("owl")

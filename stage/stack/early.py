@@ -1,0 +1,75 @@
+"""The stack of a capture that is being taken: each image is decoded when it is there, and the last one completes the stack."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from stage.capture.capture import Capture
+from stage.capture.manifest import Frame
+from stage.errors import storage
+from stage.stack.correction import Correction
+from stage.stack.fingerprint import Fingerprints
+from stage.stack.ingest import FINGERPRINTS, Ingest, stack_key
+from stage.stack.stack_file import StackFile
+
+EARLY = ".early.npy"
+"""The file in the folder of the cache; one that a killed program has left is written anew."""
+
+
+class EarlyStack:
+    """Images of a capture, decoded before all of them are there, in a file that `Ingest.stack` takes over."""
+
+    def __init__(self, folder: Path, light_count: int) -> None:
+        """Take note of what there will be; the first image makes the file.
+
+        Args:
+            folder: of the cache of the capture.
+            light_count: of all light frames.
+        """
+        self._folder, self._lights, self._path = folder, light_count, folder / EARLY
+        self._file: StackFile | None = None
+        self._resolution = (0, 0)
+        self._correction: tuple[str, Correction] | None = None
+        self._keys: dict[int, str] = {}
+
+    def add(self, capture: Capture, frame: Frame, light: int) -> None:
+        """Decode an image; where dark, flat or ambient frames come later, it is decoded anew with them in the end.
+
+        Args:
+            light: the place of the frame among all light frames.
+
+        Raises:
+            StageError: the image cannot be read, or the file not be written.
+        """
+        fingerprints = Fingerprints(capture.folder, self._folder / FINGERPRINTS)
+        file = self._file or self._begin(capture)
+        key = stack_key(capture, [], None, fingerprints)
+        if self._correction is None or self._correction[0] != key:
+            self._correction = key, Correction.of(capture, full_scale=True)
+        self._keys.pop(light, None)
+        file.write(light, replace(self._correction[1], capture=capture).coded(frame))
+        self._keys[light] = stack_key(capture, [frame], None, fingerprints)
+        fingerprints.remember()
+
+    def take(self, ingest: Ingest, path: Path) -> tuple[StackFile, set[int]] | None:
+        """Move the file to a path, and return it with the lights whose planes are those of the frames; None where it is of no use."""
+        if self._file is None or (self._lights, self._resolution) != (len(ingest.frames), ingest.capture.camera.resolution):
+            return None
+        os.replace(self._path, path)
+        file, self._file = self._file, None
+        return file, {light for light, frame in enumerate(ingest.frames)
+                      if self._keys.get(light) == stack_key(ingest.capture, [frame], None, ingest.fingerprints)}
+
+    def close(self) -> None:
+        """Remove the file, unless it has become that of a stack."""
+        if self._file is not None:
+            self._file.close()
+            self._path.unlink(missing_ok=True)
+            self._file = None
+
+    def _begin(self, capture: Capture) -> StackFile:
+        with storage("make the stack cache in", self._folder):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._file = StackFile(self._path, self._lights, capture.camera.width * capture.camera.height)
+        self._resolution = capture.camera.resolution
+        return self._file
