@@ -7,6 +7,7 @@ from pathlib import Path
 
 from service.acquisition.plans.shots import Shot
 from stage.capture.capture import Capture, source_places
+from stage.capture.manifest import FILE_NAME, read_manifest
 from stage.errors import StageError
 from stage.stack.early import EarlyStack
 from stage.stack.ingest import CACHE_FOLDER, Ingest
@@ -62,7 +63,7 @@ class EarlyIngest:
             if light is None or self._stopped:
                 continue
             try:
-                capture = Capture.open(self._folder)
+                capture = Capture(self._folder, read_manifest(self._folder / FILE_NAME))  # all files are checked in the end
                 for frame in capture.manifest.frames:
                     if frame.image == name:
                         self._early.add(capture, frame, light)

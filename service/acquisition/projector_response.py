@@ -26,15 +26,15 @@ def measure(pictures: Mapping[float, Path], space: ColorSpaceName | None, full_s
     Raises:
         RequestError: the pictures do not show a response; names their folder.
     """
-    usable, readings = np.True_, []
+    usable, readings = [], []
     for path in pictures.values():
         recorded = images.read_pixels(path)
         step = max(1, int(np.ceil(np.sqrt(recorded[..., 0].size / MOST_PIXELS))))
         sparse = recorded[::step, ::step].astype(np.float32).reshape(-1, 3)
-        usable = usable & (sparse < full_scale).all(axis=-1)
+        usable.append((sparse < full_scale).all(axis=-1))
         readings.append(linearise(sparse, space or color_space_of(path)) @ np.array(GREY_WEIGHTS, np.float32))
     try:
-        return fit_response(tuple(pictures), np.array(readings), usable=np.asarray(usable))
+        return fit_response(tuple(pictures), np.array(readings), usable=np.all(usable, axis=0))
     except CalibrationError as error:
         raise RequestError(f"{next(iter(pictures.values())).parent}: {error}") from error
 
