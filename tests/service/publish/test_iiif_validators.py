@@ -1,5 +1,7 @@
-"""relit publish --as iiif: what IIIF's own validators find. That of the Image API runs its tests of level 0 against a server of files; of that
-of the Presentation API, iiif-prezi3 has generated models."""
+"""relit publish --as iiif: what IIIF's own validators find.
+
+That of the Image API runs its tests of level 0 against a server of files. Of the schema of the Presentation API, iiif-prezi3 has models.
+"""
 
 import json
 import threading
