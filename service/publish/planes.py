@@ -30,22 +30,22 @@ RESERVE = 1.05
 """How far the range of a plane goes beyond that of the sampled pixels."""
 
 
-def write_planes(folder: Path, source: BasisCapture, display: Display, device: str, timings: Timings, *, quality: int,
+def write_planes(folder: Path, source: BasisCapture, display: Display, sample: np.ndarray, device: str, timings: Timings, *, quality: int,
                  whole: bool) -> float:
-    """Write planes and info.json, `whole` images beside their tiles.
+    """Write planes and info.json, `whole` images beside their tiles; the planes are the components of stored_sample.
 
     Returns:
         The root mean square difference of pictures under the captured lights from those, in steps of an 8-bit display, before JPEG.
     """
     timings.stage("components", 1)
-    sample = display.sample(source)
-    found = components_of(sample, source.lights.direction[display.front])
+    shown = display.of_sample(sample)
+    found = components_of(shown, source.lights.direction[display.front])
     fit = found.fit
-    planes = np.einsum("plc,cln->pn", fit, sample, optimize=True)
+    planes = np.einsum("plc,cln->pn", fit, shown, optimize=True)
     quantization = quantization_of_range(RESERVE * planes.min(axis=1), RESERVE * planes.max(axis=1))
     rebuilt = np.einsum("plc,pn->cln", found.basis, dequantize(quantize(planes, quantization), quantization), optimize=True)
-    loss = float(255 * np.sqrt(np.mean(np.square(np.clip(rebuilt, 0, 1) - sample))))
-    del sample, rebuilt
+    loss = float(255 * np.sqrt(np.mean(np.square(np.clip(rebuilt, 0, 1) - shown))))
+    del shown, rebuilt
     weights = np.zeros((len(fit), 3, source.stack.shape[1]), np.float32)
     weights[:, :, display.front] = fit.swapaxes(1, 2)
     camera = source.capture.camera
