@@ -71,8 +71,8 @@ def _info(source: BasisCapture, found: Components) -> dict[str, object]:
     camera = source.capture.camera
     black = np.zeros_like(found.stored[:1])  # what is added to all planes
     size = {} if camera.pixel_size_m is None else {"pixelSizeInMM": numbers(1000 * camera.pixel_size_m)}
-    return {"type": "bilinear", "resolution": RESOLUTION, "colorspace": "mrgb", "nplanes": len(found.stored), "format": "jpg",
-            "width": camera.width, "height": camera.height, **size,
+    return {"type": "bilinear", "resolution": RESOLUTION, "colorspace": "mrgb", "colorprofile": "sRGB",
+            "nplanes": len(found.stored), "format": "jpg", "width": camera.width, "height": camera.height, **size,
             "lights": numbers(found.directions.ravel()),
             "basis": np.concatenate([black, found.stored]).ravel().tolist()}
 

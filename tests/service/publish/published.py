@@ -27,10 +27,10 @@ def bilinear(direction, side: int) -> dict[int, float]:
 
 
 def shown(folder: Path, directions: np.ndarray, *, tiles: bool = False) -> np.ndarray:
-    """[n, rows, cols, 3] what OpenLIME's shader (ShaderRTI, type bilinear, colour space mrgb) sums up under lights, from the whole planes,
-    or from the finest tiles of the layout deepzoom."""
+    """[n, rows, cols, 3] what OpenLIME's shader (ShaderRTI, type bilinear, colour space mrgb) sums up under lights, in sRGB, from the whole
+    planes, or from the finest tiles of the layout deepzoom."""
     info = json.loads((folder / "info.json").read_text())
-    assert (info["type"], info["colorspace"]) == ("bilinear", "mrgb")
+    assert (info["type"], info["colorspace"], info["colorprofile"]) == ("bilinear", "mrgb", "sRGB")
     side, planes = info["resolution"], info["nplanes"]
     [material] = info["materials"]
     basis = np.reshape(info["basis"], (planes + 1, side**2, 3)).astype(float)
