@@ -22,8 +22,10 @@ SPACING_PART = 0.5
 """Width of the Gaussians over the usual distance between neighbouring lights: at its neighbour's place a light counts 2 %."""
 LEAST_WEIGHT = 1e-3
 """Weights up to this count nothing."""
-RESOLUTION = 24
-"""Directions along a side of the grid: cells of about 0.13 rad, half the distance of neighbours among 100 lights over the hemisphere."""
+GRID_SPAN = 6.0
+"""Directions along a side of the grid, times the distance of neighbouring lights, of which a cell is at most half."""
+GRID_SIDES = (16, 48)
+"""Fewest and most directions along a side of the grid; with the most, info.json has 0.7 MB."""
 ALIKE = 0.1
 """What the grid tells apart less than this is left as the Gaussians have it, as lights that nearly coincide."""
 BASIS_ZERO, BASIS_REACH = 127, 127
@@ -34,14 +36,15 @@ class Components(NamedTuple):
     """The basis of a capture, as it is stored."""
 
     directions: np.ndarray  # [lights, 3] unit vectors
-    stored: np.ndarray  # [planes, RESOLUTION², 3] uint8
+    side: int  # directions along a side of the grid
+    stored: np.ndarray  # [planes, side², 3] uint8
     ranges: np.ndarray  # [planes], steps for a unit
 
     @property
     def basis(self) -> np.ndarray:
         """The basis that viewers find under the captured lights, [planes, lights, 3] float64."""
         grid = (self.stored.astype(float) - BASIS_ZERO) / self.ranges[:, None, None]
-        return np.einsum("lg,pgc->plc", grid_weights(self.directions), grid, optimize=True)
+        return np.einsum("lg,pgc->plc", grid_weights(self.directions, self.side), grid, optimize=True)
 
     @property
     def fit(self) -> np.ndarray:
@@ -57,32 +60,33 @@ def components_of(values: np.ndarray, directions: np.ndarray) -> Components:
     count = min(PLANES, len(flat))
     vectors = linalg.eigh(flat @ flat.T, subset_by_index=(len(flat) - count, len(flat) - 1))[1].T[::-1]
     basis = vectors.reshape(count, channels, lights).swapaxes(1, 2)
-    gaussians = light_weights(directions, grid_directions())
-    seen = np.linalg.pinv(grid_weights(directions) @ gaussians, rcond=ALIKE)  # heights that have the basis itself under captured lights
+    side = int(np.clip(GRID_SPAN / max(light_spacing(directions), 1e-3), *GRID_SIDES))
+    gaussians = light_weights(directions, grid_directions(side))
+    seen = np.linalg.pinv(grid_weights(directions, side) @ gaussians, rcond=ALIKE)  # heights that give the basis itself
     grid = np.einsum("gl,lm,pmc->pgc", gaussians, seen, basis, optimize=True)
     ranges = BASIS_REACH / np.abs(grid).max(axis=(1, 2))
     stored = np.rint(grid * ranges[:, None, None]) + BASIS_ZERO
-    return Components(directions, stored.astype(np.uint8), ranges)
+    return Components(directions, side, stored.astype(np.uint8), ranges)
 
 
-def grid_directions() -> np.ndarray:
-    """Return the directions of the grid [RESOLUTION², 3], rows of v with columns of u.
+def grid_directions(side: int) -> np.ndarray:
+    """Return the directions of the grid [side², 3], rows of v with columns of u.
 
     Convention: the upper half of an octahedron |x| + |y| + |z| = 1, turned by 45 degrees: u = x + y and v = y − x, both from −1 to 1.
     """
-    v, u = np.meshgrid(*2 * [np.linspace(-1, 1, RESOLUTION)], indexing="ij")
+    v, u = np.meshgrid(*2 * [np.linspace(-1, 1, side)], indexing="ij")
     x, y = (u - v).ravel() / 2, (u + v).ravel() / 2
     found = np.stack([x, y, 1 - np.abs(x) - np.abs(y)], axis=1)
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def grid_weights(wanted: np.ndarray) -> np.ndarray:
-    """Return how much each direction of the grid counts in a light from `wanted` [n, 3], z ≥ 0, [n, RESOLUTION²]; the sum is 1."""
+def grid_weights(wanted: np.ndarray, side: int) -> np.ndarray:
+    """Return how much each direction of the grid counts in a light from `wanted` [n, 3], z ≥ 0, [n, side²]; the sum is 1."""
     x, y = (wanted[:, :2] / np.abs(wanted).sum(axis=1, keepdims=True)).T
     weights = []
     for place in (y - x, x + y):
-        place = (place + 1) / 2 * (RESOLUTION - 1)
-        weights.append(np.maximum(0, 1 - np.abs(place[:, None] - np.arange(RESOLUTION))))
+        place = (place + 1) / 2 * (side - 1)
+        weights.append(np.maximum(0, 1 - np.abs(place[:, None] - np.arange(side))))
     return np.asarray((weights[0][:, :, None] * weights[1][:, None, :]).reshape(len(wanted), -1))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, stack_bands
 from service.basis.display import Display
-from service.publish.components import RESOLUTION, Components, components_of
+from service.publish.components import Components, components_of
 from service.publish.pyramid import TILE, Pyramid, TilePath, halvings
 from service.publish.strips import Strips
 from service.reporting.progress import Timings
@@ -71,7 +71,7 @@ def _info(source: BasisCapture, found: Components) -> dict[str, object]:
     camera = source.capture.camera
     black = np.zeros_like(found.stored[:1])  # what is added to all planes
     size = {} if camera.pixel_size_m is None else {"pixelSizeInMM": numbers(1000 * camera.pixel_size_m)}
-    return {"type": "bilinear", "resolution": RESOLUTION, "colorspace": "mrgb", "colorprofile": "sRGB",
+    return {"type": "bilinear", "resolution": found.side, "colorspace": "mrgb", "colorprofile": "sRGB",
             "nplanes": len(found.stored), "format": "jpg", "width": camera.width, "height": camera.height, **size,
             "lights": numbers(found.directions.ravel()),
             "basis": np.concatenate([black, found.stored]).ravel().tolist()}

@@ -63,6 +63,22 @@ def test_a_hemisphere_of_lights_is_shown_as_the_basis_has_it(relit, tmp_path):
         assert rms.max() < 2
 
 
+def test_lights_close_to_one_another_show_their_own_images(relit, tmp_path):
+    """Seven lights within 8 degrees, whose images differ little; those of their neighbours are farther than the limit."""
+    scene = capture(tmp_path / "cap")
+    near = scene.directions * [0.25, 0.25, 1]
+    near /= np.linalg.norm(near, axis=1, keepdims=True)
+    white, marks = np.ones_like(near), np.random.default_rng(2).uniform(0.5, 1, (len(near), SIZE // 30, SIZE // 30, 3))
+    images = render(scene.normal, scene.albedo, near, white) * marks.repeat(30, axis=1).repeat(30, axis=2)
+    write_capture(tmp_path / "near", scene._replace(directions=near, irradiance=white, images=images))
+    relit.done("publish", tmp_path / "near", "--to", tmp_path / "out", "--as", "openlime")
+    exposure = np.quantile(images[:, scene.mask], 0.999)
+    truth = srgb(np.clip(images / exposure, 0, 1)) * scene.mask[..., None]
+    got = shown(tmp_path / "out", near)
+    assert 255 * np.sqrt(np.mean(np.square(got - truth))) < 3  # JPEG of squares that differ in each component
+    assert 255 * np.sqrt(np.mean(np.square(truth[1:] - truth[:-1]))) > 20
+
+
 def test_tiles_of_each_level_are_the_whole_image_made_smaller(relit, tmp_path):
     capture(tmp_path / "cap")
     relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "openlime", "--quality", "100")
