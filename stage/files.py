@@ -1,6 +1,7 @@
-"""Writing of files whole or not at all: to a temporary file beside the target, flushed to disk, then renamed."""
+"""Writing of files and folders whole or not at all: a temporary one beside the target, files flushed to disk, then renamed."""
 
 import os
+import shutil
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -46,6 +47,37 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def folder_beside(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path`, which none but its owner reads and which is removed at the end."""
+    target = Path(path).absolute()
+    with storage("write", path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
+    try:
+        with storage("write", path):
+            yield temporary
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder, which replaces `path` when the block ends without an error and is removed otherwise."""
+    with folder_beside(path) as temporary:
+        made, older = temporary / "made", temporary / "older"
+        made.mkdir()
+        yield made
+        if path.exists():
+            os.rename(path, older)
+        try:
+            os.rename(made, path)
+        except BaseException:
+            if older.exists():
+                os.rename(older, path)
+            raise
 
 
 def resolved(path: Path) -> Path | None:

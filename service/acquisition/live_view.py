@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +87,8 @@ def look(rig_path: Path, camera: str, folder: Path, stop: threading.Event) -> No
         RequestError: the lamps or the camera do not answer, or the camera has no live view.
     """
     rig = read_rig(rig_path)
-    opened = open_camera(camera, Setup(folder, END_S, (), None))
-    lights = None
-    try:
-        lights = Lights(rig_path, rig, lambda what: None)  # a person who holds the lamp needs not be told when
+    setup = Setup(folder, END_S, (), None)
+    with closing(open_camera(camera, setup)) as opened, closing(Lights(rig_path, rig, lambda what: None)) as lights:  # none is asked
         lights.set(even_levels(rig))
         number, place, told = 0, None, {}
         while not stop.is_set():
@@ -104,12 +103,6 @@ def look(rig_path: Path, camera: str, folder: Path, stop: threading.Event) -> No
                 told = {"focus": focus_of(linearise(tile, SPACE).mean(axis=2)), "clipped": float((pixels.max(axis=2) >= FULL_SCALE).mean())}
             print(json.dumps({"number": number, **told}), flush=True)
             stop.wait(PERIOD_S - (time.monotonic() - began))
-    finally:
-        try:
-            if lights is not None:
-                lights.close()
-        finally:
-            opened.close()
 
 
 def main(rig: str, camera: str, folder: str) -> int:

@@ -3,6 +3,7 @@
 import json
 import shlex
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -104,17 +105,9 @@ def meter(request: AcquireRequest, ask: Ask, progress: Progress | None = None) -
     shots = () if rig is None else _spread(shots_of(read_plan(request.plan), rig, request.projector), rig)
     if rig is None or not shots:
         raise RequestError("--preview: the plan has no picture of the object under lamps: meter one such as olat, with --rig")
-    camera = open_camera(request.camera, Setup(request.out / ".spool", request.timeout, tuple(shlex.split(request.trigger or "")), None))
-    lights = None
-    try:
-        lights = Lights(request.rig or Path(), rig, ask)
+    setup = Setup(request.out / ".spool", request.timeout, tuple(shlex.split(request.trigger or "")), None)
+    with closing(open_camera(request.camera, setup)) as camera, closing(Lights(request.rig or Path(), rig, ask)) as lights:
         return _Meter(request, rig, camera, lights).run(shots, Timings(progress))
-    finally:
-        try:
-            if lights is not None:
-                lights.close()
-        finally:
-            camera.close()
 
 
 def _spread(shots: tuple[Shot, ...], rig: Rig) -> list[Shot]:

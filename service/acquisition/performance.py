@@ -1,8 +1,6 @@
 """A performance: frames of a moving subject under lights that repeat a plan, cut into a sequence of captures, one a period."""
 
 import os
-import shutil
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -21,7 +19,7 @@ from service.requests.imports.interleaved import InterleavedImport
 from stage.capture.sequence import FRAME_RATE, SEQUENCE_FILE, TimeStep, write_sequence
 from stage.capture.sequence import Sequence as CaptureSequence
 from stage.colour.colour_spaces import ColorSpaceName
-from stage.errors import storage
+from stage.files import folder_beside, replacing_folder
 from stage.formats import images
 from stage.importers.camera_options import Selection, select
 from stage.importers.layout import Imported, color_space_of, image_resolution, place_images
@@ -56,10 +54,7 @@ def import_interleaved(request: InterleavedImport) -> Imported:
     rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
     shots = shots_of(read_plan(request.period), rig, request.projector)
     period, closed = _period(shots, request.period)
-    with storage("write", target):
-        target.absolute().parent.mkdir(parents=True, exist_ok=True)
-        working = Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.absolute().parent))
-    try:
+    with folder_beside(target) as working, replacing_folder(target) as made:
         frames = _frames(request, working / "frames")
         steps = _count(frames.names, len(period), closed, request)
         space = request.color_space or color_space_of(frames.folder / frames.names[0])
@@ -69,7 +64,6 @@ def import_interleaved(request: InterleavedImport) -> Imported:
         rate = frames.rate or FRAME_RATE * len(period)
         times = [place for place, shot in enumerate(shots) if shot.name.endswith(TRACKING)]
         reference = times[len(times) // 2] if times else 0  # the frame to which those of a step are aligned
-        made = working / "sequence"
         found = []
         for step in range(steps):
             name = f"{step + 1:0{max(4, len(str(steps)))}d}"
@@ -81,10 +75,6 @@ def import_interleaved(request: InterleavedImport) -> Imported:
                 "", taken, mask=frames.mask, assumed=frames.assumed)
             found.append(TimeStep(name, made / name, (begin + reference) / rate))
         write_sequence(CaptureSequence(tuple(found), rate / len(period), True), made / SEQUENCE_FILE)
-        with storage("write", target):
-            os.replace(made, target)
-    finally:
-        shutil.rmtree(working, ignore_errors=True)
     return Imported(target / SEQUENCE_FILE, (
         *frames.facts, ("period", f"{len(period)} frames, {len(times)} of them under full light" if not closed else
                         f"{len(period)} frames, {len(times) - 1} of them under full light; the first of the next period closes each"),

@@ -29,13 +29,25 @@ class Display(NamedTuple):
         """Return the display values of a band."""
         return encode(band, self.gains, self.from_stack)
 
-    def sample(self, source: BasisCapture) -> np.ndarray:
-        """Return the display values of evenly spread pixels of the object under the lights in front of it, [3, lights, pixels] float32."""
-        return srgb(np.tensordot(self.from_stack.astype(np.float32), _scene(source, self.front, self.gains), axes=1))
+    def of_sample(self, sample: np.ndarray) -> np.ndarray:
+        """Return the display values of stored_sample, [3, lights in front, pixels] float32."""
+        scene = sample * self.gains[:, self.front, None].astype(np.float32)
+        return srgb(np.tensordot(self.from_stack.astype(np.float32), scene, axes=1))
 
 
-def display_of(source: BasisCapture, front: np.ndarray, kind: str) -> Display:
+def stored_sample(source: BasisCapture, front: np.ndarray) -> np.ndarray:
+    """Return the stored values of evenly spread pixels of the object, [3, lights in front, pixels] float32."""
+    pixels = np.flatnonzero(source.inside)
+    spread = np.linspace(0, len(pixels) - 1, min(EXPOSURE_PIXELS, len(pixels))).astype(int)  # no whole step, which could meet few columns
+    values, _ = source.stack.pick(pixels[spread])
+    return np.asarray(values[:, front], dtype=np.float32)
+
+
+def display_of(source: BasisCapture, front: np.ndarray, sample: np.ndarray, kind: str) -> Display:
     """Return the display values that files of a kind hold, for the lights in front of the object.
+
+    Args:
+        sample: stored_sample, which is exposed.
 
     Raises:
         ManifestError: a light has no irradiance in a channel, or the object is black.
@@ -49,7 +61,8 @@ def display_of(source: BasisCapture, front: np.ndarray, kind: str) -> Display:
     gains = np.zeros((3, source.stack.shape[1]))
     gains[:, front] = (source.stack.scale[front, None] / irradiance[front]).T
     matrix = rgb_matrix(source.space, DISPLAY_SPACE)
-    white = float(np.quantile(np.tensordot(matrix, _scene(source, front, gains), axes=1), WHITE_PERCENTILE / 100))
+    scene = sample * gains[:, front, None].astype(np.float32)
+    white = float(np.quantile(np.tensordot(matrix, scene, axes=1), WHITE_PERCENTILE / 100))
     if not white > 0:
         raise ManifestError(f"{source.where}: frames: the object is black under every light in front of it")
     exposure = 1 / white
@@ -60,11 +73,3 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     """Return the values of linear ones for an sRGB display, limited to 0…1 (IEC 61966-2-1)."""
     limited = np.clip(linear, 0, 1)
     return np.where(limited <= 0.0031308, 12.92 * limited, 1.055 * limited ** np.float32(1 / 2.4) - np.float32(0.055))
-
-
-def _scene(source: BasisCapture, front: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return scene-linear values of evenly spread pixels, [3, lights in front, pixels] float32."""
-    pixels = np.flatnonzero(source.inside)
-    spread = np.linspace(0, len(pixels) - 1, min(EXPOSURE_PIXELS, len(pixels))).astype(int)  # no whole step, which could meet few columns
-    values, _ = source.stack.pick(pixels[spread])
-    return np.asarray(values[:, front].astype(np.float32) * gains[:, front, None].astype(np.float32))

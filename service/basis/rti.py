@@ -17,7 +17,7 @@ from kernels.relight.basis.basis import squared_residual
 from kernels.relight.basis.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, fit_weights, hemispherical_harmonics, separate
 from kernels.relight.frames.combine import combine_batch
 from service.basis.capture import BasisCapture, BasisResult, stack_bands
-from service.basis.display import WHITE_PERCENTILE, Display, display_of
+from service.basis.display import WHITE_PERCENTILE, Display, display_of, stored_sample
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.basis import BasisKind, BasisRequest
@@ -117,7 +117,7 @@ def _model(request: BasisRequest, kind: BasisKind, source: BasisCapture) -> Mode
     weights, padded = np.zeros((terms, 3, lights), dtype=np.float32), np.zeros((lights, terms))
     weights[:, :, front] = white * fit[:, None]
     padded[front] = functions / white
-    return Model(kind, display_of(source, front, kind), padded, weights)
+    return Model(kind, display_of(source, front, stored_sample(source, front), kind), padded, weights)
 
 
 def _terms(count: int | None, kind: BasisKind, lights: int) -> int:

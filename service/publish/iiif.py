@@ -15,7 +15,7 @@ from service.basis.capture import BasisCapture, stack_bands
 from service.basis.display import Display, srgb
 from service.errors import RequestError
 from service.publish.annotations import Annotation
-from service.publish.components import SPACING_PART, gaussian_width, light_weights
+from service.publish.components import light_spacing, light_weights
 from service.publish.pyramid import TILE, Pyramid, halvings, size_at, write_jpeg
 from service.publish.strips import Strips
 from service.reporting.progress import Timings
@@ -102,13 +102,13 @@ def write_iiif(folder: Path, source: BasisCapture, display: Display, maps: Resul
     chosen = display.front[np.unique(np.linspace(0, len(display.front) - 1, min(wanted, len(display.front))).round().astype(int))]
     photographs = [_Picture(f"photograph_{index}", f"photograph, {source.stack.frames[index]}") for index in chosen]
     directions = source.lights.direction[display.front]
-    width = gaussian_width(directions)
+    spacing = light_spacing(directions)
     towards = {label: np.array(direction) / np.linalg.norm(direction) for label, direction in RELIT.items()}
-    between = [label for label, way in towards.items() if np.linalg.norm(directions - way, axis=1).min() <= width / SPACING_PART]
+    between = [label for label, way in towards.items() if np.linalg.norm(directions - way, axis=1).min() <= spacing]
     relit = [_Picture(f"relit_{index}", label) for index, label in enumerate(between)]
     weights = np.zeros((len(relit) + len(chosen), 3, source.stack.shape[1]), np.float32)
     if relit:
-        weights[:len(relit), :, display.front] = light_weights(directions, width, np.array([towards[label] for label in between]))[:, None]
+        weights[:len(relit), :, display.front] = light_weights(directions, np.array([towards[label] for label in between]))[:, None]
     weights[len(relit) + np.arange(len(chosen)), :, chosen] = 1
     if not len(weights):
         raise RequestError(f"--photographs 0: the lights of {source.where} are near none of those of the relit pictures: none is left")

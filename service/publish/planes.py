@@ -1,9 +1,10 @@
 """Planes as OpenLIME and RelightLab read them: info.json, and images of three planes each, whole and as Deep Zoom tiles.
 
-A plane is scale · (value of the image, 0…1 − bias). Outside the object it is 0.
+A plane is scale · (value of the image, 0…1 − bias). Outside the object it is 0. The levels of tiles begin with 0, the whole image in one
+tile, because OpenLIME counts them so for the layout `deepzoom`; other readers of Deep Zoom count from an image of one pixel.
 
-Source: the relight format of the Visual Computing Lab, ISTI-CNR, as OpenLIME's ShaderRTI reads it; Microsoft, Deep Zoom File Format
-    Overview.
+Source: the relight format of the Visual Computing Lab, ISTI-CNR, as OpenLIME's ShaderRTI and LayoutTiles read it; Microsoft, Deep Zoom File
+    Format Overview.
 """
 
 import json
@@ -29,26 +30,26 @@ RESERVE = 1.05
 """How far the range of a plane goes beyond that of the sampled pixels."""
 
 
-def write_planes(folder: Path, source: BasisCapture, display: Display, device: str, timings: Timings, *, quality: int,
+def write_planes(folder: Path, source: BasisCapture, display: Display, sample: np.ndarray, device: str, timings: Timings, *, quality: int,
                  whole: bool) -> float:
-    """Write planes and info.json, `whole` images beside their tiles.
+    """Write planes and info.json, `whole` images beside their tiles; the planes are the components of stored_sample.
 
     Returns:
         The root mean square difference of pictures under the captured lights from those, in steps of an 8-bit display, before JPEG.
     """
     timings.stage("components", 1)
-    sample = display.sample(source)
-    found = components_of(sample, source.lights.direction[display.front])
+    shown = display.of_sample(sample)
+    found = components_of(shown, source.lights.direction[display.front])
     fit = found.fit
-    planes = np.einsum("plc,cln->pn", fit, sample, optimize=True)
+    planes = np.einsum("plc,cln->pn", fit, shown, optimize=True)
     quantization = quantization_of_range(RESERVE * planes.min(axis=1), RESERVE * planes.max(axis=1))
     rebuilt = np.einsum("plc,pn->cln", found.basis, dequantize(quantize(planes, quantization), quantization), optimize=True)
-    loss = float(255 * np.sqrt(np.mean(np.square(np.clip(rebuilt, 0, 1) - sample))))
-    del sample, rebuilt
+    loss = float(255 * np.sqrt(np.mean(np.square(np.clip(rebuilt, 0, 1) - shown))))
+    del shown, rebuilt
     weights = np.zeros((len(fit), 3, source.stack.shape[1]), np.float32)
     weights[:, :, display.front] = fit.swapaxes(1, 2)
     camera = source.capture.camera
-    images, levels = len(fit) // 3, 1 + halvings(camera.width, camera.height, 1)
+    images, levels = len(fit) // 3, 1 + halvings(camera.width, camera.height, TILE)
     pyramids = [Pyramid(camera.width, camera.height, _tile(folder, image, levels), levels=levels, quality=quality,
                         whole=folder / f"plane_{image}.jpg" if whole else None) for image in range(images)]
     bytes_per_pixel = 6 * source.stack.shape[1] + 20 * len(fit)  # display values, and planes in their stages
@@ -58,8 +59,9 @@ def write_planes(folder: Path, source: BasisCapture, display: Display, device: s
             stored = quantize(np.where(each.inside, fitted, 0), quantization)[:, :each.span.stop - each.span.start]
             strips.put(each.span.start, stored.reshape(images, 3, -1).swapaxes(1, 2))
     timings.stage("write", 1)
-    write_text(folder / INFO_FILE, json.dumps(_info(source, found) | {"quality": quality, "materials": [{
-        "scale": numbers(255 * quantization.step), "bias": numbers(quantization.zero / 255), "range": numbers(found.ranges)}]}) + "\n")
+    material = {"scale": numbers(255 * quantization.step), "bias": numbers(quantization.zero / 255), "range": numbers(found.ranges)}
+    info = _info(source, found) | {"quality": quality, "materials": [material]}
+    write_text(folder / INFO_FILE, json.dumps(info, separators=(",", ":")) + "\n")
     for image in range(images):
         write_text(folder / f"plane_{image}.dzi", DEEP_ZOOM.format(tile=TILE, width=camera.width, height=camera.height))
     return loss
@@ -69,12 +71,12 @@ def _info(source: BasisCapture, found: Components) -> dict[str, object]:
     camera = source.capture.camera
     black = np.zeros_like(found.stored[:1])  # what is added to all planes
     size = {} if camera.pixel_size_m is None else {"pixelSizeInMM": numbers(1000 * camera.pixel_size_m)}
-    return {"type": "rbf", "colorspace": "mrgb", "nplanes": len(found.stored), "format": "jpg",
-            "width": camera.width, "height": camera.height, **size,
-            "lights": numbers(found.directions.ravel()), "sigma": numbers(found.sigma),
+    return {"type": "bilinear", "resolution": found.side, "colorspace": "mrgb", "colorprofile": "sRGB",
+            "nplanes": len(found.stored), "format": "jpg", "width": camera.width, "height": camera.height, **size,
+            "lights": numbers(found.directions.ravel()),
             "basis": np.concatenate([black, found.stored]).ravel().tolist()}
 
 
 def _tile(folder: Path, image: int, levels: int) -> TilePath:
-    """Return the paths of the tiles of an image; the last level of Deep Zoom is the whole size."""
+    """Return the paths of the tiles of an image; the last level is the whole size."""
     return lambda halving, column, row: folder / f"plane_{image}_files" / str(levels - 1 - halving) / f"{column}_{row}.jpg"

@@ -1,11 +1,6 @@
 """Publish a capture as a folder of static files, whole or not at all."""
 
 import json
-import os
-import shutil
-import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +9,7 @@ import numpy as np
 from kernels import device as devices
 from service import __version__
 from service.basis.capture import open_capture
-from service.basis.display import display_of
+from service.basis.display import display_of, stored_sample
 from service.errors import RequestError
 from service.publish.annotations import read_annotations
 from service.publish.iiif import MANIFEST_FILE, write_iiif
@@ -26,7 +21,7 @@ from service.requests.publish import PublishedAs, PublishRequest
 from service.viewing.result_layers import ResultLayers
 from service.viewing.view_files import result_file
 from stage.errors import ManifestError, storage
-from stage.files import write_text
+from stage.files import replacing_folder, write_text
 
 PUBLICATION_FILE, SCHEMA = "publication.json", "relit.publication/1"
 """The file by which a folder is known as one that this command has made."""
@@ -71,13 +66,14 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
     if len(front) < LEAST_LIGHTS:
         raise ManifestError(f"{source.where}: frames: {len(front)} are lit from in front of the object (z > 0): relit publish needs "
                             f"{LEAST_LIGHTS} or more")
-    display = display_of(source, front, "relit publish")
+    sample = stored_sample(source, front)
+    display = display_of(source, front, sample, "relit publish")
     loss = None
-    with _replacing(request.out) as folder:
+    with replacing_folder(request.out) as folder:
         if request.kind is PublishedAs.IIIF:
             write_iiif(folder, source, display, maps, request, annotations, device, timings)
         else:
-            loss = write_planes(folder, source, display, device, timings, quality=request.quality,
+            loss = write_planes(folder, source, display, sample, device, timings, quality=request.quality,
                                 whole=request.kind is PublishedAs.OPENLIME)
             if request.kind is PublishedAs.WEB:
                 write_page(folder, source, request, annotations)
@@ -108,27 +104,3 @@ def _entries(file: Path) -> set[str]:
         return set(found["entries"]) if found["schema"] == SCHEMA else set()
     except (FileNotFoundError, ValueError, LookupError, TypeError, RecursionError):
         return set()
-
-
-@contextmanager
-def _replacing(out: Path) -> Iterator[Path]:
-    """Yield a folder beside `out`, which takes its place when the block ends without an error and is removed otherwise."""
-    with storage("write", out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = out.with_name(f".{out.name}.{uuid.uuid4().hex[:8]}")
-        temporary.mkdir()
-    try:
-        with storage("write", out):
-            yield temporary
-            older = temporary.with_name(f"{temporary.name}.replaced")
-            if out.exists():
-                os.rename(out, older)
-            try:
-                os.rename(temporary, out)
-            except BaseException:
-                if older.exists():
-                    os.rename(older, out)
-                raise
-            shutil.rmtree(older, ignore_errors=True)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

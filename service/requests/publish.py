@@ -20,7 +20,7 @@ class PublishedAs(Choice):
     """What a capture is published as."""
 
     IIIF = "iiif", "a manifest of IIIF Presentation 3 with image tiles of IIIF Image 3, level 0"
-    OPENLIME = "openlime", "coefficient planes and the info.json that OpenLIME and RelightLab read, whole and as Deep Zoom tiles"
+    OPENLIME = "openlime", "coefficient planes and the info.json that OpenLIME 1 and RelightLab read, whole and as Deep Zoom tiles"
     WEB = "web", "a page that lights the object live, with its tiles"
 
 

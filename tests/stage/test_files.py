@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from stage.errors import StorageError
-from stage.files import replacing, write_text
+from stage.files import replacing, replacing_folder, write_text
 from tests.scenes.captures import files_in
 
 
@@ -64,3 +64,34 @@ def test_threads_that_write_together_leave_the_umask_alone(tmp_path):
         os.umask(before)
     assert after == 0o027
     assert {stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()} == {0o640}
+
+
+def test_a_folder_takes_the_place_of_another_whole(tmp_path):
+    target = tmp_path / "a"
+    write_text(target / "old.txt", "old")
+    with replacing_folder(target) as folder:
+        assert folder != target and folder.is_dir() and not list(folder.iterdir())
+        write_text(folder / "new.txt", "new")
+        assert files_in(target) == {"old.txt"}
+    assert files_in(tmp_path) == {"a/new.txt"} and stat.S_IMODE(target.stat().st_mode) & stat.S_IRWXU == stat.S_IRWXU
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])
+def test_an_error_keeps_the_old_folder_and_leaves_nothing(tmp_path, monkeypatch, error):
+    target = tmp_path / "a"
+    write_text(target / "old.txt", "old")
+    with pytest.raises((error, StorageError)), replacing_folder(target) as folder:
+        write_text(folder / "half.txt", "half")
+        raise error
+    rename = os.rename
+
+    def fails(source, destination):
+        if destination == target and source.name == "made":
+            raise error
+        rename(source, destination)
+
+    monkeypatch.setattr(os, "rename", fails)  # the older one has been moved away by then
+    with pytest.raises((error, StorageError)), replacing_folder(target) as folder:
+        write_text(folder / "half.txt", "half")
+    assert files_in(target) == {"old.txt"} and [path.name for path in tmp_path.iterdir()] == ["a"]

@@ -7,7 +7,6 @@ written with Python's zip writer, because that of USD reports success when the d
 import os
 import shutil
 import struct
-import tempfile
 import zipfile
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +16,8 @@ from pxr import Tf, Usd
 
 from service.errors import AssetError
 from service.requests.export import TextureFormat
-from stage.errors import StorageError, storage
+from stage.errors import StorageError
+from stage.files import folder_beside
 
 SUFFIXES = (".usda", ".usdc", ".usdz")
 ALIGNMENT = 64
@@ -116,16 +116,11 @@ def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container
 @contextmanager
 def temporary_folder_beside(target: Path) -> Iterator[Path]:
     """Yield a temporary folder beside the target, removed at the end; errors of disk and USD become StorageErrors about the target."""
-    with storage("write", target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.stem}.", dir=target.parent))
     try:
-        with storage("write", target):
+        with folder_beside(target) as temporary:
             yield temporary
     except Tf.ErrorException as error:
         raise StorageError(f"cannot write {target}: {reason_of(error)}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _pack(package: Path, layer: Path, files: Sequence[Path]) -> None:

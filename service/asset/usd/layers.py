@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from anyascii import anyascii
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdShade
 
 from service.asset.usd.files import check_suffix
 from service.requests.export import FIRST_VERSION
@@ -55,6 +55,9 @@ PAYLOAD, GEOMETRY, MATERIALS = "payload.usda", "geometry.usdc", "materials.usda"
 LAYER_FILES = (PAYLOAD, GEOMETRY, MATERIALS)
 LIGHT_OFF, RIG, ENVIRONMENT = "off", "rig", "environment"
 """The variants of `light`; the layer of each but the first is named after it."""
+
+LPE_TAG = "inputs:karma:light:lpetag"
+"""The tag of a light in Karma's light path expressions."""
 
 PURPOSES = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render, UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide]
 """All of them: extents hold the geometry of every purpose."""
@@ -158,6 +161,7 @@ class AssetLayers:
         file = self.lights / f"{name}.usda"
         usd_stage = self._create(file, posed=True)
         yield usd_stage
+        describe_lights(usd_stage.GetDefaultPrim())
         usd_stage.Save()
         self.light_files.append(file)
 
@@ -269,6 +273,25 @@ def describe_root(root: UsdGeom.Xform, *, name: str, identifier: str, version: s
         root.GetPrim().SetAssetInfoByKey(key, value)
     if name and name != root.GetPrim().GetName():
         root.GetPrim().SetDisplayName(name)
+
+
+def describe_lights(root: Usd.Prim) -> None:
+    """Make the layer of a root prim with lights a light library: a component with a list and a collection of its lights, for light mixers.
+
+    Each light has an exposure, which is not animated as its intensity may be, and the tag by which Karma splits the picture into layers.
+
+    Source: OpenUSD, UsdLuxLightListAPI; SideFX, Solaris, Light Mixer and LPE Tag (the attribute's name since Houdini 20).
+    """
+    lights = [prim for prim in Usd.PrimRange(root) if prim.HasAPI(UsdLux.LightAPI)]
+    for prim in lights:
+        UsdLux.LightAPI(prim).CreateExposureAttr(0.0)
+        prim.CreateAttribute(LPE_TAG, Sdf.ValueTypeNames.String, custom=True).Set(prim.GetName())
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    paths = [prim.GetPath() for prim in lights]
+    UsdLux.LightListAPI.Apply(root).StoreLightList(paths)
+    collection = Usd.CollectionAPI.Apply(root, "lights")
+    collection.CreateExpansionRuleAttr(Usd.Tokens.explicitOnly)
+    collection.CreateIncludesRel().SetTargets(paths)
 
 
 def layer_folder(target: Path) -> str:

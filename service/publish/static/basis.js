@@ -1,26 +1,23 @@
-/** How much each plane counts under a light: the stored basis, interpolated between the captured lights (type `rbf` of the relight format). */
-
-const LEAST = 1e-3; // weights up to this count nothing
+/** How much each plane counts under a light: the stored grid of directions, interpolated (type `bilinear` of the relight format). */
 
 /** The basis of an info.json. */
 export class Basis {
-  constructor({ lights, sigma, basis, nplanes, materials: [{ range, scale, bias }] }) {
-    const count = lights.length / 3;
-    [this.lights, this.sigma, this.planes] = [lights, sigma, nplanes];
-    this.values = Float32Array.from({ length: 3 * nplanes * count }, (_, at) => (basis[3 * count + at] - 127) / range[Math.floor(at / (3 * count))]);
+  constructor({ resolution, basis, nplanes, materials: [{ range, scale, bias }] }) {
+    const count = 3 * resolution ** 2;
+    [this.side, this.planes] = [resolution, nplanes];
+    this.values = Float32Array.from({ length: nplanes * count }, (_, at) => (basis[count + at] - 127) / range[Math.floor(at / count)]);
     [this.scale, this.bias] = [scale, bias];
   }
 
-  /** Return the weight of each captured light, as [light, weight] of those that count, in a light from a unit vector. */
+  /** Return the four directions of the grid, as [place, weight], around a unit vector: the upper half of an octahedron, turned by 45 degrees. */
   weights([x, y, z]) {
-    const squares = Array.from({ length: this.lights.length / 3 }, (_, light) => (this.lights[3 * light] - x) ** 2 + (this.lights[3 * light + 1] - y) ** 2 + (this.lights[3 * light + 2] - z) ** 2);
-    const nearest = Math.min(...squares); // which all are relative to, so that none but the farthest vanish
-    const found = squares.map((square, light) => [light, Math.exp((nearest - square) / this.sigma ** 2)]);
-    const sum = (each) => each.reduce((total, [, weight]) => total + weight, 0);
-    const all = sum(found);
-    const kept = found.filter(([, weight]) => weight > LEAST * all);
-    const rest = sum(kept);
-    return kept.map(([light, weight]) => [light, weight / rest]);
+    const sum = Math.abs(x) + Math.abs(y) + Math.abs(z);
+    const [u, v] = [x + y, y - x].map((part) => (part / sum + 1) / 2 * (this.side - 1));
+    const [column, row] = [u, v].map((place) => Math.min(this.side - 2, Math.max(0, Math.floor(place))));
+    return [0, 1, 2, 3].map((corner) => {
+      const [right, below] = [corner & 1, corner >> 1];
+      return [column + right + (row + below) * this.side, Math.abs(1 - right - (u - column)) * Math.abs(1 - below - (v - row))];
+    });
   }
 
   /**
@@ -30,11 +27,10 @@ export class Basis {
   sums(direction, gain) {
     const factor = new Float32Array(3 * this.planes);
     const constant = [0, 0, 0];
-    const lights = this.lights.length / 3;
     const weights = this.weights(direction);
     for (let plane = 0; plane < this.planes; plane += 1) {
       for (let c = 0; c < 3; c += 1) {
-        const value = weights.reduce((sum, [light, weight]) => sum + weight * this.values[3 * (plane * lights + light) + c], 0);
+        const value = weights.reduce((sum, [place, weight]) => sum + weight * this.values[3 * (plane * this.side ** 2 + place) + c], 0);
         factor[3 * plane + c] = gain * value * this.scale[plane];
         constant[c] -= factor[3 * plane + c] * this.bias[plane];
       }

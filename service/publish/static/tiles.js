@@ -15,7 +15,6 @@ export class Tiles {
   /** `changed` is called when a tile has come, `failed` with the error where one cannot be had. */
   constructor(info, renderer, changed, failed) {
     [this.#info, this.#renderer, this.#changed, this.#failed] = [info, renderer, changed, failed];
-    this.levels = 1 + Math.ceil(Math.log2(Math.max(info.width, info.height)));
     this.coarsest = Math.max(0, Math.ceil(Math.log2(Math.max(info.width, info.height) / SIDE)));
   }
 
@@ -55,7 +54,7 @@ export class Tiles {
     const tile = { halving, box: this.#box(halving, column, row) };
     this.#loaded.set(key, tile);
     try {
-      const urls = Array.from({ length: this.#renderer.terms }, (_, j) => `plane_${j}_files/${this.levels - 1 - halving}/${column}_${row}.jpg`);
+      const urls = Array.from({ length: this.#renderer.terms }, (_, j) => `plane_${j}_files/${this.coarsest - halving}/${column}_${row}.jpg`);
       tile.texture = this.#renderer.texture(await Promise.all(urls.map(bitmapOf)));
     } catch (error) {
       setTimeout(() => { // it is asked for again

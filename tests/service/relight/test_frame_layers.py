@@ -1,6 +1,7 @@
 """Frames as a compositor gets them: layers by name, parts, lossless data, the matte, and the attributes of camera and time."""
 
 import json
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -127,6 +128,23 @@ def test_layers_of_lights_add_up_to_the_beauty(lit, tmp_path, guided):
     captured = np.where(SCENE.mask[..., None], SCENE.images[2], 0) * 0.4
     assert np.allclose(layers[-1], captured, rtol=0.05 if guided else 2e-3, atol=1e-3)
     assert np.array_equal(exr.read(lit("g", *options, maps=guided) / "a.0001.exr")[0]["R"], exr.read(out / "a.0001.exr")[0]["R"])
+
+
+def nuke_channel(name: str) -> tuple[str, str]:
+    """Layer and channel of a channel of a file by the rule of Nuke's reader (Foundry, NDK, ExrChannelNameToNuke): words between dots lose
+    digits at their beginning, other signs than letters and digits become _, and all but the last word are the layer."""
+    *layer, channel = [re.sub(r"[^A-Za-z0-9]", "_", word.lstrip("0123456789")) for word in name.split(".")]
+    return "_".join(layer) or "rgba", {"R": "red", "G": "green", "B": "blue", "A": "alpha"}.get(channel, channel)
+
+
+@pytest.mark.parametrize("parts", ["single", "multi"])
+def test_nuke_finds_a_layer_for_each_light(lit, tmp_path, parts):
+    out = lit("f", "--keys", tmp_path / "keys.json", "--frames", "1", "--aov", "lights", "--parts", parts, maps=False)
+    with OpenEXR.File(str(out / "a.0001.exr"), separate_channels=True) as file:
+        names = [name for part in file.parts for name in part.channels]
+    layers = ["light_environment", "light_key", "light_3", "light_key_4", "light_002"]
+    assert sorted(map(nuke_channel, names)) == sorted(
+        [(layer, channel) for layer in ["rgba", *layers] for channel in ("red", "green", "blue")] + [("rgba", "alpha")])
 
 
 def test_an_environment_alone_is_one_layer(lit):

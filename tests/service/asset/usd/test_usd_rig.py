@@ -197,3 +197,25 @@ def test_lights_of_a_package_do_not_replace_those_of_a_layer(tmp_path):
         write_asset(maps, tmp_path / "a.usdz", name="A", surroundings=Surroundings(rig=other))
     assert (tmp_path / "a_lights" / "rig.usda").read_bytes() == before and not (tmp_path / "a.usdz").exists()
     write_asset(maps, tmp_path / "a.usdz", name="A")  # without lights it has no use for the folder
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdz"])
+def test_the_layer_of_lights_is_a_library_that_mixers_read(suffix, tmp_path):
+    lights = [{"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 2, 3]}, {"type": "off"},
+              {"type": "gradient", "axis": "x", "sign": 1}]
+    export(tmp_path, lights, suffix)
+    usd_stage = Usd.Stage.Open(str(tmp_path / "a_lights" / "rig.usda"))
+    root = usd_stage.GetDefaultPrim()
+    assert (UsdGeom.GetStageUpAxis(usd_stage), UsdGeom.GetStageMetersPerUnit(usd_stage)) == (UsdGeom.Tokens.y, 1.0)
+    assert Usd.ModelAPI(root).GetKind() == "component" and root.IsModel()
+    found = [prim.GetPath() for prim in usd_stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]
+    assert [path.name for path in found] == ["Light_0001", "Light_0003"]
+    assert UsdLux.LightListAPI(root).ComputeLightList(UsdLux.LightListAPI.ComputeModeConsultModelHierarchyCache) == found
+    [collection] = Usd.CollectionAPI.GetAll(root)
+    members = Usd.CollectionAPI.ComputeIncludedObjects(collection.ComputeMembershipQuery(), usd_stage)
+    assert [member.GetPath() for member in members] == found
+    for path in found:
+        light = UsdLux.LightAPI(usd_stage.GetPrimAtPath(path))
+        assert light.GetExposureAttr().Get() == 0 and light.GetExposureAttr().GetNumTimeSamples() == 0
+        assert light.GetIntensityAttr().IsAuthored() and light.GetColorAttr().GetNumTimeSamples() == 0
+        assert light.GetPrim().GetAttribute("inputs:karma:light:lpetag").Get() == path.name

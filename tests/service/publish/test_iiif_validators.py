@@ -1,0 +1,70 @@
+"""relit publish --as iiif: what IIIF's own validators find.
+
+That of the Image API runs its tests of level 0 against a server of files. Of the schema of the Presentation API, iiif-prezi3 has models.
+"""
+
+import json
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+import iiif_prezi3
+import jsonschema
+import numpy as np
+import pytest
+
+from tests.scenes.captures import make_scene, write_capture
+
+LEVEL_0 = {"format_jpg", "id_basic", "id_squares", "info_json", "size_nofull"}
+SQUARE = 100
+"""Pixels of a square of the validator's image, which is 10 x 10 squares of known colours."""
+NOTES = [{"body": "a place", "target": "#xywh=10,20,30,40"},
+         {"body": "a point", "target": {"selector": {"type": "PointSelector", "x": 3, "y": 4.5}}}]
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+def test_the_image_validator_finds_nothing(relit, tmp_path):
+    """Its squares are what a capture shows."""
+    pytest.importorskip("magic", reason="the validator needs libmagic", exc_type=ImportError)
+    from iiif_validator.validator import ImageAPI, TestSuite, ValidationInfo
+
+    known = ValidationInfo()
+    colours = np.array(known.colorInfo).swapaxes(0, 1) / 255  # they are in columns
+    linear = np.where(colours > 0.04045, ((colours + 0.055) / 1.055) ** 2.4, colours / 12.92)  # IEC 61966-2-1
+    scene = make_scene(size=10 * SQUARE, lights=3)
+    white = np.ones_like(scene.irradiance)
+    squares = linear.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1)
+    write_capture(tmp_path / "squares", scene._replace(mask=np.ones_like(scene.mask), irradiance=white, images=np.stack(3 * [squares])))
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        where = f"127.0.0.1:{server.server_port}"
+        relit.done("publish", tmp_path / "squares", "--to", tmp_path / "out", "--as", "iiif", "--url", f"http://{where}/out",
+                   "--photographs", "1")
+        suite = TestSuite(known)
+        assert {name for name, test in suite.list_tests("3.0").items() if test["level"] == 0} == LEVEL_0
+        for name in sorted(LEVEL_0):
+            outcome = suite.run_test(name, ImageAPI("photograph_0", where, "out", version="3.0", debug=False))
+            assert outcome.exception is None and outcome.tests, f"{name}: {outcome.exception}"
+        server.shutdown()
+
+
+def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=64, lights=5), camera={
+        "projection": "orthographic", "resolution": [64, 64], "pixel_size_m": 1e-4})
+    relit.done("solve", tmp_path / "cap", "--out", tmp_path / "maps", "--method", "lambert")
+    (tmp_path / "notes.json").write_text(json.dumps(NOTES))
+    relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "iiif", "--url", "https://museum.org/cap",
+               "--maps", tmp_path / "maps", "--annotations", tmp_path / "notes.json", "--attribution", "A museum",
+               "--rights", "https://creativecommons.org/licenses/by/4.0/")
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    read = iiif_prezi3.Manifest.model_validate(manifest)
+    assert [len(canvas.items[0].items[0].body.items) for canvas in read.items] == [9, 2]
+    assert len(read.items[0].annotations[0].items) == 2
+    schema = jsonschema.Draft202012Validator(iiif_prezi3.Manifest.model_json_schema())
+    assert [error.message for error in schema.iter_errors(manifest)] == []
+    for fault in ({"items": [{"type": "Canvas"}]}, {"label": "of no language"}, {"type": "Collection"}, {"id": 3}):
+        assert list(schema.iter_errors(manifest | fault))
