@@ -29,6 +29,8 @@ class PatchOptions(Options):
     """The first universe; a lamp whose channels would not fit begins the next."""
     bits: Literal[8, 16] = 16
     """The bits of a level: 8, or 16 on two channels."""
+    host: Line | None = None
+    """The address of the node of all lamps, such as 127.0.0.1 for relit twin; None: multicast for sacn, broadcast for artnet."""
 
 
 class RigCheckRequest(Options):

@@ -94,7 +94,8 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
         if patched:
             channel = int(number("channel"))
             given = {name: channel + index * request.bits // 8 for index, name in enumerate(request.primaries)}
-            entry: object = {"protocol": request.protocol.value, "universe": int(number("universe")), "channels": given}
+            entry: object = {"protocol": request.protocol.value, "universe": int(number("universe")), "channels": given,
+                             "host": request.host}
         else:
             entry = address
         data = {"name": row["name"], "type": "point" if request.places else "distant", "bits": request.bits, "address": entry,

@@ -34,6 +34,7 @@ def addresses(patch: PatchOptions, primaries: Sequence[str]) -> Iterator[Address
             raise RequestError(f"--universe {patch.universe}: lamps would lie in universe {universe}: {patch.protocol} has {first} to "
                                f"{last}")
         yield Address(protocol="sacn" if patch.protocol is Protocol.SACN else "artnet", universe=universe,
+                      host=patch.host,
                       channels={name: channel + index * patch.bits // 8 for index, name in enumerate(primaries)})
         channel += width
 

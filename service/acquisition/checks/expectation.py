@@ -10,6 +10,8 @@ from service.acquisition.checks.prediction import prediction_weights, rough_weig
 from service.acquisition.checks.sample import Sample
 from service.acquisition.plans.shots import Shot
 
+LEAST_MISFIT = 1e-4
+"""A misfit below this is as good as none."""
 LEAST_WEIGHT = 1e-3
 """Pictures with less weight are left out of a prediction."""
 

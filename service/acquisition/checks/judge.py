@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 
 from service.acquisition.checks.expectation import (
+    LEAST_MISFIT,
     Expectation,
     Seen,
     comparable,
@@ -22,6 +23,7 @@ from service.acquisition.checks.fault import Fault, FaultKind
 from service.acquisition.checks.motion import Motion, bands_of, motion_between
 from service.acquisition.checks.prediction import LEAST_LAMPS
 from service.acquisition.checks.sample import place_of_tile, sample_of
+from service.acquisition.checks.unreached import glows, unreached_faults
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig
 
@@ -35,12 +37,10 @@ LEAST_LIGHT = 0.05
 """A lamp is judged if it gives, or should give, this part of the light that lamps give on the average."""
 UNLIT_PART = 0.03
 """A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
-GLOW_GAIN = 2.0
-"""A block reads more than in the dark if it is above it by more than this factor of the most that one is below it: noise is symmetric."""
 SAME_PART = 0.15
 """Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
-LEAST_MISFIT, AGREEMENT_WEIGHT = 1e-4, 4.0
-"""A misfit below the first is as good as none; a correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
+AGREEMENT_WEIGHT = 4.0
+"""A correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
 NEAR_COSINE = 0.3
 """Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
 MOVED_PX, MOVED_GAIN, MOVED_CORRELATION = 1.5, 1.6, 0.35
@@ -91,8 +91,11 @@ class Judge:
             return [Fault(shot.key, FaultKind.DOUBLED, f"is the picture of {doubled} again")]
         if seen.sample.digest is not None:
             self._digests[seen.sample.digest] = shot.key
-        found = [*self._exposure_faults(seen), *self._faults(seen, self._others(seen, self._sound()))][:1]
-        if found and found[0].kind is FaultKind.UNLIT and self._glows(seen):
+        found = list(self._exposure_faults(seen))
+        if not found and shot.lamp is not None and shot.exposure_s is None:  # of several exposures, short ones may show no lamp
+            found = [fault for fault in unreached_faults([*self._seen.values(), seen], self._dark) if fault.shot == shot.key]
+        found = [*found, *self._faults(seen, self._others(seen, self._sound()))][:1]
+        if found and found[0].kind is FaultKind.UNLIT and glows(seen, self._dark(shot)):
             return []  # as behind the object: all pictures together tell such a lamp from one that failed
         return found
 
@@ -121,6 +124,8 @@ class Judge:
         """
         certain = {key: each.faults[0] for key, each in self._seen.items() if each.faults and each.faults[0].kind in CERTAIN}
         found: dict[str, Fault] = {}
+        left = [each for key, each in self._seen.items() if key not in certain]
+        certain |= {fault.shot: fault for fault in unreached_faults(left, self._dark)}
         keys = [key for key in self._seen if key not in certain]
         for key in keys:
             if faults := self._dark_faults(self._seen[key], [self._seen[other] for other in keys if other not in found]):
@@ -283,14 +288,6 @@ class Judge:
             return False
         used = self._expectation.weights(seen, self._others(seen, keys))
         return used is None or any(each.shot.key == other for _, each in used)
-
-    def _glows(self, seen: Seen) -> bool:
-        """Return whether a picture under a lamp reads more than the dark one somewhere; False without a dark one."""
-        dark = self._dark(seen.shot)
-        if seen.shot.lamp is None or isinstance(dark, float):
-            return False
-        above = seen.sample.blocks - dark
-        return bool(above.max() > GLOW_GAIN * -above.min())
 
     def _dark(self, shot: Shot) -> np.ndarray | float:
         """Return the mean picture without any lamp, [blocks]; 0 where there is none."""

@@ -75,3 +75,22 @@ def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
     scene = Scene(ring.images.astype(np.float32), ring.directions)
     made, found = named(scene, 1, ())
     assert made == found == {}
+
+
+@pytest.mark.parametrize("dark", [2, 0])
+@pytest.mark.parametrize("ambient", [0.0, 0.8])
+def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
+    """In the dark, where pictures are noise, and in a room with its lights on, where all show the same."""
+    scene = relief(1)
+    rig, random, judge = rig_of(scene), np.random.default_rng(1), Judge(rig_of(scene))
+    room = ambient * scene.radiance.mean(axis=0)
+    shots = [shot for shot in shots_on(rig)[2 - dark:] if shot.lamp is not None or not shot.levels.any()]
+    at_once = 0
+    for shot in shots:
+        pixels = np.clip(room + 0.001 * random.standard_normal(room.shape), 0, 1).astype(np.float32)
+        faults = judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE)
+        at_once += bool(faults)
+        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, faults)
+    lamps = [shot.key for shot in shots if shot.lamp is not None]
+    assert {fault.shot: fault.kind for fault in judge.review()} == dict.fromkeys(lamps, FaultKind.UNLIT)
+    assert at_once >= len(lamps) - 7  # of a room without a dark picture from the eighth on
