@@ -8,18 +8,19 @@ import numpy as np
 
 from kernels.status import ESTIMATED
 from service.relight.relight import relight
-from service.relight.sheet import BACKGROUND, display, exposure_of, read_frame, write_sheet
+from service.relight.sheet import AS_EVER, BACKGROUND, display, exposure_of, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.relight import RelightRequest
 from service.requests.solve import Intensities, Method, SolveRequest
 from service.solve.opening import open_solve
+from stage.colour.colour_spaces import Review
 
 PREVIEW_FILE = "preview.png"
 KEY_LIGHT = {"name": "key", "keys": [{"frame": 1, "direction": [-0.5, 0.6, 0.62], "irradiance": [3, 3, 3], "angle_degrees": 20}]}
 """The light of the relit picture, a large lamp above left of the camera."""
 
 
-def write_preview(capture: Path, device: str | None, progress: Progress | None = None) -> Path:
+def write_preview(capture: Path, device: str | None, progress: Progress | None = None, *, review: Review = AS_EVER) -> Path:
     """Write preview.png into the folder of a capture, and return its path.
 
     Normals are those of least squares on the lights in neither shadow nor highlight, without the judgement of a solve, its height and its
@@ -39,7 +40,7 @@ def write_preview(capture: Path, device: str | None, progress: Progress | None =
         keys.write_text(json.dumps({"schema": "relit.keys/1", "lights": [KEY_LIGHT]}))
         made = relight(RelightRequest(capture=capture, keys=keys, out=f"{folder}/frame.####.exr", device=device), progress)
         relit, space = read_frame(made.frames[0])
-    shown = display(relit * exposure_of(relit[None], known[..., 0]), space)
+    shown = display(relit * exposure_of(relit[None], known[..., 0]), space, review)
     path = capture / PREVIEW_FILE
     write_sheet(path, [[("normals", normals), ("relit from above left", shown)]], height=min(shape[0], 480))
     return path

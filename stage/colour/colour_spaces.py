@@ -6,7 +6,7 @@ without loading one.
 """
 
 import os
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field
 
@@ -23,6 +23,16 @@ NAMES = (
     "srgb_texture", "srgb_rec709_scene", "g22_rec709_scene", "g18_rec709_scene", "srgb_p3d65_scene", "g22_adobergb_scene",
 )
 """The names that are known under every configuration: scene-linear spaces, and the display-encoded spaces of 8-bit cameras and textures."""
+
+
+class Review(NamedTuple):
+    """The way from scene-linear pixels to those of a display; without values that of `Configuration.view`."""
+
+    view: str | None = None
+    """DISPLAY/VIEW, or a view, as `Configuration.view` takes it."""
+    look: str | None = None
+    """Looks, as `Configuration.checked_look` takes them; None: those of the view."""
+
 
 _LINEAR_OF: dict[str, str] = {
     "srgb_texture": "lin_rec709_scene",

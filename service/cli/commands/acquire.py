@@ -85,7 +85,7 @@ def _preview(request: AcquireRequest, taken: int) -> None:
     if taken == 0 and (request.out / PREVIEW_FILE).exists():
         return
     try:
-        print(f"preview  {write_preview(request.out, request.device)}", flush=True)
+        print(f"preview  {write_preview(request.out, request.device, review=request.review)}", flush=True)
     except USER_ERRORS as error:
         print(f"preview  none: {sentence(error)}", flush=True)
 

@@ -32,7 +32,7 @@ from tests.service.server_process import serving
 LONG_S = int(os.environ.get("FUZZ_SECONDS", "0"))
 FREE = {"get_health", "get_readiness", "abilities"}
 """Operations that need no key."""
-NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000"}
+NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000", "max_project_hooks": "1000000"}
 
 
 @pytest.fixture(scope="module")
