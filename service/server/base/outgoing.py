@@ -22,6 +22,9 @@ TIMEOUT_S = 10.0
 NAT64 = ip_network("64:ff9b::/96")
 """IPv6 addresses whose last 32 bits are the IPv4 address that is meant (RFC 6052)."""
 
+UNICAST = ip_network("2000::/3")
+"""The IPv6 addresses that are given to hosts (RFC 4291). Others, such as ::127.0.0.1, can lead to addresses of IPv4."""
+
 
 class Answer(NamedTuple):
     """The outcome of a request."""
@@ -97,7 +100,7 @@ def _require_allowed(scheme: str, address: IPv4Address | IPv6Address, networks: 
     meant = _meant(address)
     if any(meant in ip_network(network) for network in networks):
         return
-    if not meant.is_global or meant.is_multicast:
+    if not meant.is_global or meant.is_multicast or (meant.version == 6 and meant not in UNICAST):
         raise RequestError(f"url: {address} is not a public address, and no network of the setting hook_networks has it")
     if scheme != "https":
         raise RequestError(f"url: http:// is for networks of the setting hook_networks, and {address} is in none: give https://")

@@ -115,7 +115,7 @@ class HookSender:
         if not hooks.settle(connection, taken, state=state, answer=words, due_at=due_at) or (state == hooks.WAITING and tries > 1):
             return
         said = {hooks.DELIVERED: "told", hooks.GIVEN_UP: f"given up after {tries} tries", hooks.WAITING: "not told, tried again"}[state]
-        logger.info("hook", delivery=taken["id"], hook=taken["hook"], job=taken["job"], state=state, answer=words)
+        logger.info("hook delivery", delivery=taken["id"], hook=taken["hook"], job=taken["job"], state=state, answer=words)
         if taken["job"] is not None:
             jobs.note(connection, taken["job"], f"{taken['hook']} {said}: {words}")
 
