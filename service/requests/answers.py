@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.requests.base.identifiers import HookId, JobId, UploadId
 from service.requests.hooks import HookEvent
-from service.requests.jobs import AnyJob
+from service.requests.jobs import StoredJob
 from service.requests.states import IntakeState, JobState
 
 Time = Annotated[datetime, Field(description="UTC.")]
@@ -42,7 +42,7 @@ class JobView(View):
     revision: int
     """Grows with every change."""
     priority: int
-    request: AnyJob
+    request: StoredJob
     created_at: Time
     started_at: Time | None
     finished_at: Time | None

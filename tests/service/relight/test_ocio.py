@@ -8,6 +8,8 @@ import pytest
 
 from service.captures.check_process import check_in_process
 from service.errors import RequestError
+from service.requests.answers import JobView
+from service.requests.jobs import RelightJob
 from stage.colour.colour import linearise, rgb_matrix
 from stage.colour.colour_spaces import STUDIO, VARIABLE, linear_space
 from stage.colour.configuration import used
@@ -116,6 +118,20 @@ def test_the_process_that_checks_uploads_has_the_configuration_of_the_service(lo
     monkeypatch.delenv(VARIABLE)
     with pytest.raises(RequestError, match="color_space: ARRI LogC4 is no colour space of"):
         check_in_process(logged[0], environment=False, root=None, max_pixels=10**6, progress=Told())
+
+
+def test_a_client_reads_a_job_in_a_space_that_its_own_configuration_lacks(monkeypatch):
+    asked = {"kind": "relight", "capture": f"cap_{'0' * 20}", "environment": f"env_{'0' * 20}",
+             "options": {"color_space": "Linear ARRI Wide Gamut 4", "frames": "1-3"}}
+    view = {"id": f"job_{'0' * 20}", "state": "queued", "attempt": 1, "revision": 1, "priority": 50, "created_at": 0, "started_at": None,
+            "finished_at": None, "progress": None, "error": None}
+    monkeypatch.setenv(VARIABLE, STUDIO)
+    request = RelightJob.model_validate(asked).model_dump(mode="json", by_alias=True)
+    monkeypatch.delenv(VARIABLE)
+    text = json.dumps({**view, "request": request})
+    assert JobView.model_validate_json(text).request.options.color_space == request["options"]["color_space"]
+    with pytest.raises(ValueError, match="is no colour space of the OpenColorIO configuration ocio://default"):
+        RelightJob.model_validate(asked)  # a request is checked as ever
 
 
 def test_a_view_has_the_matrix_of_a_space_that_the_pages_do_not_know(relit, logged, tmp_path):
