@@ -19,11 +19,11 @@ from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import Shot, shots_of
 from service.errors import RequestError
-from service.relight.sheet import BACKGROUND, TILE, display, write_sheet
+from service.relight.sheet import AS_EVER, BACKGROUND, TILE, display, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.acquire import AcquireRequest
 from stage.colour.colour import linearise
-from stage.colour.colour_spaces import linear_space
+from stage.colour.colour_spaces import Review, linear_space
 from stage.files import write_text
 from stage.importers.layout import color_space_of
 from stage.rig.rig import Rig, read_rig
@@ -206,7 +206,8 @@ class _Meter:
     def _write(self, result: Metered, taken: list[_Taken], seen: np.ndarray, brightest: int) -> None:
         counts = np.histogram(taken[brightest].pixels.max(axis=2)[seen], bins=BINS, range=(0, 1))[0]
         across = 3
-        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", zebra(each.pixels, self._space, self._full))
+        review = self._request.review
+        tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", zebra(each.pixels, self._space, self._full, review))
                  for each, reading in zip(taken, result.readings, strict=True)]
         tiles.append((f"readings under {result.readings[brightest].lamp}", _bars(counts)))
         write_sheet(result.picture, [tiles[begin:begin + across] for begin in range(0, len(tiles), across)])
@@ -217,11 +218,11 @@ class _Meter:
             "camera_settings": self._camera.settings}, indent=1) + "\n")
 
 
-def zebra(pixels: np.ndarray, space: str, full: float) -> np.ndarray:
+def zebra(pixels: np.ndarray, space: str, full: float, review: Review = AS_EVER) -> np.ndarray:
     """Return a picture as it is displayed, [rows, cols, 3], with stripes where a channel is at full scale."""
     step = max(1, len(pixels) // TILE)
     clipped = ndimage.maximum_filter(pixels.max(axis=2) >= full, step)[::step, ::step]
-    shown = display(linearise(np.ascontiguousarray(pixels[::step, ::step]), space), linear_space(space))
+    shown = display(linearise(np.ascontiguousarray(pixels[::step, ::step]), space), linear_space(space), review)
     stripe = (np.add(*np.indices(clipped.shape)) // STRIPE_PX) % 2 == 0
     shown[clipped & stripe] = (1.0, 0.1, 0.1)
     return shown

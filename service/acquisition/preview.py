@@ -8,11 +8,12 @@ import numpy as np
 
 from kernels.status import ESTIMATED
 from service.relight.relight import relight
-from service.relight.sheet import BACKGROUND, display, exposure_of, fit, read_frame, write_sheet
+from service.relight.sheet import AS_EVER, BACKGROUND, display, exposure_of, fit, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
 from service.requests.relight import RelightRequest
 from service.requests.solve import Intensities, Method, SolveRequest
 from service.solve.opening import open_solve
+from stage.colour.colour_spaces import Review
 
 PREVIEW_FILE = "preview.png"
 ROWS = 480
@@ -21,7 +22,7 @@ KEY_LIGHT = {"name": "key", "keys": [{"frame": 1, "direction": [-0.5, 0.6, 0.62]
 """The light of the relit picture, a large lamp above left of the camera."""
 
 
-def write_preview(capture: Path, device: str | None, progress: Progress | None = None) -> Path:
+def write_preview(capture: Path, device: str | None, progress: Progress | None = None, *, review: Review = AS_EVER) -> Path:
     """Write preview.png into the folder of a capture, and return its path.
 
     Normals are those of least squares on the lights in neither shadow nor highlight, without the judgement of a solve, its height and its
@@ -45,6 +46,6 @@ def write_preview(capture: Path, device: str | None, progress: Progress | None =
     relit = fit(relit, rows, kernel="triangle")  # a view transforms a megapixel in a second
     seen = fit(np.repeat(known, 3, axis=2), rows, kernel="triangle")[..., 0] > 0
     path = capture / PREVIEW_FILE
-    shown = display(relit * exposure_of(relit[None], seen), space)
+    shown = display(relit * exposure_of(relit[None], seen), space, review)
     write_sheet(path, [[("normals", fit(normals, rows, kernel="triangle")), ("relit from above left", shown)]], height=rows)
     return path

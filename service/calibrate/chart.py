@@ -100,7 +100,7 @@ def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> 
     written, unseen = _corrected(source, target, found)
     warnings = (*_stance(corners), *(finding for each in found for finding in _findings(each, len(found), manifest)), *unseen)
     shown = [(each.kind.words(manifest) if len(found) > 1 else "corrected", each.colors) for each in found]
-    picture = write_picture(manifest_path.parent / PICTURE_FILE, mean, corners, chart, shown, space)
+    picture = write_picture(manifest_path.parent / PICTURE_FILE, mean, corners, chart, shown, space, request.review)
     report = write_results("chart", request, written, manifest_path, {
         "capture": str(source.folder), "applied_to": str(target.folder), "reference": chart.source,
         "corners": [digits(corner) for corner in corners], "kinds": [_entry(each, chart, manifest) for each in found],

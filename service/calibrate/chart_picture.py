@@ -9,6 +9,7 @@ from service.calibrate.solvers.chart_colors import ChartColors
 from service.calibrate.solvers.chart_reference import ChartReference
 from service.calibrate.solvers.cielab import xyz_from_linear
 from service.relight.sheet import BACKGROUND, display, write_sheet
+from stage.colour.colour_spaces import Review
 
 PICTURE_FILE = "chart.png"
 PATCH, GAP = 42, 6
@@ -22,7 +23,7 @@ MOST_ROWS = 480
 
 
 def write_picture(path: Path, photograph: np.ndarray, corners: np.ndarray, chart: ChartReference, found: Sequence[tuple[str, ChartColors]],
-                  space: str) -> Path:
+                  space: str, review: Review) -> Path:
     """Write the picture, and return its path.
 
     Args:
@@ -30,6 +31,7 @@ def write_picture(path: Path, photograph: np.ndarray, corners: np.ndarray, chart
         corners: [4, 2] pixels of the centres of the corner patches.
         found: the title and the colours of each kind of light.
         space: the working space of the capture.
+        review: the view through which colours are shown.
     """
     reach = AROUND * float(np.ptp(corners, axis=0).max())
     (left, top), (right, bottom) = np.maximum(corners.min(axis=0) - reach, 0).astype(int), (corners.max(axis=0) + reach).astype(int) + 1
@@ -44,18 +46,18 @@ def write_picture(path: Path, photograph: np.ndarray, corners: np.ndarray, chart
     for title, colors in found:
         through = np.maximum(part @ colors.matrix.T, 0)
         shown = WHITE * through / max(float(np.percentile(through[on_chart], 99)), 1e-30)
-        rows.append([(title, display(shown.astype(np.float32), space)),
-                     ("measured | reference | corrected", _patches(colors, reference, chart.grid, space))])
+        rows.append([(title, display(shown.astype(np.float32), space, review)),
+                     ("measured | reference | corrected", _patches(colors, reference, chart.grid, space, review))])
     write_sheet(path, rows)
     return path
 
 
-def _patches(colors: ChartColors, reference: np.ndarray, grid: tuple[int, int], space: str) -> np.ndarray:
+def _patches(colors: ChartColors, reference: np.ndarray, grid: tuple[int, int], space: str, review: Review) -> np.ndarray:
     """Return display values of the patches, each in three stripes; those that are left out have the reference alone."""
     columns, rows = grid
     pitch = PATCH + GAP
     sheet = np.tile(BACKGROUND, (rows * pitch - GAP, columns * pitch - GAP, 1))
-    stripes = display(np.clip(np.stack([colors.measured, reference, colors.corrected]), 1e-6, None).astype(np.float32), space)
+    stripes = display(np.clip(np.stack([colors.measured, reference, colors.corrected]), 1e-6, None).astype(np.float32), space, review)
     for index in range(columns * rows):
         row, column = divmod(index, columns)
         for stripe in range(3) if index not in colors.refused else (1,):

@@ -12,7 +12,7 @@ from service.relight.sheet import BACKGROUND, display, display_gain, dome_places
 from stage.capture.capture import Capture
 from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.manifest import Frame
-from stage.colour.colour_spaces import linear_space
+from stage.colour.colour_spaces import Review, linear_space
 from stage.errors import StageError
 from stage.stack.correction import Correction
 from stage.tof.raw_frames import read_frame
@@ -48,7 +48,8 @@ class _Views(NamedTuple):
     saturated: np.ndarray  # [rows, cols] in how many frames each pixel is saturated
 
 
-def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], done: Callable[[int], None]) -> None:
+def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], review: Review,
+                  done: Callable[[int], None]) -> None:
     """Write the picture of a capture.
 
     Args:
@@ -58,7 +59,7 @@ def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[s
     """
     unit = 1.0 if peak <= 2.0 ** STOPS[1] else 2.0 ** (np.ceil(np.log2(peak)) - STOPS[1])
     views = _read(capture, unit, done)
-    images, (mean,) = _shown(views.images, capture), _shown([views.mean], capture)
+    images, (mean,) = _shown(views.images, capture, review), _shown([views.mean], capture, review)
     inside, hit = views.mask[..., None], views.saturated[views.mask] > 0
     part = np.minimum(views.saturated / max(len(images) / 4, 1), 1)[..., None]
     over = np.where(part > 0, (0.35 + 0.65 * part) * np.array(RED), mean.mean(axis=-1, keepdims=True) * 0.5)
@@ -119,7 +120,7 @@ def _directions(capture: Capture) -> dict[str, np.ndarray]:
     return {frame.image: direction for frame, direction in zip(lit, lights.direction, strict=True)}
 
 
-def _shown(images: Sequence[np.ndarray | None], capture: Capture) -> list[np.ndarray]:
+def _shown(images: Sequence[np.ndarray | None], capture: Capture, review: Review) -> list[np.ndarray]:
     """Return images as they are displayed, alike exposed; crossed where there is none."""
     there = [image for image in images if image is not None]
     if not there:
@@ -130,7 +131,7 @@ def _shown(images: Sequence[np.ndarray | None], capture: Capture) -> list[np.nda
     else:
         gain = np.float32(display_gain(np.stack(there)))
         together = np.concatenate([np.maximum(image, 0) * gain for image in there])
-        parts = iter(np.split(display(together, linear_space(capture.manifest.color_space)), len(there)))
+        parts = iter(np.split(display(together, linear_space(capture.manifest.color_space), review), len(there)))
     return [_crossed(there[0].shape[1] / there[0].shape[0]) if image is None else next(parts) for image in images]
 
 

@@ -20,7 +20,7 @@ from stage.capture.lighting import MEASURED_BY, check_solvable, has_placeholders
 from stage.capture.manifest import FILE_NAME, Frame
 from stage.capture.point_lights import PlacedLights, distance_is_missing, place_lights
 from stage.capture.projector import Projector
-from stage.colour.colour_spaces import linear_space
+from stage.colour.colour_spaces import Review, linear_space
 from stage.colour.configuration import current
 from stage.colour.radiance import clipping_sentences
 from stage.errors import StageError, StorageError
@@ -60,6 +60,7 @@ class _FrameLevel(NamedTuple):
 
 def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspection:
     """Decode and check every frame of a capture."""
+    request.require_picture("--picture", request.picture)
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
@@ -99,12 +100,12 @@ def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspectio
     looks = [*capture.doubts, *found.sentences]
     if request.picture is not None:
         peak = max((level.peak for level in read), default=1.0)
-        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, timings)))
+        facts.append(("picture", _picture(request.picture, capture, peak, found.suspects, request.review, timings)))
     timings.close()
     return Inspection(facts, faults, looks)
 
 
-def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], timings: Timings) -> str:
+def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], review: Review, timings: Timings) -> str:
     """Write the picture of a capture, and return its path, or why there is none."""
     from service.captures.capture_picture import write_picture
     from service.relight.outputs import check_outputs
@@ -112,7 +113,7 @@ def _picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, f
     check_outputs([(f"--picture {path}", path)], (capture.folder / FILE_NAME, *(capture.file(name) for _, name in capture.files())))
     timings.stage("picture", len(capture.manifest.frames))
     try:
-        write_picture(path, capture, peak, suspects, timings.advance)
+        write_picture(path, capture, peak, suspects, review, timings.advance)
     except StorageError:
         raise
     except StageError as error:  # of the mask, or the dark, flat or ambient frames

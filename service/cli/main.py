@@ -59,6 +59,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
                   "residuals."),
     "submit": ("submit", "Submit work to a service, with the options of the commands that do it on this machine."),
     "jobs": ("jobs", "List the jobs of a service, wait for them, cancel, retry or resume them, and fetch their results."),
+    "hooks": ("hooks", "Let a service tell a URL how the jobs of a project have ended; list, test and delete such hooks."),
     "farm": ("farm", "Jobs for render farms; docs/farm.md."),
 }
 """The commands in the order of the help: the module of service.cli.commands that registers each, and its sentence in the list of commands.

@@ -20,6 +20,7 @@ from service.client.errors import (
     Refused,
     Unreachable,
 )
+from service.client.hooks import Hooks
 from service.client.intakes import Intakes
 from service.client.jobs import Jobs
 from service.requests.base.identifiers import DEFAULT_SERVER
@@ -48,6 +49,7 @@ class Client:
         self.captures = Intakes(self._connection, "/v1/captures", "folder", parallel=parallel)
         self.environments = Intakes(self._connection, "/v1/environments", "file", parallel=parallel)
         self.jobs = Jobs(self._connection, parallel=parallel)
+        self.hooks = Hooks(self._connection)
 
     def close(self) -> None:
         """Close the connections to the service."""

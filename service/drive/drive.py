@@ -102,7 +102,7 @@ def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResul
     timings.stage("files", 1)
     cues, report = write_cue_files(request, rig, quantised, numbers, rate, sections, warnings, timings)
     titles = [_title(*frame) for frame in zip(numbers, light.beyond, dilated.radius, strict=True)]
-    picture = write_picture(request.out, rig, light.far, quantised.level, factor, titles, shown)
+    picture = write_picture(request.out, rig, light.far, quantised.level, factor, titles, shown, request.review)
     if request.capture is not None:
         camera = TwinPicture(rig, TwinRequest(rig=request.rig, capture=request.capture, device=device, cache=request.cache), timings)
         warnings += tuple(camera.warnings)

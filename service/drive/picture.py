@@ -9,6 +9,7 @@ from service.drive.chart_view import ChartView
 from service.drive.judgement import far_irradiance, irradiance_of, lamp_irradiance
 from service.relight.far_light import FarLight
 from service.relight.sheet import BACKGROUND, display, write_sheet
+from stage.colour.colour_spaces import Review
 from stage.rig.rig import Rig
 
 PICTURE_FILE = "preview.png"
@@ -29,7 +30,7 @@ LAMP_COSINE = float(np.cos(np.radians(4.0)))
 
 
 def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, titles: Sequence[str],
-                  chart: ChartView | None) -> Path:
+                  chart: ChartView | None, review: Review) -> Path:
     """Write the picture into a folder and return its path.
 
     Args:
@@ -40,9 +41,11 @@ def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.nda
         exposure: [frames] factor on the light.
         titles: of the frames.
         chart: what it shows in each frame; None: there is none.
+        review: the view through which colours are shown.
     """
     shown = np.linspace(0, len(far), min(MOST_ROWS, len(far)), endpoint=False).astype(int)
-    rows = [_row(rig, far[index], level[index], exposure[index], titles[index], None if chart is None else chart.picture(index))
+    rows = [_row(rig, far[index], level[index], exposure[index], titles[index], None if chart is None else chart.picture(index),
+                 review)
             for index in shown]
     path = folder / PICTURE_FILE
     write_sheet(path, rows)
@@ -50,7 +53,7 @@ def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.nda
 
 
 def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, title: str,
-         chart: np.ndarray | None) -> list[tuple[str, np.ndarray]]:
+         chart: np.ndarray | None, review: Review) -> list[tuple[str, np.ndarray]]:
     energy = lamp_irradiance(level[None], rig)[0]
     normal, on_ball = _ball()
     wanted = far_irradiance(light, normal, SAMPLE_ROWS) * exposure
@@ -66,18 +69,18 @@ def _row(rig: Rig, light: FarLight, level: np.ndarray, exposure: float, title: s
 
     def ball(values: np.ndarray) -> np.ndarray:
         picture = np.tile(BACKGROUND, (BALL, BALL, 1))
-        picture[on_ball] = display((values * scale)[None].astype(np.float32), rig.color_space)[0]
+        picture[on_ball] = display((values * scale)[None].astype(np.float32), rig.color_space, review)[0]
         return picture
 
     tiles = [("mirror ball: environment", ball(mirrored * np.pi)), ("mirror ball: lamps", ball(lamps * np.pi)),
              ("matte ball: environment", ball(wanted)), ("matte ball: lamps", ball(given)),
              (f"{ERROR_SCALE:.0f} x difference", ball(np.abs(given - wanted) * ERROR_SCALE))]
     if chart is not None:
-        tiles.append(("chart: environment, within it lamps", display((chart * scale).astype(np.float32), rig.color_space)))
+        tiles.append(("chart: environment, within it lamps", display((chart * scale).astype(np.float32), rig.color_space, review)))
     if light.environment is not None:
         step = -(-len(light.environment.radiance) // MAP_ROWS)
         shown = light.environment.radiance[::step, ::step] * (light.gain * exposure * scale * np.pi)
-        tiles.insert(0, ("map", display(shown.astype(np.float32), rig.color_space)))
+        tiles.insert(0, ("map", display(shown.astype(np.float32), rig.color_space, review)))
     return [(f"{title}: {tiles[0][0]}", tiles[0][1]), *tiles[1:]]
 
 

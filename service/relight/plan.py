@@ -16,7 +16,6 @@ from service.requests.light.frame_range import frame_numbers, part_of
 from service.requests.light.light_keys import LightKeys
 from service.requests.light.picture_options import Layer
 from service.requests.relight import RelightRequest
-from stage.colour.configuration import current
 
 
 class PlannedFrame(NamedTuple):
@@ -72,10 +71,7 @@ def make_plan(request: RelightRequest) -> Plan:
     made = range(numbers[0], numbers[-1] + 1) if request.only is None else part_of(numbers, request.only)
     outputs = [(f"--out {request.out}", path) for path in paths]
     check_layers(request, request.maps)
-    if request.view is not None:
-        current().view(request.view)
-        if request.sheet is None:
-            raise RequestError(f"--view {request.view}: is for the contact sheet: give --sheet too")
+    request.require_picture("--sheet", request.sheet)
     if request.sheet is not None:
         if request.only is not None:
             raise RequestError(f"--sheet {request.sheet} shows the whole range, --only {request.only} makes a part of it: give one of them")

@@ -102,7 +102,7 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     paths = tuple(frame.path for frame in plan.frames)
     if request.sheet is not None:
         timings.stage("sheet", 1)
-        contact_sheet(request.sheet, paths, request.view)
+        contact_sheet(request.sheet, paths, request.review)
     if request.nuke is not None:
         numbered = [(frame.scheduled.number, frame.path) for frame in plan.frames]
         write_nuke_script(request.nuke, request.out, numbered, plan.groups, plan.rate)

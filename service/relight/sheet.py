@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from stage.colour.colour import pixels_of, through_view
+from stage.colour.colour_spaces import Review
 from stage.files import replacing
 from stage.formats import exr
 from stage.formats.images import write_png
@@ -25,16 +26,18 @@ INK = (0.82, 0.84, 0.87)
 EXPOSURE_PERCENTILE = 99.0
 """This percentile of what is shown becomes EXPOSURE_TARGET before the display transform."""
 EXPOSURE_TARGET = 0.8
+AS_EVER = Review()
+"""The view of pictures for which no other is chosen."""
 
 
-def contact_sheet(path: Path, frames: Sequence[Path], view: str | None = None) -> None:
+def contact_sheet(path: Path, frames: Sequence[Path], review: Review = AS_EVER) -> None:
     """Write a contact sheet, a PNG, of EXR frames at the exposure that they were made with, through a view of OpenColorIO."""
     shown = [frames[i] for i in np.linspace(0, len(frames), min(MOST_FRAMES, len(frames)), endpoint=False).astype(int)]
     tiles = []
     for frame in shown:
         pixels, space = read_frame(frame)
         # in linear light, and before the display transform: that is the slow part
-        tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space, view)))
+        tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space, review)))
     across = max(1, math.ceil(math.sqrt(len(tiles) * FRAME_TILE / max(tiles[0][1].shape[1], 1) * 16 / 9)))  # as wide as a screen
     write_sheet(path, [tiles[begin : begin + across] for begin in range(0, len(tiles), across)], height=FRAME_TILE)
 
@@ -52,16 +55,16 @@ def read_frame(path: Path) -> tuple[np.ndarray, str]:
     return np.stack([channels[c] for c in "RGB"], axis=-1).astype(np.float32), exr.color_space_of(metadata)
 
 
-def display(pixels: np.ndarray, space: str, view: str | None = None) -> np.ndarray:
+def display(pixels: np.ndarray, space: str, review: Review = AS_EVER) -> np.ndarray:
     """Return display values, [rows, cols, 3] float32, 0…1, of scene-linear ones in a colour space, through a view of OpenColorIO.
 
-    `view` is DISPLAY/VIEW or VIEW, as `Configuration.view` takes it. Black becomes the background of a sheet.
+    Black becomes the background of a sheet.
     """
     lit = pixels.any(axis=-1)
     shown = np.empty(pixels.shape, dtype=np.float32)
     shown[~lit] = BACKGROUND
     if lit.any():  # the transform takes a microsecond a pixel, and most of an object's picture is black
-        shown[lit] = through_view(pixels[lit][None], space, view)[0]
+        shown[lit] = through_view(pixels[lit][None], space, review)[0]
     return np.maximum(shown, BACKGROUND * (pixels.max(axis=-1, keepdims=True) <= 0))
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 
 from service.requests.base.base import Choice, Commas, DeviceRequest, Role, Spelling, WidthHeight
+from service.requests.base.review import ReviewOptions
 from service.requests.patterns import Side
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.model import FirstFault, Line, Positive
@@ -18,7 +19,7 @@ class Then(Choice):
     EXPORT = "export", "of these an asset, asset.usdz in the capture"
 
 
-class AcquireRequest(DeviceRequest):
+class AcquireRequest(ReviewOptions, DeviceRequest):
     """Take a capture: switch each light or show each pattern, take the picture, check it, and write the capture folder as it goes. Given
     again, the command takes the pictures that are missing."""
 

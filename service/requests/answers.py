@@ -1,12 +1,13 @@
 """The models of the answers of the service, views for short, shared by the API and its client."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.requests.base.identifiers import JobId, UploadId
-from service.requests.jobs import AnyJob
+from service.requests.base.identifiers import HookId, JobId, UploadId
+from service.requests.hooks import HookEvent
+from service.requests.jobs import StoredJob
 from service.requests.states import IntakeState, JobState
 
 Time = Annotated[datetime, Field(description="UTC.")]
@@ -41,7 +42,7 @@ class JobView(View):
     revision: int
     """Grows with every change."""
     priority: int
-    request: AnyJob
+    request: StoredJob
     created_at: Time
     started_at: Time | None
     finished_at: Time | None
@@ -135,3 +136,47 @@ class FilePage(View):
     files: list[FileView]
     next: str | None
     """Give it as `after` for the page after this one; null: this is the last page."""
+
+
+class DeliveryView(View):
+    """An event that a hook is told of."""
+
+    id: str
+    """The `webhook-id` of every try."""
+    event: HookEvent | Literal["test"]
+    job: JobId | None
+    """The job that ended; None: a test."""
+    state: Literal["waiting", "delivered", "given_up"]
+    tries: int
+    made_at: Time
+    tried_at: Time | None
+    due_at: Time | None
+    """The time of the next try; None: it is delivered or given up."""
+    answer: str | None
+    """The status of the answer to the last try, or why there was none; None: it was not tried yet, or is being tried."""
+
+
+class HookView(View):
+    """A URL that is told how the jobs of the project have ended."""
+
+    id: HookId
+    url: str
+    events: list[HookEvent]
+    created_at: Time
+    waiting: int
+    """Deliveries that the receiver has not accepted yet."""
+    last_delivery: DeliveryView | None
+    """The delivery that was tried last."""
+
+
+class NewHookView(HookView):
+    """A new hook."""
+
+    secret: str
+    """The secret that signs, in the form of Standard Webhooks; it is not shown again."""
+
+
+class HookList(View):
+    """The hooks of a project, the oldest first."""
+
+    hooks: list[HookView]

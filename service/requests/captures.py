@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from service.requests.base.base import CAPTURE, PixelOptions, Request, Role, Spelling, StackOptions
+from service.requests.base.review import ReviewOptions
 
 MOST_TERMS = 256
 """Layers that a texture of any browser with WebGL2 can have (OpenGL ES 3.0, table 6.29)."""
@@ -17,7 +18,7 @@ def _png(path: Path | None) -> Path | None:
     return path
 
 
-class InfoRequest(PixelOptions):
+class InfoRequest(ReviewOptions, PixelOptions):
     """Say what a capture holds, and what is wrong with it."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]

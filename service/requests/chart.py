@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base.base import CAPTURE, Choice, Commas, Options, Role, Spelling
+from service.requests.base.review import ReviewOptions
 from service.requests.calibrate import ManifestRequest
 from stage.model import Finite
 
@@ -36,7 +37,7 @@ class ChartOptions(Options):
     """The light of the colours in `reflectances`, where the file does not name it."""
 
 
-class ChartRequest(ChartOptions, ManifestRequest):
+class ChartRequest(ReviewOptions, ChartOptions, ManifestRequest):
     """The colours of the capture from a colour chart in its frames: a matrix for each kind of light, and how far each patch is off."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]

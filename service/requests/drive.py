@@ -9,6 +9,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from service.requests.base.base import Choice, Options, Request, Role, Spelling
+from service.requests.base.review import ReviewOptions
 from service.requests.light.picture_options import MAX_STOPS, FrameRate
 from service.requests.relight import LightWeights
 from stage.model import Finite, Line
@@ -99,7 +100,7 @@ class ChartDocument(_CheckedDocument):
         return Chart
 
 
-class DriveRequest(DriveOptions, Request):
+class DriveRequest(ReviewOptions, DriveOptions, Request):
     """Levels at which the lamps of a rig light a subject as environments and animated lights would."""
 
     rig: Annotated[Path, Role.INPUT, RIG]

@@ -1,9 +1,9 @@
 """The jobs of the service: options as on the command line, with identifiers of captures and jobs in place of paths."""
 
 import re
-from typing import Annotated, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
 from service.requests.base.base import CAPTURE, JobRequest, Role, SequenceOptions, Spelling
 from service.requests.base.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
@@ -20,6 +20,7 @@ from service.requests.register import FuseOptions, RegisterOptions
 from service.requests.relight import RelightOptions
 from service.requests.shade import ShadeOptions
 from service.requests.solve import SolveOptions
+from stage.colour.colour_spaces import names_as_given
 from stage.model import Count, Line
 from stage.sets.board import BoardRegions, GaugeRuns
 
@@ -270,6 +271,11 @@ class PatternsJob(JobRequest):
     options: PatternsOptions
 
 
+def _read_stored(given: Any, read: ValidatorFunctionWrapHandler) -> Any:
+    with names_as_given():
+        return read(given)
+
+
 OneJob = (SolveJob | DepthJob | RelightJob | ShadeJob | ExportJob | ViewJob | PipelineJob | BasisJob | SeparateJob | ScanJob | PatternsJob
           | InspectBoardJob | GaugeBoardJob | DriveJob | JoinJob | RegisterJob | FuseJob | AnyCalibration)
 UserJob = Annotated[OneJob, Field(discriminator="kind")]
@@ -277,4 +283,6 @@ UserJob = Annotated[OneJob, Field(discriminator="kind")]
 JOBS: dict[str, type[JobRequest]] = {get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(OneJob)}
 """The same by `kind`."""
 AnyJob = Annotated[CheckJob | OneJob, Field(discriminator="kind")]
+StoredJob = Annotated[AnyJob, WrapValidator(_read_stored)]
+"""A job that a service has checked: its colour spaces are those of the service, which the reader's configuration may lack."""
 ANY_JOB: TypeAdapter[CheckJob | OneJob] = TypeAdapter(AnyJob)

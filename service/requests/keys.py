@@ -13,7 +13,7 @@ class Scope(Choice):
 
     READ = "read", "see captures, jobs and results"
     WRITE = "write", "also upload, submit, cancel and retry jobs, and delete what belongs to the project"
-    ADMIN = "admin", "also register folders of the server, and see /metrics"
+    ADMIN = "admin", "also register folders of the server, set hooks, and see /metrics"
 
 
 class NewKey(Options):

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from service.requests.base.base import Choice, Commas, Options, PixelOptions, Request, Role, Spelling
+from service.requests.base.review import ReviewOptions
 from service.requests.drive import RIG
 from stage.model import Count, Finite, Line, NotNegative, NotNegativeCount, Positive
 
@@ -71,7 +72,7 @@ class PictureFault(Choice):
     FOCUS = "focus", "the picture is blurred"
 
 
-class TwinRequest(DrivenOptions, PixelOptions, Request):
+class TwinRequest(ReviewOptions, DrivenOptions, PixelOptions, Request):
     """A stage that is not there: receive what is sent to the lamps of a rig, and show what a camera would see."""
 
     rig: Annotated[Path, Role.INPUT, RIG]

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from service.requests.base.base import CAPTURE, Choice, Request, Role, Spelling, StackOptions
+from service.requests.base.review import ReviewOptions
 from service.requests.light.picture_options import FrameRate, PictureOptions
 from stage.model import Finite, Line
 
@@ -35,7 +36,7 @@ class RelightOptions(PictureOptions, StackOptions):
     """Frames per second, which the frames record with their time code; None: those of the light keys, else 24."""
 
 
-class RelightRequest(RelightOptions, Request):
+class RelightRequest(ReviewOptions, RelightOptions, Request):
     """Frames under HDR environments and animated lights."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
@@ -55,10 +56,7 @@ class RelightRequest(RelightOptions, Request):
     overwrite: Annotated[bool, Role.RUN] = False
     """Make every frame again. Without it, frames are kept that an earlier run made from the same inputs and options."""
     sheet: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
-    """Write a contact sheet of the frames, for review."""
-    view: Annotated[Line | None, Role.RUN, Spelling(metavar="DISPLAY/VIEW")] = None
-    """View of the OpenColorIO configuration through which `sheet` shows the frames, such as "sRGB - Display/Un-tone-mapped" or the view
-    alone; None: ACES 2.0 at 100 nits, or the default view of a configuration without it."""
+    """Write a contact sheet of the frames, for review, as `view` and `look` say."""
     nuke: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.nk")] = None
     """Write a script of Nuke that reads the frames and mixes their layers of lights, each with a gain; needs `--aov lights`."""
     report: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.json")] = None

@@ -46,7 +46,7 @@ class TwinPicture:
         self._images = ImagesOnDevice(stack, device)
         self._size = capture.camera.height, capture.camera.width
         self.space = linear_space(capture.manifest.color_space)
-        self._gain = np.float32(2.0**request.exposure)
+        self._gain, self._review = np.float32(2.0**request.exposure), request.review
         self._captured = lights.irradiance
         lamps = np.array([index for index, _ in rig.emitters])
         cosine = rig.directions @ lights.direction.T
@@ -78,7 +78,7 @@ class TwinPicture:
             exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self.space, metadata={})
             return
         radiance = fit(radiance, min(len(radiance), most_rows or len(radiance)), kernel="triangle")
-        shown = display(radiance * self._gain, self.space)
+        shown = display(radiance * self._gain, self.space, self._review)
         shown[~radiance.any(axis=-1)] = 0.0  # and not the background of a sheet
         with replacing(path, flush=False) as temporary:
             write_png(temporary, np.round(np.clip(shown, 0, 1) * 255).astype(np.uint8), srgb=True)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import OpenImageIO as oiio
 
-from stage.colour.colour_spaces import channels_apart, is_linear, linear_space, location
+from stage.colour.colour_spaces import Review, channels_apart, is_linear, linear_space, location
 from stage.colour.configuration import current
 from stage.errors import ColourError
 from stage.formats.images import fractions
@@ -89,24 +89,24 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
     return converted[..., :1] if grey else converted
 
 
-def through_view(pixels: np.ndarray, space: str, view: str | None) -> np.ndarray:
+def through_view(pixels: np.ndarray, space: str, review: Review) -> np.ndarray:
     """Convert pixels to those of a display, through a view.
 
     Args:
         pixels: [rows, cols, 3] float32, encoded in `space`.
-        view: as `Configuration.view` takes it.
+        review: the view and the looks.
 
     Returns:
         [rows, cols, 3] float32, 0…1.
     """
     found = current()
-    chosen = found.view(view)
+    chosen, look = found.view(review.view), "" if review.look is None else found.checked_look(review.look)
     if chosen is None:
         return convert(pixels, space, "srgb_texture")
     if found.find(space) is None:
         pixels, space = convert(pixels, space, found.aces(space)), found.aces(space)
     source = oiio.ImageBuf(np.ascontiguousarray(pixels, dtype=np.float32))
-    buffer = oiio.ImageBufAlgo.ociodisplay(source, *chosen, space, colorconfig=found.location)
+    buffer = oiio.ImageBufAlgo.ociodisplay(source, *chosen, space, look, colorconfig=found.location)
     if buffer.has_error:
         raise ColourError(f"cannot show {space}: {' '.join(buffer.geterror().split())}")
     return pixels_of(buffer)

@@ -6,7 +6,10 @@ without loading one.
 """
 
 import os
-from typing import Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field
 
@@ -24,6 +27,16 @@ NAMES = (
 )
 """The names that are known under every configuration: scene-linear spaces, and the display-encoded spaces of 8-bit cameras and textures."""
 
+
+class Review(NamedTuple):
+    """The way from scene-linear pixels to those of a display; without values that of `Configuration.view`."""
+
+    view: str | None = None
+    """DISPLAY/VIEW, or a view, as `Configuration.view` takes it."""
+    look: str | None = None
+    """Looks, as `Configuration.checked_look` takes them; None: those of the view."""
+
+
 _LINEAR_OF: dict[str, str] = {
     "srgb_texture": "lin_rec709_scene",
     "srgb_rec709_scene": "lin_rec709_scene",
@@ -32,6 +45,9 @@ _LINEAR_OF: dict[str, str] = {
     "srgb_p3d65_scene": "lin_p3d65_scene",
     "g22_adobergb_scene": "lin_adobergb_scene",
 }
+
+
+_AS_GIVEN: ContextVar[bool] = ContextVar("_AS_GIVEN", default=False)
 
 
 def location() -> str:
@@ -71,12 +87,25 @@ def _linear_of(space: str) -> tuple[str, bool]:
     return linear_of(location(), space)
 
 
+@contextmanager
+def names_as_given() -> Iterator[None]:
+    """Take names in models as they are within a context: a process that has another configuration has checked them."""
+    token = _AS_GIVEN.set(True)
+    try:
+        yield
+    finally:
+        _AS_GIVEN.reset(token)
+
+
 def _known(space: str) -> str:
-    is_linear(space)
+    if not _AS_GIVEN.get():
+        is_linear(space)
     return space
 
 
 def _of_light(space: str) -> str:
+    if _AS_GIVEN.get():
+        return space
     if not is_linear(space):
         raise ValueError(f"is {space}: give a scene-linear colour space, such as lin_rec709_scene")
     return linear_space(space)  # one name for a space, by which lights and captures are compared

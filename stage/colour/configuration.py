@@ -50,6 +50,8 @@ class Configuration(NamedTuple):
     """The spaces that hold no colours."""
     views: dict[str, tuple[str, ...]]
     """The views of each display; the default display and its default view come first."""
+    looks: tuple[str, ...]
+    """The names of the looks."""
     label: str
     """The name, and the version of the library or the SHA-256 of the files: results carry it."""
 
@@ -116,9 +118,23 @@ class Configuration(NamedTuple):
         names = {name.lower(): pair for pair in reversed(pairs) for name in (pair[1], "/".join(pair))}
         if (found := names.get(wanted.lower())) is None:
             near = {names[name] for name in get_close_matches(wanted.lower(), names, NEAREST, 0.3)} or pairs[:NEAREST]
-            raise ColourError(f"--view {wanted}: is no view of the OpenColorIO configuration {self.name}: "
+            raise ColourError(f"{wanted} is no view of the OpenColorIO configuration {self.name}: "
                               f"{'give ' + ' or '.join(sorted(map('/'.join, near))) if near else 'it has none'}")
         return found
+
+    def checked_look(self, wanted: str) -> str:
+        """Return looks in OpenColorIO's syntax: names with commas between, each with + or - before it, and | between alternatives.
+
+        Raises:
+            ColourError: there is no such look; the message proposes others.
+        """
+        names = {look.lower(): look for look in self.looks}
+        for look in (part.strip().lstrip("+-").strip() for part in re.split(r"[,:|]", wanted)):
+            if look.lower() not in names:
+                near = [names[name] for name in get_close_matches(look.lower(), names, NEAREST, 0.3)] or self.looks[:NEAREST]
+                raise ColourError(f"{look or wanted} is no look of the OpenColorIO configuration {self.name}: "
+                                  f"{'give ' + ' or '.join(near) if near else 'it has none'}")
+        return wanted
 
     def _proposal(self, name: str) -> str:
         """Return what to do about a name that is missing."""
@@ -240,7 +256,7 @@ def _read(place: str, changed: int) -> Configuration:
         label = f"{place} OpenColorIO {oiio.get_string_attribute('opencolorio_version')}"
     else:
         label = f"{Path(place).name.replace(' ', '_')} sha256:{_digest(Path(place))}"
-    return Configuration(place, names, linear, data, views, label)
+    return Configuration(place, names, linear, data, views, tuple(config.getLookNames()), label)
 
 
 def _digest(path: Path) -> str:

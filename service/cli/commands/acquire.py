@@ -102,7 +102,7 @@ def _preview(request: AcquireRequest, early: "EarlyIngest", taken: int) -> None:
         return
     try:
         early.finish()
-        print(f"preview  {write_preview(request.out, request.device)}", flush=True)
+        print(f"preview  {write_preview(request.out, request.device, review=request.review)}", flush=True)
     except USER_ERRORS as error:
         print(f"preview  none: {sentence(error)}", flush=True)
 

@@ -1,4 +1,4 @@
-"""Identifiers of captures, environments, uploads, jobs and keys: a prefix, and 20 random letters and digits; the default address."""
+"""Identifiers of captures, environments, uploads, jobs, keys and hooks: a prefix, and 20 random letters and digits; the default address."""
 
 import secrets
 from typing import Annotated
@@ -13,7 +13,7 @@ DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 """The address at which a client looks for the service, where nothing else is given."""
 PROJECT_PATTERN = r"^[a-z0-9][a-z0-9-]{0,62}$"
 
-CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY = "cap", "env", "up", "job", "key"
+CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY, HOOK, DELIVERY = "cap", "env", "up", "job", "key", "hook", "msg"
 
 
 def new_id(prefix: str) -> str:
@@ -30,4 +30,5 @@ CaptureId = Annotated[str, StringConstraints(pattern=pattern(CAPTURE))]
 EnvironmentId = Annotated[str, StringConstraints(pattern=pattern(ENVIRONMENT))]
 UploadId = Annotated[str, StringConstraints(pattern=pattern(UPLOAD))]
 JobId = Annotated[str, StringConstraints(pattern=pattern(JOB))]
+HookId = Annotated[str, StringConstraints(pattern=pattern(HOOK))]
 Project = Annotated[str, StringConstraints(pattern=PROJECT_PATTERN)]

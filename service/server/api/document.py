@@ -15,6 +15,7 @@ TAGS = {
     "jobs": "Requests for work, which are queued, and survive the workers that do them.",
     "events": "Changes of jobs, as server-sent events.",
     "results": "Files that jobs have made.",
+    "hooks": "URLs that are told by a signed request how jobs have ended.",
     "operations": "Health, readiness and metrics, for operators.",
 }
 REQUEST_ID = {"description": "Identifier of the request in the log.", "schema": {"type": "string"}}

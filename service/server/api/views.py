@@ -1,5 +1,6 @@
 """Views made from rows of the database and files of the storage; service.requests.answers declares their fields."""
 
+from typing import Any
 from urllib.parse import quote
 
 import sqlalchemy as sa
@@ -8,7 +9,7 @@ from service.requests.answers import IntakeView, JobView, ProgressView, ResultVi
 from service.server.storage.folder import StoredFile
 
 
-def job_view(row: sa.RowMapping) -> JobView:
+def job_view(row: sa.RowMapping | dict[str, Any]) -> JobView:
     """Return the view of a row of `jobs`."""
     progress = None
     if row["stage"] is not None:

@@ -60,7 +60,7 @@ class ProjectQuota(NamedTuple):
     limit: int
 
 
-QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels")
+QUOTAS = ("max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels", "max_project_hooks")
 
 
 def _reader(pattern: str, form: str) -> BeforeValidator:
@@ -136,6 +136,8 @@ class Settings(BaseSettings):
     """Jobs of one project that have not ended at most; without it any number."""
     max_project_pixels: Count | None = None
     """Pixels of all images of the captures and environments of one project at most; without it any number."""
+    max_project_hooks: Count = 16
+    """Hooks of one project at most."""
     project_quotas: Annotated[tuple[Quoted, ...], NoDecode] = ()
     """Other quotas for some projects, separated by commas: `larch:max_project_jobs=500`."""
     requests_per_second: Positive = 50.0
@@ -154,6 +156,8 @@ class Settings(BaseSettings):
     """Event streams of one project at most, in each API process."""
     trusted_proxies: Annotated[tuple[str, ...], NoDecode] = ()
     """Addresses or networks of proxies whose `X-Forwarded-For` is believed, separated by commas; without it that of none."""
+    hook_networks: Annotated[tuple[str, ...], NoDecode] = ()
+    """Addresses or networks that are not public, to which hooks may send all the same, separated by commas; without it none."""
     min_free_bytes: Annotated[int, Field(ge=0)] = 1024**3
     """Bytes that must be free in the data folder; uploads and jobs are refused when less is left."""
 
@@ -187,7 +191,7 @@ class Settings(BaseSettings):
     @classmethod
     def _split(cls, given: dict[str, object]) -> dict[str, object]:
         for name, mark in (("roots", os.pathsep), ("project_roots", os.pathsep), ("devices", ","), ("trusted_proxies", ","),
-                           ("oidc_grants", ","), ("project_quotas", ",")):
+                           ("hook_networks", ","), ("oidc_grants", ","), ("project_quotas", ",")):
             if isinstance(value := given.get(name), str):
                 given[name] = tuple(part.strip() for part in value.split(mark) if part.strip())
         return given
@@ -198,11 +202,12 @@ class Settings(BaseSettings):
             raise ValueError(f"anonymous: requests without a key are let in on loopback addresses alone, and host is {self.host}")
         if NO_WORKER in self.devices and len(self.devices) > 1:
             raise ValueError(f"devices: {NO_WORKER} stands alone, and they are {', '.join(self.devices)}")
-        for proxy in self.trusted_proxies:
-            try:
-                ip_network(proxy)
-            except ValueError:
-                raise ValueError(f"trusted_proxies: {proxy} is no address and no network such as 10.0.0.0/8") from None
+        for name in ("trusted_proxies", "hook_networks"):
+            for network in getattr(self, name):
+                try:
+                    ip_network(network)
+                except ValueError:
+                    raise ValueError(f"{name}: {network} is no address and no network such as 10.0.0.0/8") from None
         if self.otel_endpoint is not None and not _is_http(self.otel_endpoint):
             raise ValueError(f"otel_endpoint: {self.otel_endpoint} is no address of the form http://host:4318")
         if self.oidc_issuer is not None and not (_is_http(self.oidc_issuer) and (

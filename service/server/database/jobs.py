@@ -14,6 +14,7 @@ from service import __version__
 from service.requests.base.base import JobRequest
 from service.requests.base.identifiers import JOB, new_id
 from service.requests.states import ACTIVE, CANCELLED, CHECKING, ENDED, FAILED, QUEUED, REFUSED, RUNNING, SUCCEEDED
+from service.server.database import hooks
 from service.server.database.engine import Database, lock_project, storable
 from service.server.database.tables import intakes, job_inputs, job_log, jobs, newest_first
 
@@ -207,9 +208,10 @@ def record_lost_worker(connection: sa.Connection, claim: Claim, limit: int) -> s
         state=state, lost=lost, lost_repeating=repeating, repeating=bool(row.stages_begun), worker=None, updated_at=now,
         revision=jobs.c.revision + 1,
         **({"error": sentence, "finished_at": now} if state == FAILED else {})))
-    _log(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
+    note(connection, claim.job, f"failed: {sentence}" if state == FAILED else "lost its worker, queued again")
     if state == FAILED:
         _end_check(connection, claim.job, sentence)
+        hooks.record_end(connection, claim.job)
     return state if done.rowcount == 1 else None
 
 
@@ -220,7 +222,7 @@ def release(connection: sa.Connection, claim: Claim) -> bool:
         jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.state.in_(ACTIVE), mine).values(
         state=QUEUED, worker=None, updated_at=time.time(), revision=jobs.c.revision + 1)).rowcount == 1
     if done:
-        _log(connection, claim.job, "given back by its worker, queued again")
+        note(connection, claim.job, "given back by its worker, queued again")
     return done
 
 
@@ -230,8 +232,9 @@ def cancel(connection: sa.Connection, job: str) -> bool:
     done = connection.execute(jobs.update().where(jobs.c.id == job, jobs.c.state.in_(ACTIVE)).values(
         state=CANCELLED, finished_at=now, updated_at=now, revision=jobs.c.revision + 1))
     if done.rowcount == 1:
-        _log(connection, job, CANCELLED)
+        note(connection, job, CANCELLED)
         _end_check(connection, job, "its check was cancelled: validate it again")
+        hooks.record_end(connection, job)
     return done.rowcount == 1
 
 
@@ -242,7 +245,7 @@ def queue_again(connection: sa.Connection, job: str, state: str) -> int | None:
         error=None, reached=0, **NOTHING_LOST, worker=None, stage=None, done=None, total=None, rate=None))
     if done.rowcount != 1:
         return None
-    _log(connection, job, "queued again")
+    note(connection, job, "queued again")
     return int(connection.execute(sa.select(jobs.c.attempt).where(jobs.c.id == job)).scalar_one())
 
 
@@ -273,7 +276,7 @@ def _held(claim: Claim) -> list[sa.ColumnElement[bool]]:
     return [jobs.c.id == claim.job, jobs.c.attempt == claim.attempt, jobs.c.worker == claim.worker, jobs.c.state.in_(ACTIVE)]
 
 
-def _log(connection: sa.Connection, job: str, text: str) -> None:
+def note(connection: sa.Connection, job: str, text: str) -> None:
     """Add an entry to the log of a job: a text for a person, which names nothing of the machine."""
     count = sa.select(sa.func.count()).where(job_log.c.job == job).scalar_subquery()
     entry = sa.select(jobs.c.id, sa.literal(time.time()), jobs.c.attempt, sa.literal(storable(text))).where(
@@ -297,7 +300,9 @@ def _change(database: Database, claim: Claim, free: sa.ColumnElement[bool] | Non
     def work(connection: sa.Connection) -> bool:
         changed = connection.execute(statement).rowcount == 1
         if changed and entry is not None:
-            _log(connection, claim.job, entry)
+            note(connection, claim.job, entry)
+        if changed and values.get("state") in ENDED:
+            hooks.record_end(connection, claim.job)
         return changed
 
     return database.transact(work, patience_s=patience_s)

@@ -11,11 +11,11 @@ import sqlalchemy as sa
 
 from service.errors import RequestError
 from service.requests.states import ACTIVE, READY
-from service.server.base.settings import Settings
+from service.server.base.settings import QUOTAS, Settings
 from service.server.database.engine import lock_project
-from service.server.database.tables import intakes, jobs, uploads
+from service.server.database.tables import hooks, intakes, jobs, uploads
 
-BYTES, CAPTURES, JOBS, PIXELS = "max_project_bytes", "max_project_captures", "max_project_jobs", "max_project_pixels"
+BYTES, CAPTURES, JOBS, PIXELS, HOOKS = QUOTAS
 
 
 class QuotaExceeded(RequestError):
@@ -66,5 +66,10 @@ def _pixels(connection: sa.Connection, project: str) -> int:
     return sum(pixels_of(facts) for facts in rows)
 
 
-USED: dict[str, Callable[[sa.Connection, str], int]] = {BYTES: _bytes, CAPTURES: _captures, JOBS: _jobs, PIXELS: _pixels}
-UNITS = {BYTES: "bytes", CAPTURES: "captures and environments", JOBS: "jobs", PIXELS: "pixels"}
+def _hooks(connection: sa.Connection, project: str) -> int:
+    return connection.execute(sa.select(sa.func.count()).where(hooks.c.project == project)).scalar_one()
+
+
+USED: dict[str, Callable[[sa.Connection, str], int]] = {
+    BYTES: _bytes, CAPTURES: _captures, JOBS: _jobs, PIXELS: _pixels, HOOKS: _hooks}
+UNITS = {BYTES: "bytes", CAPTURES: "captures and environments", JOBS: "jobs", PIXELS: "pixels", HOOKS: "hooks"}

@@ -15,7 +15,7 @@ import sqlalchemy as sa
 
 from service.server.base.log import logger
 from service.server.base.settings import Settings
-from service.server.database import audit, idempotency, intakes, jobs, workers
+from service.server.database import audit, hooks, idempotency, intakes, jobs, workers
 from service.server.database.engine import UNANSWERED, Database, message_of
 from service.server.database.tables import clock as clock_table
 from service.server.jobs.queue import JobQueue
@@ -30,6 +30,8 @@ EVERY_S = 600.0
 HOUR_S, DAY_S = 3600.0, 86_400.0
 TOKEN_S = DAY_S
 """Seconds for which an idempotency token is remembered."""
+DELIVERY_S = 30 * DAY_S
+"""Seconds for which a delivery to a hook is kept that was accepted or given up."""
 UNFINISHED_S = DAY_S
 """Seconds without a write after which an unfinished image stack is deleted."""
 FORGET_S = HOUR_S
@@ -95,7 +97,7 @@ class Housekeeper:
     def _aged(self) -> None:
         """Remove what is old, unless the clock that says so has jumped."""
         if self._watch.steady():
-            for piece in (self._jobs, self._uploads, self._tokens, self._audit):
+            for piece in (self._jobs, self._uploads, self._tokens, self._deliveries, self._audit):
                 self._try(piece.__name__.strip("_"), piece)
 
     def _jobs(self) -> None:
@@ -119,6 +121,9 @@ class Housekeeper:
 
     def _tokens(self) -> None:
         self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
+
+    def _deliveries(self) -> None:
+        self._database.transact(lambda connection: hooks.drop_before(connection, self._clock() - DELIVERY_S))
 
     def _audit(self) -> None:
         now = self._clock()

@@ -26,6 +26,7 @@ from service.server.database.engine import Database, open_database
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
 from service.server.process import connections, devices
+from service.server.process.hook_sender import HookSender
 from service.server.process.housekeeping import Housekeeper
 from service.server.process.processes import configure, hear_signals
 from service.server.storage.objects import Storage, open_storage
@@ -62,6 +63,7 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
     app = create_app(settings, database, tracing, max_streams=limits.connections // 2, set_stage=set_stage)
     server = http_server(app, settings, limits)
     housekeeper = Housekeeper(settings, database, open_storage(settings), JobQueue(database))
+    sender = HookSender(settings, database)
     address = _address(settings.host, listening.getsockname()[1])
     print(f"relit    {address}/v1", flush=True)
     print(f"data     {settings.data}", flush=True)
@@ -77,12 +79,14 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
         try:
             housekeeper.stop()
             supervisor.stop()
+            sender.stop()
         finally:
             app.state.service.closing.set()
             server.should_exit = True
 
     supervisor.start()
     housekeeper.start()
+    sender.start()
     ending = threading.Thread(target=end, name="relit-end", daemon=True)
     ending.start()
     try:

@@ -19,6 +19,7 @@ from service.requests import (
     depth,
     drive,
     export,
+    hooks,
     jobs,
     keys,
     patterns,
@@ -62,7 +63,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "drive": [drive.DriveRequest], "rig check": [rig.RigCheckRequest], "rig from-capture": [rig.RigFromCaptureRequest],
     "rig from-csv": [rig.RigFromCsvRequest], "rig from-mvr": [rig.RigFromMvrRequest], "rig plan": [rig.RigPlanRequest],
     "rig sweep": [rig.RigSweepRequest],
-    "keys create": [keys.NewKey], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
+    "keys create": [keys.NewKey], "hooks create": [hooks.NewHook], "calibrate mirror-ball": [calibrate.MirrorBallRequest],
     "calibrate light-positions": [calibrate.LightPositionsRequest], "calibrate grey-ball": [calibrate.GreyBallRequest],
     "calibrate intensity": [calibrate.IntensityRequest], "calibrate dark": [calibrate.DarkRequest],
     "calibrate flat-field": [calibrate.FlatFieldRequest], "calibrate saturation": [calibrate.SaturationRequest],
@@ -76,6 +77,7 @@ COMMANDS: dict[str, list[type[Options]]] = {
 }
 OWN = {
     "relight": {"progress"}, "shade": {"progress"}, "patterns": {"plan"}, "demo": {"serve"}, "keys create": {"data", "config"},
+    "hooks create": {"server", "key"},
     **{name: {"server", "key", "wait", "out", "cancel_on_interrupt"} for name in COMMANDS if name.startswith("submit")},
     "farm template relight": {"job", "chunk_frames", "gpu"}, "farm template shade": {"job", "turns", "gpu"},
 }
@@ -134,7 +136,7 @@ def test_a_command_has_the_options_of_its_models_and_its_own(name):
     models, left_out = COMMANDS[name], {Role.PART, Role.RUN} if name.startswith("farm") else set()
     found = parameters(name)
     options = {option.name: option for model in reversed(models) for option in options_of(model) if option.role not in left_out}
-    extra = OWN.get(name, set()) | ({"device", "ocio"} if not name.startswith(("submit", "farm", "keys")) else set())
+    extra = OWN.get(name, set()) | ({"device", "ocio"} if not name.startswith(("submit", "farm", "keys", "hooks")) else set())
     assert found.keys() == options.keys() | extra
     for option in options.values():
         parameter = found[option.name]
@@ -201,7 +203,8 @@ NO_JOBS = {
     "import": "describes files before they are uploaded", "simulate": "makes raw frames, which are uploaded as any others",
     "publish": "makes files for another web server", "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
-    "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "submit": "asks the service",
+    "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
+    "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",
     "restore": "is for its operator", "keys": "is for its operator",
 }

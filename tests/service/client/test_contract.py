@@ -14,6 +14,7 @@ from service.client import Client
 from service.client.errors import Fault
 from service.requests import answers as shared_answers
 from service.requests.answers import View
+from service.requests.hooks import NewHook
 from service.requests.jobs import ExportJob, RelightJob, SolveJob, UserJob
 from service.requests.relight import RelightOptions
 from service.requests.solve import Method, SolveOptions
@@ -29,7 +30,8 @@ USED = {
     "POST /v1/environments", "GET /v1/environments/{environment}",
     "POST /v1/jobs", "GET /v1/jobs", "GET /v1/jobs/{job}", "PATCH /v1/jobs/{job}", "DELETE /v1/jobs/{job}", "POST /v1/jobs/{job}/cancel",
     "POST /v1/jobs/{job}/retry", "POST /v1/jobs/{job}/resume", "GET /v1/jobs/{job}/events",
-    "GET /v1/jobs/{job}/results", "GET /v1/jobs/{job}/results/{name}", "HEAD /v1/jobs/{job}/results/{name}"}
+    "GET /v1/jobs/{job}/results", "GET /v1/jobs/{job}/results/{name}", "HEAD /v1/jobs/{job}/results/{name}",
+    "POST /v1/hooks", "GET /v1/hooks", "GET /v1/hooks/{hook}", "POST /v1/hooks/{hook}/test", "DELETE /v1/hooks/{hook}"}
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +120,10 @@ def everything(client: Client, between: Between, folder: Path, dome: str, sky: s
     (folder / "out" / f".asset.usdz.{'0' * 16}.part").write_bytes(b"of another version")  # so that HEAD is asked
     client.jobs.download(export.id, folder / "out")
     client.jobs.delete(export.id)
+    hook = client.hooks.create(NewHook(url="https://tracker.example/relit"))
+    client.hooks.test(hook.id)
+    assert [each.id for each in client.hooks.all()] == [client.hooks.get(hook.id).id] == [hook.id]
+    client.hooks.delete(hook.id)
     client.captures.delete(capture.id)
 
 

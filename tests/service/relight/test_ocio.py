@@ -3,15 +3,21 @@
 import json
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from service.captures.check_process import check_in_process
 from service.errors import RequestError
-from stage.colour.colour_spaces import STUDIO, VARIABLE
+from service.requests.answers import JobView
+from service.requests.jobs import RelightJob
+from stage.colour.colour import linearise, rgb_matrix
+from stage.colour.colour_spaces import STUDIO, VARIABLE, linear_space
+from stage.colour.configuration import used
 from stage.formats import exr
 from tests.reference.colour import ACES_TO_ACESCG, ACES_TO_REC709, AWG4_TO_ACES, logc4_to_linear
-from tests.scenes.captures import edit_frame, make_scene, rgb, write_capture, write_image
+from tests.scenes.captures import edit_frame, edit_manifest, make_scene, rgb, write_capture, write_image
 from tests.service.captures.test_check_process import Told
+from tests.stage.colour.test_configuration import minimal
 
 SCENE = make_scene(size=12, lights=5)
 KEYS = {"schema": "relit.keys/1", "captured": [{"image": "000.png", "keys": [{"frame": 1, "weight": 2}]}]}
@@ -49,10 +55,36 @@ def test_logc4_in_and_acescg_out(relit, logged, tmp_path):
     assert "ARRI LogC4, worked on in ocio:lin_awg4_scene" in shown and label in shown
 
 
+@pytest.mark.parametrize(("place", "space"), [
+    (STUDIO, "ARRI LogC4"), ("ocio://cg-config-latest", "ACEScct"), ("minimal", "house gamma")])
+def test_frames_are_what_the_processor_of_opencolorio_makes_of_the_images(relit, logged, tmp_path, place, space):
+    """In one piece from the codes to ACEScg, by each configuration; and solved without the halves of files, within 1e-5 of the value.
+
+    The configuration for computer graphics has no LogC4: the log that it has is ACEScct. The minimal one has no ACEScg: its processor
+    leads to its space of ACES2065-1, and the matrix of the standard on.
+    """
+    folder, fractions = logged
+    place = minimal(tmp_path / "house.ocio") if place == "minimal" else place
+    edit_manifest(folder, color_space=space)
+    recorded = oiio.ImageBuf(np.ascontiguousarray(fractions[0], np.float32))
+    target = "house aces" if "house" in space else "ACEScg"
+    processed = np.asarray(oiio.ImageBufAlgo.colorconvert(recorded, space, target, colorconfig=place).get_pixels(oiio.FLOAT)).astype(float)
+    if target == "house aces":
+        processed = processed @ ACES_TO_ACESCG.T
+    with used(place):
+        worked = linearise(fractions[0].astype(np.float32), space)
+        made = worked @ rgb_matrix(linear_space(space), "ACEScg" if target == "ACEScg" else "lin_ap1_scene").T
+    assert np.allclose(made, processed, rtol=1e-5, atol=1e-5 * processed.max())
+    acescg = "ACEScg" if target == "ACEScg" else "lin_ap1_scene"
+    relight(relit, tmp_path, "--ocio", place, space=acescg)
+    # halves of the stack and of the frame: 2 × 2^-11
+    assert np.allclose(rgb(tmp_path / "f" / "a.1.exr"), 2 * processed, rtol=1e-3, atol=1e-3 * processed.max())
+    shown = relit.done("info", folder, "--ocio", place).out
+    assert f"{space}, worked on in " in shown and ("house.ocio sha256:" if "house" in space else f"{place} OpenColorIO ") in shown
+
+
 def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, logged, tmp_path, monkeypatch):
     """The same name in a configuration with another curve: neither the stack nor the frame is taken again."""
-    from tests.stage.colour.test_configuration import minimal
-
     folder, _ = logged
     data = json.loads((folder / "capture.json").read_text())
     (folder / "capture.json").write_text(json.dumps({**data, "color_space": "house gamma"}))
@@ -70,7 +102,7 @@ def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, l
     (("--ocio", "no.ocio"), "no.ocio: no such OpenColorIO configuration"),
     (("--color-space", "ACESgc", "--ocio", STUDIO), "--color-space: ACESgc is no colour space of the OpenColorIO configuration"),
     (("--color-space", "ACEScct", "--ocio", STUDIO), "--color-space: is ACEScct: give a scene-linear colour space"),
-    (("--view", "Nice", "--sheet", "s.png", "--ocio", STUDIO), "--view Nice: is no view of"),
+    (("--view", "Nice", "--sheet", "s.png", "--ocio", STUDIO), "--view: Nice is no view of"),
     (("--view", "Un-tone-mapped", "--ocio", STUDIO), "give --sheet too"),
     ((), f"color_space: ARRI LogC4 is no colour space of the OpenColorIO configuration ocio://default: {STUDIO} has ARRI LogC4"),
 ])
@@ -86,6 +118,20 @@ def test_the_process_that_checks_uploads_has_the_configuration_of_the_service(lo
     monkeypatch.delenv(VARIABLE)
     with pytest.raises(RequestError, match="color_space: ARRI LogC4 is no colour space of"):
         check_in_process(logged[0], environment=False, root=None, max_pixels=10**6, progress=Told())
+
+
+def test_a_client_reads_a_job_in_a_space_that_its_own_configuration_lacks(monkeypatch):
+    asked = {"kind": "relight", "capture": f"cap_{'0' * 20}", "environment": f"env_{'0' * 20}",
+             "options": {"color_space": "Linear ARRI Wide Gamut 4", "frames": "1-3"}}
+    view = {"id": f"job_{'0' * 20}", "state": "queued", "attempt": 1, "revision": 1, "priority": 50, "created_at": 0, "started_at": None,
+            "finished_at": None, "progress": None, "error": None}
+    monkeypatch.setenv(VARIABLE, STUDIO)
+    request = RelightJob.model_validate(asked).model_dump(mode="json", by_alias=True)
+    monkeypatch.delenv(VARIABLE)
+    text = json.dumps({**view, "request": request})
+    assert JobView.model_validate_json(text).request.options.color_space == request["options"]["color_space"]
+    with pytest.raises(ValueError, match="is no colour space of the OpenColorIO configuration ocio://default"):
+        RelightJob.model_validate(asked)  # a request is checked as ever
 
 
 def test_a_view_has_the_matrix_of_a_space_that_the_pages_do_not_know(relit, logged, tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from stage.colour.colour import convert, linearise, rgb_matrix, through_view
-from stage.colour.colour_spaces import STUDIO, VARIABLE, LightSpaceName, channels_apart, is_linear, linear_space
+from stage.colour.colour_spaces import STUDIO, VARIABLE, LightSpaceName, Review, channels_apart, is_linear, linear_space
 from stage.colour.configuration import current, used
 from stage.colour.environment_maps import read_environment
 from stage.errors import ColourError
@@ -35,7 +35,11 @@ colorspaces:
         - !<ExponentTransform> {{value: [2.5, 2.5, 2.5, 1]}}
         - !<MatrixTransform> {{matrix: [{matrix}]}}
   - !<ColorSpace> {{name: values, isdata: true}}
+looks:
+  - !<Look> {{name: warm, process_space: house linear, transform: !<CDLTransform> {{slope: [1.5, 1, 0.5]}}}}
+  - !<Look> {{name: cold, process_space: house linear, transform: !<CDLTransform> {{slope: [0.5, 0.5, 0.5]}}}}
 """
+WARM = np.array([1.5, 1, 0.5])
 PIXELS = np.random.default_rng(7).uniform(0.1, 0.9, (4, 9, 3)).astype(np.float32)
 
 
@@ -64,8 +68,11 @@ def test_a_minimal_configuration_is_its_closed_form(tmp_path):
         assert np.allclose(convert(to_rec709.astype(np.float32), "lin_rec709_scene", "hg"), PIXELS, atol=1e-4)  # steep near 0
         # both missing: as without a configuration
         inside = convert(PIXELS, "srgb_texture", "lin_rec709_scene")
-        assert np.allclose(through_view(PIXELS, "hl", None), PIXELS.astype(float) ** 0.4, rtol=3e-5)
-        assert np.allclose(through_view(PIXELS, "hl", "wall/plain"), through_view(PIXELS, "hl", None))
+        assert np.allclose(through_view(PIXELS, "hl", Review()), PIXELS.astype(float) ** 0.4, rtol=3e-5)
+        assert np.allclose(through_view(PIXELS, "hl", Review("wall/plain")), through_view(PIXELS, "hl", Review()))
+        for look, slope in {"warm": WARM, "-warm": 1 / WARM, "Warm, -warm": 1, "cold, +warm": WARM / 2}.items():
+            shown = through_view(PIXELS, "hl", Review("Plain", look))
+            assert np.allclose(shown, (PIXELS.astype(float) * slope) ** 0.4, rtol=3e-5), look
     assert np.array_equal(inside, convert(PIXELS, "srgb_texture", "lin_rec709_scene"))
     assert current().location == "ocio://default"
 
@@ -192,7 +199,17 @@ def test_a_configuration_that_cannot_be_joined_says_so(tmp_path):
 
 
 def test_a_view_that_is_missing_is_one_sentence():
-    with pytest.raises(ColourError, match=r"--view Un-toned: is no view .* give .*/Un-tone-mapped"):
+    with pytest.raises(ColourError, match=r"Un-toned is no view .* give .*/Un-tone-mapped"):
         current().view("Un-toned")
     assert current().view("Un-tone-mapped") == ("sRGB - Display", "Un-tone-mapped")
     assert current().view("display p3 - display/un-tone-mapped") == ("Display P3 - Display", "Un-tone-mapped")
+
+
+@pytest.mark.parametrize(("look", "words"), [
+    ("warn", "warn is no look of the OpenColorIO configuration house.ocio: give warm"),
+    ("warm, -", "warm, - is no look of .*: give warm or cold"), ("warm, green", "green is no look of")])
+def test_a_look_that_is_missing_is_one_sentence(tmp_path, look, words):
+    with used(minimal(tmp_path / "house.ocio")), pytest.raises(ColourError, match=words):
+        current().checked_look(look)
+    with pytest.raises(ColourError, match=r"warm is no look of the OpenColorIO configuration ocio://default: give ACES 1\.3"):
+        current().checked_look("warm")

@@ -19,7 +19,7 @@ PEAK_BYTES = 1 << 30
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("server")
-    with serving(folder, "--anonymous", "--device", "cpu", sabotage="long",
+    with serving(folder, "--anonymous", "--device", "cpu", sabotage="long", hook_networks="127.0.0.0/8",
                  roots=os.pathsep.join([str(SAMPLES), str(folder / "registered")])) as running:
         yield running
 

@@ -6,10 +6,11 @@ import time
 from pathlib import Path
 
 from service.requests.base.identifiers import ENVIRONMENT
+from service.requests.hooks import NewHook
 from service.requests.jobs import RelightJob
 from service.requests.keys import NewKey, Scope
 from service.server.base.settings import Settings
-from service.server.database import intakes, jobs, keys, tables
+from service.server.database import hooks, intakes, jobs, keys, tables
 from tests.service.server.process.house import PROJECT, House
 from tests.service.server_process import Server, environment_with
 
@@ -23,6 +24,7 @@ suppress-health-check = ["all"]
 "path.capture" = {{ dictionary = "captures", probability = 0.5 }}
 "path.environment" = {{ dictionary = "environments", probability = 0.5 }}
 "path.job" = {{ dictionary = "jobs", probability = 0.7 }}
+"path.hook" = {{ dictionary = "hooks", probability = 0.7 }}
 "path.name" = {{ dictionary = "results", probability = 0.7 }}
 "body.capture" = {{ dictionary = "captures", probability = 0.7 }}
 "body.environment" = {{ dictionary = "environments", probability = 0.7 }}
@@ -33,6 +35,7 @@ suppress-health-check = ["all"]
 captures = {{ values = {captures} }}
 environments = {{ values = {environments} }}
 jobs = {{ values = {jobs} }}
+hooks = {{ values = {hooks} }}
 results = {{ values = ["maps.exr", "report.json"] }}
 
 [generation]
@@ -66,8 +69,10 @@ def seed(settings: Settings) -> tuple[str, dict[str, list[str]]]:
         (house.results(job) / "report.json").write_text("{}")
     house.database.transact(lambda connection: connection.execute(tables.workers.insert().values(  # one that is seen for the whole run
         id="fuzz", host="fuzz", pid=1, device="cpu", started_at=time.time(), seen_at=time.time() + 86_400, state="ready")))
+    told = [house.database.transact(lambda connection: hooks.insert(connection, PROJECT, NewHook(url="https://tracker.example/")))["id"]
+            for _ in range(2)]
     house.database.close()
-    return key, {"captures": captures, "environments": environments, "jobs": made}
+    return key, {"captures": captures, "environments": environments, "jobs": made, "hooks": told}
 
 
 def fuzz(server: Server, key: str, known: dict[str, list[str]], folder: Path, *, examples: int, phases: str, max_time_s: int | None,

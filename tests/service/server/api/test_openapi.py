@@ -19,6 +19,7 @@ from service import __version__
 from service.requests.answers import IntakeView, JobView, ResultView
 from service.requests.base.identifiers import pattern
 from service.requests.depth import DepthRequest
+from service.requests.hooks import NewHook
 from service.requests.jobs import UserJob
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority
@@ -31,7 +32,7 @@ from tests.service.server_process import serving
 LONG_S = int(os.environ.get("FUZZ_SECONDS", "0"))
 FREE = {"get_health", "get_readiness", "abilities"}
 """Operations that need no key."""
-NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000"}
+NO_LIMITS = {"requests_per_second": "100000", "request_burst": "100000", "max_queued": "1000000", "max_project_hooks": "1000000"}
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,8 @@ def test_the_document_is_served_and_says_what_it_is_of(server, client, document)
     served = client.get("/v1/openapi.json").raise_for_status().json()
     assert served == document
     assert (served["info"]["title"], served["info"]["version"]) == ("Relit", __version__)
-    assert [tag["name"] for tag in served["tags"]] == ["captures", "environments", "uploads", "jobs", "events", "results", "operations"]
+    assert [tag["name"] for tag in served["tags"]] == [
+        "captures", "environments", "uploads", "jobs", "events", "results", "hooks", "operations"]
     used = [operation["tags"] for path in served["paths"].values() for operation in path.values()]
     assert {tag for tags in used for tag in tags} == {tag["name"] for tag in served["tags"]}
 
@@ -71,7 +73,7 @@ def test_every_operation_is_described_and_its_parameters_say_what_they_may_be(op
         assert all(response["description"] for response in operation["responses"].values()), name
         assert (operation.get("security", []) != []) == (name not in FREE), name
     patterns = {kind: pattern(prefix) for kind, prefix in
-                {"capture": "cap", "environment": "env", "job": "job", "upload": "up"}.items()}
+                {"capture": "cap", "environment": "env", "job": "job", "upload": "up", "hook": "hook"}.items()}
     for name, operation in operations.items():
         for parameter in operation.get("parameters", []):
             if parameter["in"] == "path" and parameter["name"] != "name":
@@ -105,7 +107,7 @@ def test_schemas_name_their_fields_and_take_no_others_and_the_examples_of_jobs_a
     schemas = document["components"]["schemas"]
     assert "HTTPValidationError" not in schemas
     for name, schema in schemas.items():
-        if name.endswith(("Job", "Options", "Choices", "Light", "Key", "Keys", "Track", "Capture", "Environment", "Priority")):
+        if name.endswith(("Job", "Options", "Choices", "Light", "Key", "Keys", "Track", "Capture", "Environment", "Priority", "NewHook")):
             assert schema.get("additionalProperties") is False or "enum" in schema, name
     assert schemas["RelightOptions"]["properties"]["frames"]["description"].startswith("A number, or first-last; null:")
     adapter = TypeAdapter(UserJob)
@@ -143,7 +145,7 @@ def paths_in(kind: object) -> set[str]:
 def test_no_request_or_parameter_of_the_api_has_a_path_of_the_server(app):
     assert paths_in(DepthRequest) == {
         "DepthRequest.beside", "DepthRequest.cache", "DepthRequest.capture", "DepthRequest.out", "TofOptions.calibration"}
-    for body in (UserJob, NewCapture, NewEnvironment, Priority):
+    for body in (UserJob, NewCapture, NewEnvironment, Priority, NewHook):
         assert len(list(models_in(body))) >= 1 and paths_in(body) == set()
     routes = [route for route in iter_route_contexts(app.routes) if route.path.startswith("/v1/")]
     assert len(routes) > 20

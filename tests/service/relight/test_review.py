@@ -1,0 +1,102 @@
+"""Pictures for review are shown through the view and the looks that are asked for, by every command that makes one."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.acquisition.meter import zebra
+from service.acquisition.preview import write_preview
+from service.relight import sheet
+from service.reporting.progress import Timings
+from service.requests.play import TwinRequest
+from service.twin.picture import TwinPicture
+from stage.capture.capture import Capture
+from stage.colour.colour_spaces import Review
+from stage.formats import images
+from stage.rig.rig import read_rig
+from stage.transforms import fibonacci_sphere
+from tests.scenes.captures import make_scene, write_capture, write_exr
+from tests.scenes.chart import picture, shoot
+from tests.scenes.patched_rigs import write_rig_file
+from tests.scenes.rigs import write_rig
+from tests.service.calibrate.test_chart import POSE, seen
+from tests.stage.colour.test_configuration import minimal
+
+WANTED = Review("Un-tone-mapped", "ACES 1.3 Reference Gamut Compression")
+OPTIONS = ("--view", WANTED.view, "--look", WANTED.look)
+SCENE = make_scene(size=12, lights=5)
+KEYS = {"schema": "relit.keys/1", "captured": [{"image": "000.exr", "keys": [{"frame": 1, "weight": 1}]}]}
+
+
+@pytest.fixture
+def reviews(monkeypatch) -> list[Review]:
+    """The views and looks through which colours were shown."""
+    asked, through = [], sheet.through_view
+
+    def told(pixels, space, review):
+        asked.append(review)
+        return through(pixels, space, review)
+
+    monkeypatch.setattr(sheet, "through_view", told)
+    return asked
+
+
+@pytest.fixture
+def capture(tmp_path):
+    (tmp_path / "keys.json").write_text(json.dumps(KEYS))
+    return write_capture(tmp_path / "cap", SCENE)
+
+
+def test_the_pictures_of_commands_have_the_view_and_the_look(relit, reviews, capture, tmp_path):
+    write_rig(tmp_path / "rig.json", fibonacci_sphere(32))
+    write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32))
+    image = Capture.open(capture).manifest.frames[0].image
+    (tmp_path / "keys.json").write_text(json.dumps(KEYS).replace("000.exr", image))
+    chart = shoot(tmp_path / "chart", [picture(seen(), POSE).pixels])
+    for command in (
+            ("relight", capture, "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", "--sheet", tmp_path / "s.png"),
+            ("info", capture, "--picture", tmp_path / "i.png"),
+            ("drive", tmp_path / "rig.json", "--environment", tmp_path / "sky.exr", "--out", tmp_path / "cues"),
+            ("calibrate", "chart", chart)):
+        relit.done(*command, *OPTIONS)
+        assert reviews and set(reviews) == {WANTED}, command
+        reviews.clear()
+
+
+def test_the_pictures_of_the_stage_have_them_too(reviews, tmp_path):
+    scene = make_scene(size=24, lights=8)
+    folder = write_capture(tmp_path / "cap", scene)
+    rig = write_rig_file(tmp_path / "rig.json", scene.directions, host="127.0.0.1")
+    twin = TwinPicture(read_rig(rig), TwinRequest(rig=rig, capture=folder, view=WANTED.view, look=WANTED.look), Timings(None))
+    twin.write(tmp_path / "seen.png", np.ones(3 * 8))
+    zebra(np.full((4, 4, 3), 0.5, np.float32), "lin_rec709_scene", 1.0, WANTED)
+    write_preview(folder, "cpu", review=WANTED)
+    assert len(reviews) >= 3 and set(reviews) == {WANTED}
+
+
+def test_a_look_of_a_studios_configuration_is_in_the_sheet(relit, capture, tmp_path):
+    """Half of the light of a look in closed form: 0.5 to the power of 1 / 2.5 of the values on the sheet."""
+    config, image = minimal(tmp_path / "house.ocio"), Capture.open(capture).manifest.frames[0].image
+    (tmp_path / "keys.json").write_text(json.dumps(KEYS).replace("000.exr", image))
+    shown = {}
+    for look in ("cold, -cold", "cold"):
+        relit.done("relight", capture, "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", "--sheet", tmp_path / "s.png",
+                   "--ocio", config, "--view", "Wall/Plain", "--look", look)
+        shown[look] = images.read_pixels(tmp_path / "s.png").astype(float)
+    plain, cold = shown.values()
+    changed = (np.abs(plain - cold).max(axis=-1) > 0) & (plain.min(axis=-1) > 0.2) & (plain.max(axis=-1) < 1)
+    assert changed.sum() > 100
+    # codes of 8 bits, at least 50 of them, and edges between the object and the background, which are blended after the display
+    assert np.median(cold[changed] / plain[changed]) == pytest.approx(0.5**0.4, rel=0.01)
+
+
+@pytest.mark.parametrize(("command", "options", "words"), [
+    ("relight", ("--look", "warm", "--sheet", "s.png"), "--look: warm is no look of the OpenColorIO configuration ocio://default: give"),
+    ("relight", ("--look", "ACES 1.3 Reference Gamut Compression"), "is for the picture of --sheet: give --sheet too"),
+    ("info", ("--view", "Nice", "--picture", "i.png"), "--view: Nice is no view of the OpenColorIO configuration ocio://default: give"),
+    ("info", ("--view", "Un-tone-mapped"), "is for the picture of --picture: give --picture too")])
+def test_what_is_wrong_is_one_sentence(relit, capture, tmp_path, command, options, words):
+    more = ("--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr") if command == "relight" else ()
+    assert words in relit.refused(command, capture, *more, *options)
+    assert not (tmp_path / "f").exists()
