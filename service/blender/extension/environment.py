@@ -1,8 +1,8 @@
 """Environments: a map of a capture as Blender's world, and Blender's world as a map for Relit.
 
 Convention:
-    A map of Relit has +y of the camera frame in its top row, +z at its centre and +x a quarter from the left. That of Blender's world has +z
-    at the top, +x at its centre and +y a quarter from the left; a panoramic camera has -z of its own at the centre.
+    A map of Relit has +y of the camera frame in its top row, +z at its centre and +x a quarter from the left. That of Blender's world has
+    +z at the top, +x at its centre and +y a quarter from the left; a panoramic camera has -z of its own at the centre.
 
 Source: Blender manual, "Environment Texture"; intern/cycles/kernel/camera/projection.h, direction_to_equirectangular.
 """
@@ -52,6 +52,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         world.node_tree and any(node.type == "TEX_ENVIRONMENT" and node.image and node.image.source in ("SEQUENCE", "MOVIE")
                                 for node in world.node_tree.nodes))
     folder.mkdir(parents=True, exist_ok=True)
+    kept = scene.frame_current
     other = bpy.data.scenes.new("Relit world")
     data = bpy.data.cameras.new("Relit world")
     view = bpy.data.objects.new("Relit world", data)
@@ -72,6 +73,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         render.use_compositing = render.use_sequencer = False
         brightest = 0.0
         for number in frames if animated else frames[:1]:
+            scene.frame_set(number)  # without which Blender does not animate a world that it shares
             other.frame_set(number)
             path = folder / (f"world.{number:04d}.exr" if animated else "world.exr")
             render.filepath = str(path)
@@ -80,6 +82,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
             brightest = max(brightest, *image.pixels[:])
             bpy.data.images.remove(image)
     finally:
+        scene.frame_set(kept)
         bpy.data.scenes.remove(other)
         bpy.data.objects.remove(view)
         bpy.data.cameras.remove(data)

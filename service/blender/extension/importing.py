@@ -18,7 +18,7 @@ SUFFIXES = (".usda", ".usdc", ".usdz", ".glb")
 VARIANTS = """#usda 1.0
 (
     defaultPrim = "Asset"
-    metersPerUnit = 1
+    metersPerUnit = {unit}
     upAxis = "Y"
 )
 
@@ -30,7 +30,7 @@ def "Asset" (
 {{
 }}
 """
-"""A layer that chooses variants of an asset of Relit, whose assets are in metres with +y up."""
+"""A layer that chooses variants of an asset, with its unit and axis, which importers read of the outermost layer alone."""
 NEAR_PX = 1.0
 """A corner of the asset is at most so far from its place in the picture, in pixels, where its own camera and that of the capture agree."""
 
@@ -89,8 +89,12 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
     scene.collection.children.link(collection)
     root = camera.add_root(name, capture, collection)
     root["relit_camera"], root["relit_unit_m"] = capture, camera.unit_m(capture)
-    objects = _import(context, path, {"geo": given.mesh, "look": given.look})
-    if not any(each.type == "MESH" for each in objects):
+    objects = _import(context, path, root, {"geo": given.mesh, "look": given.look})
+    meshes = [each for each in objects if each.type == "MESH"]
+    materials = {_stem(each.name) for mesh in meshes for each in mesh.data.materials}
+    chosen = (given.mesh == "mesh" or given.mesh.title() in {_stem(each.name) for each in meshes}) and (
+        given.look == "metallic" or given.look.title() in materials)  # USD shows the default in place of a variant that is not there
+    if not meshes or not chosen:
         raise Failure(f"{path.name} has no mesh {given.mesh!r} with the look {given.look!r}: choose others, or export it with --levels")
     for each in objects:
         collection.objects.link(each)
@@ -107,7 +111,7 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
     for each in [each for each in objects if each.type in ("CAMERA", "LIGHT")]:
         bpy.data.objects.remove(each)
     lights = path.with_name(f"{path.stem}_lights")
-    lamps = rig.take(_import(context, lights / "rig.usda", {}), root) if (lights / "rig.usda").is_file() else []
+    lamps = rig.take(_import(context, lights / "rig.usda", root, {}), root) if (lights / "rig.usda").is_file() else []
     for each in lamps:
         collection.objects.link(each)
         scene.collection.objects.unlink(each)
@@ -130,7 +134,7 @@ def _camera_of(path: Path, given: settings.Settings) -> dict:
     return {name: value for name, value in settings.manifest(given)["camera"].items() if value is not None}
 
 
-def _import(context: bpy.types.Context, path: Path, variants: dict[str, str]) -> list[bpy.types.Object]:
+def _import(context: bpy.types.Context, path: Path, root: bpy.types.Object, variants: dict[str, str]) -> list[bpy.types.Object]:
     """Return the objects that an importer of Blender makes of a file; variants of USD are chosen in a layer that refers to it."""
     known = set(bpy.data.objects)
     if path.suffix.lower() == ".glb":
@@ -139,10 +143,15 @@ def _import(context: bpy.types.Context, path: Path, variants: dict[str, str]) ->
         choices = "".join(f'        string {name} = "{value}"\n' for name, value in variants.items())
         with tempfile.TemporaryDirectory() as folder:
             layer = Path(folder) / "variants.usda"
-            layer.write_text(VARIANTS.format(path=path.as_posix(), choices=choices), encoding="utf-8")
+            layer.write_text(VARIANTS.format(path=path.as_posix(), unit=root["relit_unit_m"], choices=choices), encoding="utf-8")
             bpy.ops.wm.usd_import(filepath=str(layer), create_world_material=False, set_frame_range=False)
     context.view_layer.update()
     return [each for each in bpy.data.objects if each not in known]
+
+
+def _stem(name: str) -> str:
+    """Return a name without the number that Blender appends to a second one."""
+    return re.sub(r"\.\d+$", "", name)
 
 
 def _compare(scene: bpy.types.Scene, capture: dict, view: bpy.types.Object, objects: list[bpy.types.Object]) -> None:

@@ -42,6 +42,7 @@ class RELIT_OT_relight(WorkOperator):
             raise tasks.Failure("the scene has no light: add a light or a world, or choose another light in the panel")
 
         def work(task: tasks.Task) -> dict[int, Path]:
+            out.parent.mkdir(parents=True, exist_ok=True)
             files = {number: out.with_name(f"frame.{number:04d}.exr") for number in frames}
             if method == "RELIGHT":
                 relit.relight(capture, guide, keys, sky, frames, out, task)
