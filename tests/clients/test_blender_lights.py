@@ -2,13 +2,13 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
 from benchmarks.clients.comparison import compare
+from benchmarks.clients.panel import picture
 from service.export.export import export
 from service.requests.export import ExportRequest
 from stage.capture.capture import Capture
@@ -28,11 +28,6 @@ OWL_LIGHTS = (44, 31)
 """The light of the owl that is nearest to the view axis, and one 20 degrees from it."""
 
 
-def picture(path: Path) -> np.ndarray:
-    channels, _ = exr.read(path)
-    return np.stack([channels[name] for name in "RGBA"], axis=-1).astype(np.float64)
-
-
 THE_OWL = """
 from mathutils import Vector
 settings(capture=given["capture"], levels=1)
@@ -40,10 +35,13 @@ bpy.ops.relit.solve()
 scene, chosen = bpy.context.scene, bpy.context.scene.relit
 found["light"], found["resolution"] = chosen.light_index, (scene.render.resolution_x, scene.render.resolution_y)
 render(given["folder"] + "/owl.exr", 24)
-scenes = [sorted(scene.name for scene in bpy.data.scenes), len(bpy.data.objects)]
+def held():
+    return [len(each) for each in (bpy.data.scenes, bpy.data.objects, bpy.data.collections)]
+
+before = held()
 settings(mesh="lod4")
 found["no level"] = refused(bpy.ops.relit.import_asset)
-found["left"] = scenes == [sorted(scene.name for scene in bpy.data.scenes), len(bpy.data.objects)]
+found["left"] = before == held()
 settings(mesh="lod1", look="specular")
 bpy.ops.relit.import_asset(new_scene=False)
 found["meshes"] = sorted(len(each.data.polygons) for each in scene.objects if each.type == "MESH")
@@ -212,12 +210,31 @@ for number in (1, 2):
     scene.frame_set(number)
     render(folder / f"card{number}.exr", 4)
 found["scenes"] = len(bpy.data.scenes)
+
+from bpy_extras.object_utils import world_to_camera_view
+settings(place="BESIDE")
+bpy.ops.relit.show_frames(filepath=str(folder / "frames" / "frame.0001.exr"))
+card, = [each for each in scene.objects if "relit_card" in each]
+bpy.context.view_layer.update()
+found["beside"] = [tuple(world_to_camera_view(scene, scene.camera, card.matrix_world @ each.co))[:2] for each in card.data.vertices]
+found["other kinds"] = []
+for name in ("asset.usdz", "asset.glb"):
+    settings(asset=str(folder / name))
+    bpy.ops.relit.import_asset()
+    found["other kinds"].append([bpy.context.scene.relit.light, sum(each.type == "MESH" for each in bpy.context.scene.objects)])
+settings(mesh="lod1")
+found["no variants"] = refused(bpy.ops.relit.import_asset)
+settings(mesh="mesh", capture=given["other"], asset=str(folder / "asset.usdz"))
+found["another capture"] = refused(bpy.ops.relit.import_asset)
 """
 
 
 def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
     write_frames(tmp_path / "frames", (1, 2), a_ball.camera, opaque=True)
-    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture")
+    for suffix in (".usdz", ".glb"):
+        export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / f"asset{suffix}", name="Ball"))
+    capture_of(tmp_path / "other", a_ball.camera.model_copy(update={"focal_px": (50.0, 50.0)}), [{"type": "off"}])
+    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other")
     assert found["captured"] == [True, "CAPTURED"]
     d, omega = directions(64)
     cosine = np.maximum(np.einsum("rcx,hwx->rchw", a_ball.normal.astype(float), d), 0)
@@ -235,3 +252,6 @@ def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
     for number in (1, 2):
         card = picture(tmp_path / f"card{number}.exr")
         np.testing.assert_allclose(card[1:-1, 1:-1], np.broadcast_to([number / 4, 0.5, 2, 1], (30, 30, 4)), rtol=1e-3)
+    np.testing.assert_allclose(found["beside"], [(1.05, 0), (2.05, 0), (2.05, 1), (1.05, 1)], atol=1e-4)
+    assert found["other kinds"] == [["CAPTURED", 1], ["CAPTURED", 1]]  # the rig of asset.usda lies beside them too
+    assert "has no mesh 'lod1'" in found["no variants"] and "different cameras" in found["another capture"]

@@ -59,7 +59,7 @@ def _material(files: dict[int, Path]) -> bpy.types.Material:
     """Return a material that emits the frames; where they are premultiplied, it shows what is behind them."""
     image = bpy.data.images.load(str(files[min(files)]), check_existing=True)
     image.reload()
-    image.colorspace_settings.name, image.alpha_mode = "Linear Rec.709", "PREMUL"
+    image.alpha_mode = "PREMUL"
     material = bpy.data.materials.new("Relit frames")
     if material.node_tree is None:
         material.use_nodes = True  # Blender 4; later ones have nodes always

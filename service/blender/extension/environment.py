@@ -56,9 +56,11 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
     other = bpy.data.scenes.new("Relit world")
     data = bpy.data.cameras.new("Relit world")
     view = bpy.data.objects.new("Relit world", data)
+    alone = world.copy()
+    alone.cycles.sampling_method = "NONE"  # nothing in the scene is lit by it, and its table would take most of the time
     try:
         other.collection.objects.link(view)
-        other.camera, other.world = view, world
+        other.camera, other.world = view, alone
         turn = root.matrix_world.to_quaternion().to_matrix().to_4x4()
         view.matrix_world = turn @ Matrix.Rotation(math.pi, 4, "Y")
         data.type = "PANO"
@@ -73,7 +75,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         render.use_compositing = render.use_sequencer = False
         brightest = 0.0
         for number in frames if animated else frames[:1]:
-            scene.frame_set(number)  # without which Blender does not animate a world that it shares
+            scene.frame_set(number)  # without which the other scene stays at its frame
             other.frame_set(number)
             path = folder / (f"world.{number:04d}.exr" if animated else "world.exr")
             render.filepath = str(path)
@@ -86,4 +88,5 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         bpy.data.scenes.remove(other)
         bpy.data.objects.remove(view)
         bpy.data.cameras.remove(data)
+        bpy.data.worlds.remove(alone)
     return (folder / ("world.####.exr" if animated else "world.exr")) if brightest > 0 else None

@@ -70,12 +70,13 @@ def bring_in(context: bpy.types.Context, path: Path, *, new_scene: bool) -> bpy.
             if name not in ("root", "world", "environment", "light", "light_index"):
                 setattr(made.relit, name, getattr(given, name))
         context.window.scene = made
-    known = set(bpy.data.objects)
+    known = {*bpy.data.objects, *bpy.data.collections}
     try:
         return _fill(context, path, capture, new_scene)
     except Exception:
-        for each in set(bpy.data.objects) - known:
-            bpy.data.objects.remove(each)
+        for home in (bpy.data.objects, bpy.data.collections):
+            for each in set(home) - known:
+                home.remove(each)
         if made is not None:
             context.window.scene = before
             bpy.data.scenes.remove(made)
@@ -107,7 +108,8 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
     context.view_layer.update()
     view = camera.add_camera(root, capture, scene, collection)
     context.view_layer.update()
-    _compare(scene, capture, view, objects)
+    if path.suffix.lower() != ".glb":  # whose cameras have no principal point
+        _compare(scene, capture, view, objects)
     for each in [each for each in objects if each.type in ("CAMERA", "LIGHT")]:
         bpy.data.objects.remove(each)
     lights = path.with_name(f"{path.stem}_lights")
@@ -144,7 +146,9 @@ def _import(context: bpy.types.Context, path: Path, root: bpy.types.Object, vari
         with tempfile.TemporaryDirectory() as folder:
             layer = Path(folder) / "variants.usda"
             layer.write_text(VARIANTS.format(path=path.as_posix(), unit=root["relit_unit_m"], choices=choices), encoding="utf-8")
-            bpy.ops.wm.usd_import(filepath=str(layer), create_world_material=False, set_frame_range=False)
+            known_options = bpy.ops.wm.usd_import.get_rna_type().properties
+            options = {name: False for name in ("create_world_material", "set_frame_range") if name in known_options}
+            bpy.ops.wm.usd_import(filepath=str(layer), **options)
     context.view_layer.update()
     return [each for each in bpy.data.objects if each not in known]
 
@@ -156,7 +160,7 @@ def _stem(name: str) -> str:
 
 def _compare(scene: bpy.types.Scene, capture: dict, view: bpy.types.Object, objects: list[bpy.types.Object]) -> None:
     """Raise Failure if the asset's own camera saw something else than the capture's: they are not of one another."""
-    others = [each for each in objects if each.type == "CAMERA" and each.data.type == "PERSP" and not each.name.startswith("glTF")]
+    others = [each for each in objects if each.type == "CAMERA" and each.data.type == "PERSP"]
     if capture["projection"] == "orthographic":
         others = [each for each in others if each.name.startswith("CameraPerspective")]
     if not others:

@@ -1,8 +1,13 @@
 """The panel of the sidebar, and the list of all classes."""
 
+import textwrap
+
 import bpy
 
 from . import importing, preferences, relighting, settings, solving, tasks
+
+LINE = 44
+"""Letters of a line of the sidebar."""
 
 
 class RELIT_PT_capture(bpy.types.Panel):
@@ -17,7 +22,7 @@ class RELIT_PT_capture(bpy.types.Panel):
         layout, given = self.layout, context.scene.relit
         layout.use_property_split = True
         if sentence := preferences.problem(preferences.preferences(context)):
-            layout.label(text=sentence, icon="ERROR")
+            _error(layout, sentence)
         _progress(layout)
         _part(layout, "Capture", given, ("capture", "out", "sky", "levels"), (solving.RELIT_OT_solve,))
         _part(layout, "Asset", given, ("asset", "mesh", "look"), (importing.RELIT_OT_import_asset,))
@@ -46,7 +51,13 @@ def _progress(layout: bpy.types.UILayout) -> None:
         layout.progress(factor=task.percent / 100, text=f"{task.stage or task.title} {task.percent} %")
         layout.operator(solving.RELIT_OT_cancel.bl_idname, icon="CANCEL")
     elif task.error is not None:
-        layout.label(text=task.error, icon="ERROR")
+        _error(layout, task.error)
+
+
+def _error(layout: bpy.types.UILayout, sentence: str) -> None:
+    """Draw a sentence in lines that a narrow sidebar shows whole."""
+    for number, line in enumerate(textwrap.wrap(sentence, LINE)):
+        layout.label(text=line, icon="BLANK1" if number else "ERROR")
 
 
 CLASSES = (preferences.Preferences, settings.Settings, solving.RELIT_OT_solve, solving.RELIT_OT_cancel, importing.RELIT_OT_import_asset,

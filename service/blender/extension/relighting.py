@@ -57,7 +57,15 @@ class RELIT_OT_relight(WorkOperator):
                     done[same] = files[number]
             return files
 
-        tasks.start("Relighting", work, lambda files: card.show(root, files, place), wait=self.wait)
+        name = root.name
+
+        def finish(files: dict[int, Path]) -> None:
+            now = bpy.data.objects.get(name)  # an undo may have replaced what was there when the work began
+            if now is None:
+                raise tasks.Failure(f"{name} is gone: the frames are {out}")
+            card.show(now, files, place)
+
+        tasks.start("Relighting", work, finish, wait=self.wait)
 
 
 class RELIT_OT_show_frames(RelitOperator):

@@ -63,4 +63,6 @@ def update(given: bpy.types.PropertyGroup, context: bpy.types.Context | None = N
         return
     for index, lamp in enumerate(lamps):
         lamp.hide_render = lamp.hide_viewport = not (given.light == "CAPTURED" and index == given.light_index)
+    if scene.world not in (None, given.environment):
+        given.world = scene.world  # what the user has chosen meanwhile
     scene.world = {"CAPTURED": None, "ENVIRONMENT": given.environment, "SCENE": given.world}[given.light]

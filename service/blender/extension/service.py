@@ -27,6 +27,16 @@ JOB_FILE = "relit_job.json"
 """Beside the maps that a service has solved: which job they are of."""
 
 
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """Refuses to be sent elsewhere, where the key would be sent too."""
+
+    def redirect_request(self, *given: object) -> None:
+        """Return nothing, with which the answer becomes an error."""
+
+
+OPENER = urllib.request.build_opener(_NoRedirect)
+
+
 class Service:
     """What the extension asks of Relit, done by a service."""
 
@@ -181,8 +191,7 @@ class Service:
     def _open(self, method: str, path: str, data: bytes | None = None, headers: dict | None = None) -> http.client.HTTPResponse:
         key = {"Authorization": f"Bearer {self._key}"} if self._key else {}
         try:
-            return urllib.request.urlopen(urllib.request.Request(self._url + path, data, {**(headers or {}), **key}, method=method),
-                                          timeout=SILENCE_S)
+            return OPENER.open(urllib.request.Request(self._url + path, data, {**(headers or {}), **key}, method=method), timeout=SILENCE_S)
         except urllib.error.HTTPError as error:
             try:
                 said = json.load(error)

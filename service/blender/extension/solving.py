@@ -27,7 +27,8 @@ class RELIT_OT_solve(WorkOperator):
             return relit.solve(capture, out, sky, levels, task)
 
         def finish(asset: Path) -> None:
-            given.asset = str(asset)
+            now = bpy.context.scene.relit  # an undo may have replaced what was there when the work began
+            now.capture, now.out, now.asset = str(capture), str(out), str(asset)
             importing.bring_in(bpy.context, asset, new_scene=True)
 
         tasks.start("Solving", work, finish, wait=self.wait)

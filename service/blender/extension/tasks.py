@@ -1,7 +1,8 @@
 """Work in a thread beside Blender: its progress, its end in Blender's own thread, and cancelling.
 
 Convention:
-    `work` runs in a thread and never touches bpy. A timer asks for its end, and then `finish`, which may, runs in Blender's own thread.
+    `work` runs in a thread and never touches bpy. A timer asks for its end, and then `finish`, which may, runs in Blender's own thread. The
+    timer goes when another file is opened: the work ends then without `finish`, and its files are there.
 """
 
 import threading
@@ -102,7 +103,8 @@ def poll() -> float | None:
     finish, _finish = _finish, None
     if finish is not None and current.error is None:
         try:
-            finish(current.result)
+            with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):  # a timer has none
+                finish(current.result)
         except Failure as error:
             current.error = str(error)
     return None
