@@ -124,7 +124,7 @@ found["cancelled"] = tasks.current.error
 found["poll"] = bpy.ops.relit.cancel.poll()
 found["registered"] = bpy.app.timers.is_registered(tasks.poll)
 
-scenes = len(bpy.data.scenes), len(bpy.data.objects)
+bpy.ops.relit.solve(wait=False)  # under way when the extension is disabled
 bpy.ops.preferences.addon_disable(module=NAME)
 found["left"] = [name for name in dir(bpy.types) if "relit" in name.lower()] + [name for name in dir(bpy.types.Scene) if "relit" in name]
 found["left"] += ["timer"] * bpy.app.timers.is_registered(tasks.poll)
@@ -165,6 +165,15 @@ from pathlib import Path
 preferences.backend, preferences.url = "SERVICE", given["url"]
 folder = Path(given["folder"])
 settings(capture=given["capture"], out=str(folder / "out"), levels=0)
+import importlib, time
+tasks = importlib.import_module(NAME + ".tasks")
+bpy.ops.relit.solve(wait=False)
+while tasks.current.stage in ("", "reading cap", "sending cap", "checking cap"):  # until the job is under way
+    time.sleep(0.01)
+bpy.ops.relit.cancel()
+while tasks.poll() is not None:
+    time.sleep(0.01)
+found["cancelled"] = tasks.current.error
 bpy.ops.relit.solve()
 scene = bpy.context.scene
 scene.frame_start = scene.frame_end = 7
@@ -181,10 +190,11 @@ found["other maps"] = refused(bpy.ops.relit.relight)
 
 @pytest.mark.long
 def test_a_service_solves_and_relights_as_the_program_does(tmp_path):
-    scene = make_scene(size=32, lights=8)
+    scene = make_scene(size=32, lights=12)
     capture = write_capture(tmp_path / "cap", scene)
     with serving(tmp_path / "server", "--anonymous", "--device", "cpu") as server:
         found = in_blender(SERVED, tmp_path, capture=capture, url=server.url)
+    assert found["cancelled"] == "Solving is cancelled"
     maps = SurfaceMaps.read(tmp_path / "out" / "maps" / MAPS_FILE)
     assert maps.mask.sum() > 0.9 * scene.mask.sum()
     frame, _ = exr.read(tmp_path / "out" / "relit_frames" / "frame.0007.exr")

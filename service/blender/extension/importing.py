@@ -23,7 +23,7 @@ VARIANTS = """#usda 1.0
 )
 
 def "Asset" (
-    references = @{path}@
+    references = @@@{path}@@@
     variants = {{
 {choices}    }}
 )
@@ -65,7 +65,7 @@ def bring_in(context: bpy.types.Context, path: Path, *, new_scene: bool) -> bpy.
     capture = _camera_of(path, given)
     before, made = context.scene, None
     if new_scene:
-        made = bpy.data.scenes.new(path.stem)
+        made = bpy.data.scenes.new(_name(path))
         for name in settings.Settings.__annotations__:
             if name not in ("root", "world", "environment", "light", "light_index"):
                 setattr(made.relit, name, getattr(given, name))
@@ -85,10 +85,9 @@ def bring_in(context: bpy.types.Context, path: Path, *, new_scene: bool) -> bpy.
 
 def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool) -> bpy.types.Object:
     scene, given = context.scene, context.scene.relit
-    name = path.stem if path.stem != "asset" else path.parent.name
-    collection = bpy.data.collections.new(name)
+    collection = bpy.data.collections.new(_name(path))
     scene.collection.children.link(collection)
-    root = camera.add_root(name, capture, collection)
+    root = camera.add_root(_name(path), capture, collection)
     root["relit_camera"], root["relit_unit_m"] = capture, camera.unit_m(capture)
     objects = _import(context, path, root, {"geo": given.mesh, "look": given.look})
     meshes = [each for each in objects if each.type == "MESH"]
@@ -97,10 +96,8 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
         given.look == "metallic" or given.look.title() in materials)  # USD shows the default in place of a variant that is not there
     if not meshes or not chosen:
         raise Failure(f"{path.name} has no mesh {given.mesh!r} with the look {given.look!r}: choose others, or export it with --levels")
+    _move(objects, collection)
     for each in objects:
-        collection.objects.link(each)
-        for home in [home for home in each.users_collection if home is not collection]:
-            home.objects.unlink(each)
         if each.parent is None:
             world = each.matrix_world.copy()
             each.parent = root
@@ -114,9 +111,7 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
         bpy.data.objects.remove(each)
     lights = path.with_name(f"{path.stem}_lights")
     lamps = rig.take(_import(context, lights / "rig.usda", root, {}), root) if (lights / "rig.usda").is_file() else []
-    for each in lamps:
-        collection.objects.link(each)
-        scene.collection.objects.unlink(each)
+    _move(lamps, collection)
     given.root, given.world, given.environment = root, scene.world, None
     if (lights / "environment.exr").is_file():
         given.environment = environment.world_of(lights / "environment.exr", root)
@@ -129,6 +124,19 @@ def _fill(context: bpy.types.Context, path: Path, capture: dict, new_scene: bool
     return root
 
 
+def _name(path: Path) -> str:
+    """Return what an asset is called in Blender: its file's name, or that of the folder of results."""
+    return path.parent.name if path.stem == "asset" else path.stem
+
+
+def _move(objects: list[bpy.types.Object], collection: bpy.types.Collection) -> None:
+    """Put imported objects, which lie where the user was at work, into the asset's collection."""
+    for each in objects:
+        for home in each.users_collection:
+            home.objects.unlink(each)
+        collection.objects.link(each)
+
+
 def _camera_of(path: Path, given: settings.Settings) -> dict:
     """Return the camera that the asset names, which is that of a part where the capture was cropped, else that of the capture."""
     if path.suffix.lower() == ".usda" and (match := re.search(r"string camera = '(\{.*\})'", path.read_text(encoding="utf-8"))):
@@ -139,16 +147,19 @@ def _camera_of(path: Path, given: settings.Settings) -> dict:
 def _import(context: bpy.types.Context, path: Path, root: bpy.types.Object, variants: dict[str, str]) -> list[bpy.types.Object]:
     """Return the objects that an importer of Blender makes of a file; variants of USD are chosen in a layer that refers to it."""
     known = set(bpy.data.objects)
-    if path.suffix.lower() == ".glb":
-        bpy.ops.import_scene.gltf(filepath=str(path))
-    else:
-        choices = "".join(f'        string {name} = "{value}"\n' for name, value in variants.items())
-        with tempfile.TemporaryDirectory() as folder:
-            layer = Path(folder) / "variants.usda"
-            layer.write_text(VARIANTS.format(path=path.as_posix(), unit=root["relit_unit_m"], choices=choices), encoding="utf-8")
-            known_options = bpy.ops.wm.usd_import.get_rna_type().properties
-            options = {name: False for name in ("create_world_material", "set_frame_range") if name in known_options}
-            bpy.ops.wm.usd_import(filepath=str(layer), **options)
+    usd = bpy.ops.wm.usd_import
+    options = {name: False for name in ("create_world_material", "set_frame_range") if name in usd.get_rna_type().properties}
+    choices = "".join(f'        string {name} = "{value}"\n' for name, value in variants.items())
+    try:
+        if path.suffix.lower() == ".glb":
+            bpy.ops.import_scene.gltf(filepath=str(path))
+        else:
+            with tempfile.TemporaryDirectory() as folder:
+                layer = Path(folder) / "variants.usda"
+                layer.write_text(VARIANTS.format(path=path.as_posix(), unit=root["relit_unit_m"], choices=choices), encoding="utf-8")
+                usd(filepath=str(layer), **options)
+    except RuntimeError as error:  # of an importer, which reports one
+        raise Failure(f"{path} cannot be imported: {str(error).strip()}") from error
     context.view_layer.update()
     return [each for each in bpy.data.objects if each not in known]
 

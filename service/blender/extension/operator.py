@@ -15,7 +15,7 @@ class RelitOperator(bpy.types.Operator):
         """Act, or report why not."""
         try:
             self.act(context)
-        except Failure as error:
+        except (Failure, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}

@@ -91,7 +91,8 @@ def start(title: str, work: Callable[[Task], object], finish: Callable[[object],
             raise Failure(current.error)
         return
     threading.Thread(target=current.run, args=(work,), daemon=True).start()
-    bpy.app.timers.register(poll, first_interval=INTERVAL_S)
+    if not bpy.app.timers.is_registered(poll):
+        bpy.app.timers.register(poll, first_interval=INTERVAL_S)
 
 
 def poll() -> float | None:
@@ -105,8 +106,8 @@ def poll() -> float | None:
         try:
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):  # a timer has none
                 finish(current.result)
-        except Failure as error:
-            current.error = str(error)
+        except Exception as error:  # as in Task.run
+            current.error = str(error) if isinstance(error, Failure) else f"{current.title} failed: {type(error).__name__}: {error}"
     return None
 
 
