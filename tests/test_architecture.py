@@ -60,7 +60,9 @@ def imports_of(path: Path) -> list[Import]:
     return found
 
 
-FILES = {module_name(path): path for root in ROOTS for path in sorted((HOME / root).rglob("*.py"))}
+IN_BLENDER = HOME / "service" / "blender" / "extension"
+"""The modules that run in Blender, as a package of its own: it imports itself relatively, and nothing of Relit."""
+FILES = {module_name(path): path for root in ROOTS for path in sorted((HOME / root).rglob("*.py")) if path.parent != IN_BLENDER}
 
 
 @cache

@@ -20,6 +20,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
              "depth as points."),
     "solve": ("solve", "Normals, albedo and height of a light-stage capture."),
     "export": ("export", "A USD or glTF asset of solved maps with their material, or of a depth with its colours."),
+    "blender-extension": ("export", "Write the extension that brings Relit into Blender 4.2 and later; Blender's preferences install it "
+                          "from the file."),
     "inspect": ("export", "Say what an asset holds, and what is wrong with it: layers, variants, geometry, materials, textures, "
                 "provenance, validators."),
     "basis": ("export", "A capture as a few coefficient images, for a browser or for RTI viewers."),

@@ -24,15 +24,15 @@ class ProgressStyle(Choice):
     """The ways in which progress is shown."""
 
     BAR = "bar", "on a terminal, else not at all"
-    OPENJD = "openjd", "lines that a farm's worker reads (docs/farm.md)"
+    OPENJD = "openjd", "lines that a farm's worker or another program reads (docs/farm.md)"
 
 
 ProgressOption = Annotated[ProgressStyle, typer.Option("--progress", help=f"{ProgressStyle.explained()}.")]
 
 
-def progress_in(style: ProgressStyle) -> "ProgressBar | OpenJdProgress":
-    """Return what shows progress in a style."""
-    return OpenJdProgress() if style is ProgressStyle.OPENJD else ProgressBar()
+def progress_in(style: ProgressStyle, counted: tuple[str, ...] | None = COUNTED) -> "ProgressBar | OpenJdProgress":
+    """Return what shows progress in a style; `counted` as OpenJdProgress takes it."""
+    return OpenJdProgress(counted) if style is ProgressStyle.OPENJD else ProgressBar()
 
 
 class ProgressBar:
@@ -79,20 +79,24 @@ class ProgressBar:
             self._bar.update(self._task, completed=task.total)
 
 
-def with_bar(work: Callable[[Given, ProgressBar], Result], request: Given) -> Result:
-    """Do the work of a request, and show its progress."""
-    with ProgressBar() as bar:
+def with_bar(work: "Callable[[Given, ProgressBar | OpenJdProgress], Result]", request: Given,
+             style: ProgressStyle = ProgressStyle.BAR) -> Result:
+    """Do the work of a request, and show the progress of each of its stages."""
+    with progress_in(style, counted=None) as bar:
         return work(request, bar)
 
 
 class OpenJdProgress:
     """A service.reporting.progress.Progress that prints on standard output what the task does, and how much of it is done.
 
+    Args:
+        counted: the stages whose percentages are those of the task; None: each stage has its own, from 0.
+
     Source: Open Job Description, How Jobs Are Run, Stdout/Stderr Messages.
     """
 
-    def __init__(self) -> None:
-        self._stage, self._total, self._told = "", 0, -1
+    def __init__(self, counted: tuple[str, ...] | None = COUNTED) -> None:
+        self._stage, self._total, self._told, self._counted = "", 0, -1, counted
 
     def __enter__(self) -> Self:
         """Return the object: there is nothing to begin."""
@@ -106,11 +110,13 @@ class OpenJdProgress:
     def stage(self, name: str, total: int) -> None:
         """Print the name of the stage that begins."""
         self._stage, self._total = name, total
+        if self._counted is None:
+            self._told = -1
         print(f"openjd_status: {name}", flush=True)
 
     def advance(self, done: int) -> None:
         """Print each whole percentage once."""
         percent = 100 * done // max(self._total, 1)
-        if self._stage in COUNTED and self._told < percent < 100:
+        if (self._counted is None or self._stage in self._counted) and self._told < percent < 100:
             self._told = percent
             print(f"openjd_progress: {percent}", flush=True)

@@ -1,4 +1,4 @@
-"""The options of `relit export` and `relit inspect`."""
+"""The options of `relit export`, `relit inspect` and `relit blender-extension`."""
 
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -84,6 +84,13 @@ class ExportRequest(ExportOptions):
     card: Annotated[Path | None, Role.INPUT, Spelling(metavar="FRAMES")] = None
     """Relit frames of the capture, such as frame.####.exr: they come along on a rectangle in the plane of the image, as a variant of the
     geometry. For .usdz, .usda and .usdc of solved maps."""
+
+
+class BlenderExtensionRequest(Options):
+    """Write the extension that brings Relit into Blender 4.2 and later; Blender's preferences install it from the file."""
+
+    out: Annotated[Path, Role.OUTPUT]
+    """The extension: .zip."""
 
 
 class InspectRequest(Options):

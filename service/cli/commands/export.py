@@ -1,5 +1,5 @@
-"""relit export, inspect, basis, publish and join: assets and what they hold, coefficient images and web pages of a capture, and maps joined
-with a depth."""
+"""relit export, blender-extension, inspect, basis, publish and join: assets, how they reach Blender and what they hold, coefficient images
+and web pages of a capture, and maps joined with a depth."""
 
 import json
 from collections.abc import Iterator
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import with_bar
+from service.cli.progress import ProgressOption, ProgressStyle, with_bar
 from service.cli.request_commands import local_command
 from service.requests.basis import BasisRequest
-from service.requests.export import ExportRequest, InspectRequest
+from service.requests.export import BlenderExtensionRequest, ExportRequest, InspectRequest
 from service.requests.publish import PublishRequest
 from service.requests.solve import JoinRequest
 
@@ -26,22 +26,29 @@ LONGEST_TEXT = 100
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "export", _export)
+    local_command(app, "blender-extension", _blender_extension)
     local_command(app, "inspect", _inspect)
     local_command(app, "basis", _basis)
     local_command(app, "publish", _publish)
     local_command(app, "join", _join)
 
 
-def _export(request: ExportRequest) -> None:
+def _export(request: ExportRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
     from service.export.export import export
 
-    exported = with_bar(export, request)
+    exported = with_bar(export, request, progress)
     print(f"asset    {exported.path}")
     for layer in exported.lights:
         print(f"lights   {layer}")
     for name, (vertices, faces) in exported.sizes.items():
         print(f"{name:<8} {vertices} vertices, {faces} faces")
     print_warnings(exported.warnings)
+
+
+def _blender_extension(request: BlenderExtensionRequest) -> None:
+    from service.blender.package import pack
+
+    print(f"extension {pack(request)}")
 
 
 def _inspect(request: InspectRequest) -> None:

@@ -3,7 +3,7 @@
 import typer
 
 from service.cli.printing import check_single, counted, print_sequence, print_warnings
-from service.cli.progress import with_bar
+from service.cli.progress import ProgressOption, ProgressStyle, with_bar
 from service.cli.request_commands import local_command
 from service.requests.solve import SolveRequest
 
@@ -13,18 +13,18 @@ def register(app: typer.Typer) -> None:
     local_command(app, "solve", _solve)
 
 
-def _solve(request: SolveRequest) -> None:
+def _solve(request: SolveRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
     from stage.capture.sequence import is_sequence
 
     if is_sequence(request.capture):
         from service.sequences.run import solve_sequence
 
-        print_sequence(with_bar(solve_sequence, request))
+        print_sequence(with_bar(solve_sequence, request, progress))
         return
     from service.solve.solve import solve
 
     check_single(request)
-    result = with_bar(solve, request)
+    result = with_bar(solve, request, progress)
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
     print(f"pixels   {counted(result.counts)}")

@@ -43,6 +43,7 @@ from service.requests.inspect_board import GaugeBoardRequest, InspectBoardReques
 
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
+    "blender-extension": [export.BlenderExtensionRequest],
     "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
     "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
@@ -76,7 +77,8 @@ COMMANDS: dict[str, list[type[Options]]] = {
     "farm template relight": [relight.RelightRequest], "farm template shade": [shade.ShadeRequest],
 }
 OWN = {
-    "relight": {"progress"}, "shade": {"progress"}, "patterns": {"plan"}, "demo": {"serve"}, "keys create": {"data", "config"},
+    "relight": {"progress"}, "shade": {"progress"}, "solve": {"progress"}, "export": {"progress"},
+    "patterns": {"plan"}, "demo": {"serve"}, "keys create": {"data", "config"},
     "hooks create": {"server", "key"},
     **{name: {"server", "key", "wait", "out", "cancel_on_interrupt"} for name in COMMANDS if name.startswith("submit")},
     "farm template relight": {"job", "chunk_frames", "gpu"}, "farm template shade": {"job", "turns", "gpu"},
@@ -203,6 +205,7 @@ NO_JOBS = {
     "import": "describes files before they are uploaded", "simulate": "makes raw frames, which are uploaded as any others",
     "publish": "makes files for another web server", "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
+    "blender-extension": "writes a file for another program of this machine",
     "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
     "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",

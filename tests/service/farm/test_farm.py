@@ -191,6 +191,15 @@ def test_progress_lines_of_a_task(relit, tmp_path):
     assert failed.code == 2 and "openjd_progress: 100" not in failed.out
 
 
+def test_progress_lines_of_a_solve_count_each_stage(relit, tmp_path):
+    write_capture(tmp_path / "cap", make_scene(size=8, lights=4))
+    lines = relit("solve", tmp_path / "cap", "--progress", "openjd", "--out", tmp_path / "maps").out.splitlines()
+    stages = [line.removeprefix("openjd_status: ") for line in lines if "status" in line]
+    assert stages[:2] == ["open", "ingest"] and stages[-1] == "write"
+    ingest = lines[lines.index("openjd_status: ingest") + 1 : lines.index(f"openjd_status: {stages[2]}")]
+    assert "openjd_progress: 25" in ingest and "openjd_progress: 100" in lines
+
+
 def test_the_docs_name_every_option_and_parameter(relit, tmp_path):
     text = (ROOT / "docs" / "farm.md").read_text(encoding="utf-8")
     for command, model in (("relight", RelightRequest), ("shade", ShadeRequest)):

@@ -1,0 +1,257 @@
+"""Blender and Relit mean the same light: captured lights, exported lights and worlds, and cards, each against pictures that are known."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+from benchmarks.clients.comparison import compare
+from benchmarks.clients.panel import picture
+from service.export.export import export
+from service.requests.export import ExportRequest
+from stage.capture.capture import Capture
+from stage.formats import exr
+from stage.results.maps import MAPS_FILE, SurfaceMaps
+from stage.stack.correction import Correction
+from tests.clients.blender import in_blender
+from tests.clients.scenes import directions, uneven
+from tests.clients.test_conventions import CAMERAS, ball
+from tests.scenes.captures import write_exr
+from tests.scenes.surroundings import capture_of, write_frames
+from tests.service.owl import OWL
+
+pytestmark = pytest.mark.long
+
+OWL_LIGHTS = (44, 31)
+"""The light of the owl that is nearest to the view axis, and one 20 degrees from it."""
+
+
+THE_OWL = """
+from mathutils import Vector
+settings(capture=given["capture"], levels=1)
+bpy.ops.relit.solve()
+scene, chosen = bpy.context.scene, bpy.context.scene.relit
+found["light"], found["resolution"] = chosen.light_index, (scene.render.resolution_x, scene.render.resolution_y)
+render(given["folder"] + "/owl.exr", 24)
+def held():
+    return [len(each) for each in (bpy.data.scenes, bpy.data.objects, bpy.data.collections)]
+
+before = held()
+settings(mesh="lod4")
+found["no level"] = refused(bpy.ops.relit.import_asset)
+found["left"] = before == held()
+settings(mesh="lod1", look="specular")
+bpy.ops.relit.import_asset(new_scene=False)
+found["meshes"] = sorted(len(each.data.polygons) for each in scene.objects if each.type == "MESH")
+found["materials"] = sorted(slot.name for each in scene.objects for slot in each.material_slots)
+
+# a sun of the scene that goes from one captured light to another
+bpy.ops.relit.import_asset(new_scene=True)
+scene = bpy.context.scene
+settings(mesh="mesh", look="metallic", light="SCENE", guided=False)
+sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+sun.data.energy, sun.data.angle, sun.rotation_mode = 3, 0, "QUATERNION"
+scene.collection.objects.link(sun)
+for frame, (x, y, z) in zip((2, 4), given["directions"]):
+    sun.rotation_quaternion = Vector((x, -z, y)).to_track_quat("Z", "Y")
+    sun.keyframe_insert("rotation_quaternion", frame=frame)
+scene.frame_start, scene.frame_end = 2, 4
+bpy.ops.relit.relight()
+bpy.data.objects.remove(sun)
+for each in scene.objects:
+    each.hide_render = each.type == "MESH" and "relit_card" not in each
+scene.frame_set(4)
+render(given["folder"] + "/card.exr", 1)
+"""
+
+
+def test_the_owl_from_the_panel_looks_like_its_photographs(tmp_path):
+    """Error of the rendered asset: RMSE over the photograph's mean, all pixels of the mask, no factor of brightness; the bar is .15."""
+    folder = shutil.copytree(OWL, tmp_path / "owl", ignore=shutil.ignore_patterns(".relit"))
+    capture = Capture.open(folder)
+    correction, mask, sources = Correction.of(capture), capture.mask(), list(capture.sources())
+    photographs = [correction.apply(sources[index]).pixels for index in OWL_LIGHTS]
+    lights = [frame["light"]["direction"] for frame in json.loads((folder / "capture.json").read_text())["frames"]]
+    found = in_blender(THE_OWL, tmp_path, capture=folder, directions=[lights[index] for index in OWL_LIGHTS])
+    assert found["light"] == OWL_LIGHTS[0] and found["resolution"] == [320, 320]
+    assert compare(picture(tmp_path / "owl.exr")[..., :3], photographs[0], mask, scaled=False).rmse < 0.15
+    assert found["no level"].startswith("asset.usda has no mesh 'lod4'") and found["left"]
+    assert found["meshes"][0] < 0.6 * found["meshes"][1] and any("Specular" in name for name in found["materials"])
+    for number, photograph in zip((2, 4), photographs, strict=True):
+        frame = picture(tmp_path / "owl_relit" / "relit_frames" / f"frame.{number:04d}.exr")
+        # a captured light gives its photograph; Blender keeps directions in float32, of whose 1e-7 the weights make less than a percent
+        assert compare(frame[..., :3], photograph, mask, scaled=False).rmse < 0.01
+    card = picture(tmp_path / "card.exr")
+    assert np.abs(card - frame).max() < 0.02 * frame.max()  # Cycles' filter of 1.5 pixels blurs it
+"""A card is the frame; the last one, since the sequence is shown at frame 4."""
+
+
+NEAR = """
+import importlib, os
+from mathutils import Euler, Vector
+lights = importlib.import_module(NAME + ".lights")
+folder = given["folder"]
+settings(capture=given["capture"], out=folder, asset=folder + "/asset.usda")
+bpy.ops.relit.import_asset()
+scene, root = bpy.context.scene, bpy.context.scene.relit.root
+settings(light="SCENE", method="SHADE")
+scene.frame_start = scene.frame_end = 1
+root.matrix_world = root.matrix_world @ Euler((0.3, 0.5, -0.2)).to_matrix().to_4x4()
+root.location, root.scale = (1, 2, 3), (1.5, 1.5, 1.5)
+bpy.context.view_layer.update()
+centre = lights.subject_of(root).centre
+
+def lamp(kind, place, size=0.0, **values):
+    data = bpy.data.lights.new(kind, kind)
+    for name, value in values.items():
+        setattr(data, name, value)
+    made = bpy.data.objects.new(kind, data)
+    scene.collection.objects.link(made)
+    made.rotation_mode = "QUATERNION"
+    made.location = root.matrix_world @ Vector(place)
+    made.rotation_quaternion = (made.location - centre).to_track_quat("Z", "Y")
+    return made
+
+at = given["at"]
+LAMPS = {
+    "sun": dict(kind="SUN", energy=3, angle=0.2, color=(1, 0.5, 0.25)),
+    "point": dict(kind="POINT", energy=2, shadow_soft_size=0, exposure=1),
+    "sphere": dict(kind="POINT", energy=2, shadow_soft_size=0.05, use_soft_falloff=False),
+    "not normalised": dict(kind="POINT", energy=200, shadow_soft_size=0.05, use_soft_falloff=False, normalize=False),
+    "spot": dict(kind="SPOT", energy=2, shadow_soft_size=0, spot_size=2.4, spot_blend=0.1, use_temperature=True, temperature=3000),
+    "area": dict(kind="AREA", energy=1, shape="RECTANGLE", size=0.3, size_y=0.1),
+}
+for name, values in LAMPS.items():
+    made = lamp(place=at, **values)
+    bpy.context.view_layer.update()
+    bpy.ops.relit.relight()
+    for each in [each for each in scene.objects if "relit_card" in each]:
+        bpy.data.objects.remove(each)
+    os.replace(folder + "/shaded_frames/frame.0001.exr", folder + f"/{name} shaded.exr")
+    render(folder + f"/{name}.exr", 64, bounces=0)
+    found[name] = lights.distant(made, lights.subject_of(root))
+    bpy.data.objects.remove(made)
+
+found["refused"] = []
+for values in (dict(kind="SPOT", spot_size=0.1), dict(kind="AREA", spread=1.0), dict(kind="POINT", use_shadow=False),
+               dict(kind="POINT", specular_factor=0.0), dict(kind="AREA", shape="DISK")):
+    made = lamp(place=at, **values)
+    bpy.context.view_layer.update()
+    found["refused"].append(refused(bpy.ops.relit.relight))
+    bpy.data.objects.remove(made)
+found["dark"] = refused(bpy.ops.relit.relight)
+root.scale = (1, 2, 1)
+bpy.context.view_layer.update()
+found["stretched"] = refused(bpy.ops.relit.relight)
+"""
+
+
+@pytest.fixture
+def a_ball(tmp_path) -> SurfaceMaps:
+    """A Lambertian ball before a turned perspective camera, as maps, asset and capture in the test's folder."""
+    camera, radius, centre_z = CAMERAS["perspective, turned"]
+    maps = ball(camera, radius, centre_z)
+    maps = SurfaceMaps(camera=camera, mask=maps.mask, normal=maps.normal, diffuse_albedo=maps.diffuse_albedo, height=maps.height)
+    (tmp_path / "maps").mkdir()
+    maps.write(tmp_path / "maps" / MAPS_FILE)
+    write_exr(tmp_path / "sky.exr", uneven())
+    capture = capture_of(tmp_path / "capture", camera, [{"type": "distant", "direction": [0.6, 0, 0.8], "irradiance": [3, 3, 3]}])
+    assert capture.camera == camera
+    export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / "asset.usda", environment=tmp_path / "sky.exr", rig=tmp_path / "capture"))
+    return maps
+
+
+def test_lights_of_blender_are_those_that_relit_shades_with(a_ball, tmp_path):
+    at = (0.25, 0.3, -0.25)
+    found = in_blender(NEAR, tmp_path, capture=tmp_path / "capture", at=at)
+    inside = binary_erosion(a_ball.mask, np.ones((3, 3)))
+    normal = a_ball.normal.astype(float)
+    for name in ("sun", "point", "sphere", "not normalised", "spot", "area"):
+        rendered, shaded = (picture(tmp_path / f"{name}{suffix}.exr")[..., :3] for suffix in ("", " shaded"))
+        ratio = rendered[inside].sum(axis=0) / shaded[inside].sum(axis=0)
+        np.testing.assert_allclose(ratio, 1, atol=0.02, err_msg=name)  # a mesh of flat facets, and noise of 64 paths
+        assert compare(rendered, shaded, inside, scaled=False).rmse < 0.05, name
+    sun = found["sun"]
+    np.testing.assert_allclose([*sun["irradiance"], sun["angle_degrees"]], [3, 1.5, 0.75, np.degrees(0.2)], rtol=1e-5)
+    distant = a_ball.diffuse_albedo / np.pi * np.maximum(normal @ sun["direction"], 0)[..., None] * sun["irradiance"]
+    assert compare(picture(tmp_path / "sun.exr")[..., :3], distant, inside, scaled=False).rmse < 0.05
+    points = a_ball.camera.points(a_ball.height)[a_ball.mask]
+    distance = 1.5 * np.linalg.norm(np.array(at) - (points.min(axis=0) + points.max(axis=0)) / 2)
+    # E = Φ/4πd², in W and metres, with an exposure of one stop; the mesh ends half a pixel outside the mask
+    np.testing.assert_allclose(found["point"]["irradiance"], 2 * 2 / (4 * np.pi * distance**2), rtol=0.05)
+    spot, spread, shadow, factor, disk = found["refused"]
+    assert "cone of the light SPOT falls on the object" in spot and "spread below 180" in spread and "no shadow" in shadow
+    assert "factor" in factor and "is a disk" in disk and "no light" in found["dark"] and "stretches no object" in found["stretched"]
+
+
+WORLD = """
+import importlib
+environment = importlib.import_module(NAME + ".environment")
+from pathlib import Path
+folder = Path(given["folder"])
+settings(capture=given["capture"], out=str(folder), asset=str(folder / "asset.usda"))
+bpy.ops.relit.import_asset()
+scene = bpy.context.scene
+found["captured"] = [scene.world is None, scene.relit.light]
+settings(light="ENVIRONMENT")
+render(folder / "environment.exr", 256, bounces=0)
+found["file"] = str(environment.write_world(scene, scene.relit.root, range(3, 5), folder / "worlds"))
+scene.world.node_tree.nodes["Background"].inputs["Strength"].keyframe_insert("default_value", frame=3)
+scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 2
+scene.world.node_tree.nodes["Background"].inputs["Strength"].keyframe_insert("default_value", frame=4)
+found["files"] = str(environment.write_world(scene, scene.relit.root, range(3, 5), folder / "worlds"))
+bpy.ops.relit.show_frames(filepath=str(folder / "frames" / "frame.0002.exr"))
+scene.world = None
+for each in scene.objects:
+    each.hide_render = each.type == "MESH" and "relit_card" not in each
+for number in (1, 2):
+    scene.frame_set(number)
+    render(folder / f"card{number}.exr", 4)
+found["scenes"] = len(bpy.data.scenes)
+
+from bpy_extras.object_utils import world_to_camera_view
+settings(place="BESIDE")
+bpy.ops.relit.show_frames(filepath=str(folder / "frames" / "frame.0001.exr"))
+card, = [each for each in scene.objects if "relit_card" in each]
+bpy.context.view_layer.update()
+found["beside"] = [tuple(world_to_camera_view(scene, scene.camera, card.matrix_world @ each.co))[:2] for each in card.data.vertices]
+found["other kinds"] = []
+for name in ("asset.usdz", "asset.glb"):
+    settings(asset=str(folder / name))
+    bpy.ops.relit.import_asset()
+    found["other kinds"].append([bpy.context.scene.relit.light, sum(each.type == "MESH" for each in bpy.context.scene.objects)])
+settings(mesh="lod1")
+found["no variants"] = refused(bpy.ops.relit.import_asset)
+settings(mesh="mesh", capture=given["other"], asset=str(folder / "asset.usdz"))
+found["another capture"] = refused(bpy.ops.relit.import_asset)
+"""
+
+
+def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
+    write_frames(tmp_path / "frames", (1, 2), a_ball.camera, opaque=True)
+    for suffix in (".usdz", ".glb"):
+        export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / f"asset{suffix}", name="Ball"))
+    capture_of(tmp_path / "other", a_ball.camera.model_copy(update={"focal_px": (50.0, 50.0)}), [{"type": "off"}])
+    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other")
+    assert found["captured"] == [True, "CAPTURED"]
+    d, omega = directions(64)
+    cosine = np.maximum(np.einsum("rcx,hwx->rchw", a_ball.normal.astype(float), d), 0)
+    truth = a_ball.diffuse_albedo / np.pi * np.einsum("rchw,hwk,hw->rck", cosine, uneven(), omega)
+    inside = binary_erosion(a_ball.mask, np.ones((3, 3)))
+    assert compare(picture(tmp_path / "environment.exr")[..., :3], truth, inside, scaled=False).rmse < 0.05  # noise of 256 paths
+    written = {name: exr.read(tmp_path / "worlds" / f"{name}.exr")[0] for name in ("world", "world.0003", "world.0004")}
+    maps = {name: np.stack([found[channel] for channel in "RGB"], axis=-1).reshape(64, 4, 128, 4, 3).mean(axis=(1, 3))
+            for name, found in written.items()}
+    # Blender interpolates between the texels of 2.8 degrees, and between the top and the bottom row
+    np.testing.assert_allclose(maps["world"][1:-1], uneven()[1:-1], rtol=0.05)
+    np.testing.assert_allclose(maps["world.0003"], maps["world"], rtol=0.02)
+    np.testing.assert_allclose(maps["world.0004"], 2 * maps["world"], rtol=0.02)
+    assert found["file"].endswith("world.exr") and found["files"].endswith("world.####.exr") and found["scenes"] == 2
+    for number in (1, 2):
+        card = picture(tmp_path / f"card{number}.exr")
+        np.testing.assert_allclose(card[1:-1, 1:-1], np.broadcast_to([number / 4, 0.5, 2, 1], (30, 30, 4)), rtol=1e-3)
+    np.testing.assert_allclose(found["beside"], [(1.05, 0), (2.05, 0), (2.05, 1), (1.05, 1)], atol=1e-4)
+    assert found["other kinds"] == [["CAPTURED", 1], ["CAPTURED", 1]]  # the rig of asset.usda lies beside them too
+    assert "has no mesh 'lod1'" in found["no variants"] and "different cameras" in found["another capture"]
