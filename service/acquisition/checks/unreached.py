@@ -10,7 +10,7 @@ from service.acquisition.checks.prediction import LEAST_LAMPS
 from service.acquisition.plans.shots import Shot
 
 FAINT = 0.003
-"""A picture under a lamp shows no sign of it, where there is no dark one, if its brightest thousandth reads less, as a part of full scale."""
+"""A picture under a lamp shows no sign of it, where there is no dark one, if its brightest thousandth reads less of full scale."""
 GLOW_GAIN = 2.0
 """A block reads more than in the dark if it is above it by more than this factor of the most that one is below it: noise is symmetric."""
 ALIKE = 0.02
