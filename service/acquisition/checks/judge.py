@@ -204,6 +204,8 @@ class Judge:
         light, should = float((sample.blocks - dark).mean()), float((expected - dark).mean())
         least = LEAST_LIGHT * float((usual - dark).mean())
         if shot.lamp is not None:
+            if should >= 4 * least and not isinstance(dark, float) and not glows(seen, dark):
+                return [Fault(shot.key, FaultKind.UNLIT, "shows no sign of the lamp")]  # few lamps behind an object light no rim of it
             should = min(should, lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
         faint = should < least
         if faint and (shot.lamp is None or light < least):
