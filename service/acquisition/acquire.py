@@ -4,6 +4,7 @@ import shlex
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -125,11 +126,12 @@ class Acquisition:
         Raises:
             RequestError: the lamps or the camera do not answer any more; the pictures that were taken are kept.
         """
-        with ended_by_signals(stop or threading.Event()) as stopping:
+        with ended_by_signals(stop or threading.Event()) as stopping, ExitStack() as receiving:
             lights = None
             try:
                 for receiver in receivers:
                     receiver.open()
+                    receiving.callback(receiver.stop)
                     self._receivers.append(receiver)
                 self._recall()
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
@@ -147,13 +149,10 @@ class Acquisition:
                     self._timings.advance(number)
                 else:
                     self._review(lights, stopping)
-            except BaseException:
-                self._give_up()
-                raise
             finally:
                 self._close(lights)
-        if len(self.journal.taken) < len(self.shots):
-            self._give_up()
+            if len(self.journal.taken) == len(self.shots):
+                receiving.pop_all()
         faults = tuple(fault for found in self.faults.values() for fault in found)
         self._report(faults)
         return AcquireResult(self._request.out, len(self._own), len(self.journal.taken), len(self.shots), faults, tuple(self.retaken),
@@ -270,9 +269,19 @@ class Acquisition:
                 self.retaken += faults
                 self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
                 continue
+            self._refuse_darkness(shot, picture, faults, attempt)
             self._accept(shot, picture, faults)
             self._own.append(released - began - self.plan.settle_s + time.perf_counter() - came)
             return
+
+    def _refuse_darkness(self, shot: Shot, picture: Picture, faults: list[Fault], attempt: int) -> None:
+        """Raise RequestError where two lamps did not light, at every attempt, and none has yet."""
+        if not any(fault.kind is FaultKind.UNLIT for fault in faults) or shot.lamp is None:
+            return
+        lamps = {each.key for each in self.shots if each.lamp is not None and each.key in self.journal.taken}
+        if lamps and all(any(fault.kind is FaultKind.UNLIT for fault in self.faults.get(key, ())) for key in lamps):
+            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
+            raise RequestError(f"no lamp has lit yet: {faults[0].sentence} Then run the same command again, with --retake {min(lamps)}")
 
     def _await(self, shot: Shot, owed: int, stopping: threading.Event) -> None:
         """Wait for pictures that are late, while the lamps shine for which they were asked, so that none is taken for another shot's."""
@@ -302,11 +311,6 @@ class Acquisition:
         """Name the picture of a shot of the capture itself to the receivers."""
         for receiver in self._receivers if not shot.folder else ():
             receiver.send(self.journal.taken[shot.key]["file"], new=new)
-
-    def _give_up(self) -> None:
-        """Tell the receivers that the capture has ended before its last picture."""
-        for receiver in self._receivers:
-            receiver.stop()
 
     def _review(self, lights: Lights, stopping: threading.Event) -> None:
         """Take those pictures again, the worst first, in which all of them together show a fault that none showed when it came."""

@@ -14,7 +14,7 @@ from stage.stack.ingest import CACHE_FOLDER, Ingest
 
 
 class EarlyIngest:
-    """Takes note of pictures as they come, and decodes them in a thread of its own."""
+    """Takes note of pictures as they come, and decodes them in a thread of its own, once one has been taken in this run."""
 
     def __init__(self, folder: Path, shots: Sequence[Shot]) -> None:
         """Find which shots of the capture itself are light frames; nothing is decoded yet."""
@@ -24,18 +24,20 @@ class EarlyIngest:
         self._early = EarlyStack(folder / CACHE_FOLDER, len(self._lights))
         self._waiting: queue.Queue[str | None] = queue.Queue()
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="relit-early-ingest", daemon=True)
+        self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Begin."""
-        self._thread.start()
+        """Do nothing: the first new picture begins."""
 
     def send(self, name: str, *, new: bool) -> None:
         """Decode a picture of the capture when those before it are decoded; returns at once."""
         self._waiting.put(name)
+        if new and self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="relit-early-ingest", daemon=True)
+            self._thread.start()
 
     def stop(self) -> None:
-        """End, as the capture has ended before its last picture."""
+        """End, as the capture has ended before its last picture; done once more, it does nothing."""
         self._stopped = True
         self._end()
         self._early.close()
@@ -49,13 +51,15 @@ class EarlyIngest:
         self._end()
         try:
             if self._lights:
+                self._early.remember()
                 Ingest.of(Capture.open(self._folder)).stack(early=self._early)
         finally:
             self._early.close()
 
     def _end(self) -> None:
         self._waiting.put(None)
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     def _run(self) -> None:
         while (name := self._waiting.get()) is not None:
@@ -67,5 +71,5 @@ class EarlyIngest:
                 for frame in capture.manifest.frames:
                     if frame.image == name:
                         self._early.add(capture, frame, light)
-            except StageError:
-                continue  # `finish` decodes it, and says what is wrong if it still is
+            except (StageError, MemoryError):  # no more is decoded before all are there; `finish` says what is wrong if it still is
+                self._stopped = True

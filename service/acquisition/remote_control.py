@@ -255,7 +255,7 @@ class RemoteControl:
         self._process = subprocess.Popen([sys.executable, "-m", "service.cli.main", *words], text=True,
                                          stdin=subprocess.DEVNULL if terminal is None else terminal, stdout=subprocess.PIPE,
                                          stderr=subprocess.STDOUT, start_new_session=True)
-        threading.Thread(target=self._listen, args=[self._process], name="relit-set", daemon=True).start()
+        threading.Thread(target=self._listen, args=[self._process, self._name, self._calibrating], name="relit-set", daemon=True).start()
 
     def _version(self) -> str | None:
         """Return a word that is another one when the capture is; None where not all of its pictures are there, or it is being made."""
@@ -296,9 +296,11 @@ class RemoteControl:
         process = self._process
         return None if process is None else process.poll()
 
-    def _listen(self, process: "subprocess.Popen[str]") -> None:
+    def _listen(self, process: "subprocess.Popen[str]", name: str, step: str | None) -> None:
         assert process.stdout is not None
         for line in process.stdout:
+            if process is not self._process:  # of a child of it that outlives it
+                continue
             text = line.rstrip()
             if text.startswith(PLEASE) and text.endswith(THEN_ENTER):
                 self._prompt = text.removeprefix(PLEASE).removesuffix(THEN_ENTER)
@@ -306,9 +308,10 @@ class RemoteControl:
                 self._lines.append(text)
                 if text.startswith(PLEASE) and (address := re.search(r"http://\S+", text)) is not None:
                     self._address = address[0]
-        if process.wait() == 0 and self._calibrating is not None:
-            self._calibrated[self._name, self._calibrating] = self._taken_at()
-        self._calibrating = None
+        if process.wait() == 0 and step is not None:
+            self._calibrated[name, step] = (self._folder / name / JOURNAL_FILE).stat().st_mtime_ns
+        if process is self._process:
+            self._calibrating = None
 
 
 def _named(kind: str, sentence: str) -> str:

@@ -6,7 +6,7 @@ import math
 import os
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -165,42 +165,47 @@ def stack_key(capture: Capture, frames: list[Frame], tracking: Tracking | None, 
 def _build(ingest: Ingest, alignment: Alignment | None, early: Begun | None, progress: FrameProgress | None) -> Stack:
     capture, frames, folder, key = ingest.capture, ingest.frames, ingest.folder, ingest.key
     pixel_count = capture.camera.width * capture.camera.height
-    correction = Correction.of(capture, full_scale=True)
-    lock = threading.Lock()
-
     with replacing(stacks.values_path(folder, key), flush=False) as temporary:  # the index has checksums of all planes
         begun = None if early is None else early.take(ingest, temporary)
         if begun is None:
             with storage("make the stack cache", stacks.values_path(folder, key)):
                 begun = StackFile(temporary, len(frames), pixel_count), set()
         file, there = begun
-        done = len(there)
-
-        def take(light: int, warp: Warp | None) -> None:
-            nonlocal done
-            file.write(light, correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light])))
-            with lock:
-                done += 1
-                if progress is not None:
-                    progress(done, len(frames))
-
-        batches: Iterable[tuple[Sequence[int], Warp | None]] = [([light for light in range(len(frames)) if light not in there], None)]
-        if alignment is not None:
-            batches = alignment.batches(correction)
-        bytes_per_pixel = ALIGNED_BYTES_PER_PIXEL
-        if alignment is None:
-            bytes_per_pixel = CODED_BYTES_PER_PIXEL if correction.has_codes(frames[0]) else BYTES_PER_PIXEL
-        workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
-        with closing(file), ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
-            try:
-                for batch, warp in batches:
-                    for job in [pool.submit(take, light, warp) for light in batch]:
-                        job.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        with closing(file):
+            _write(file, capture, frames, alignment, there, progress)
     motion = None if alignment is None else alignment.statistics()
     return _complete(capture, frames, folder, key, file, motion)
+
+
+def _write(file: StackFile, capture: Capture, frames: list[Frame], alignment: Alignment | None, there: Collection[int],
+           progress: FrameProgress | None) -> None:
+    """Decode the frames whose planes are not there yet."""
+    correction = Correction.of(capture, full_scale=True)
+    lock, done = threading.Lock(), len(there)
+
+    def take(light: int, warp: Warp | None) -> None:
+        nonlocal done
+        file.write(light, correction.coded(frames[light]) if warp is None else warp(light, correction.apply(frames[light])))
+        with lock:
+            done += 1
+            if progress is not None:
+                progress(done, len(frames))
+
+    batches: Iterable[tuple[Sequence[int], Warp | None]] = [([light for light in range(len(frames)) if light not in there], None)]
+    if alignment is not None:
+        batches = alignment.batches(correction)
+    bytes_per_pixel = ALIGNED_BYTES_PER_PIXEL
+    if alignment is None:
+        bytes_per_pixel = CODED_BYTES_PER_PIXEL if correction.has_codes(frames[0]) else BYTES_PER_PIXEL
+    workers = max(1, min(os.cpu_count() or 1, DECODE_BYTES // (bytes_per_pixel * math.prod(capture.image_resolution))))
+    with ThreadPoolExecutor(workers, thread_name_prefix="relit-ingest") as pool:
+        try:
+            for batch, warp in batches:
+                for job in [pool.submit(take, light, warp) for light in batch]:
+                    job.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _complete(capture: Capture, frames: list[Frame], folder: Path, key: str, file: StackFile, motion: dict[str, Any] | None) -> Stack:

@@ -42,10 +42,15 @@ class StackFile:
             np.lib.format.write_array_header_1_0(
                 self._file, {"descr": "<f2", "fortran_order": False, "shape": (CHANNELS, lights, pixels)})
             self._start = self._file.tell()
-            _reserve(self._file.fileno(), self._start + 2 * CHANNELS * lights * pixels)
+            _reserve(self._file.fileno(), self._start + self.size(light_count, pixel_count))
         except BaseException:
             self._file.close()
             raise
+
+    @staticmethod
+    def size(light_count: int, pixel_count: int) -> int:
+        """Return the bytes of such a file, without its header."""
+        return 2 * CHANNELS * padded(light_count, LIGHT_PAD) * padded(pixel_count, PIXEL_PAD)
 
     def write(self, light: int, radiance: Radiance | CodedRadiance) -> None:
         """Write the planes of a light, in place of those that it had."""

@@ -93,7 +93,8 @@ class Judge:
             self._digests[seen.sample.digest] = shot.key
         found = list(self._exposure_faults(seen))
         if not found and shot.lamp is not None and shot.exposure_s is None:  # of several exposures, short ones may show no lamp
-            found = [fault for fault in unreached_faults([*self._seen.values(), seen], self._dark) if fault.shot == shot.key]
+            every = [*self._seen.values(), seen]
+            found = [fault for fault in unreached_faults(every, self._expectation.directions, self._dark) if fault.shot == shot.key]
         found = [*found, *self._faults(seen, self._others(seen, self._sound()))][:1]
         if found and found[0].kind is FaultKind.UNLIT and glows(seen, self._dark(shot)):
             return []  # as behind the object: all pictures together tell such a lamp from one that failed
@@ -125,7 +126,7 @@ class Judge:
         certain = {key: each.faults[0] for key, each in self._seen.items() if each.faults and each.faults[0].kind in CERTAIN}
         found: dict[str, Fault] = {}
         left = [each for key, each in self._seen.items() if key not in certain]
-        certain |= {fault.shot: fault for fault in unreached_faults(left, self._dark)}
+        certain |= {fault.shot: fault for fault in unreached_faults(left, self._expectation.directions, self._dark)}
         keys = [key for key in self._seen if key not in certain]
         for key in keys:
             if faults := self._dark_faults(self._seen[key], [self._seen[other] for other in keys if other not in found]):

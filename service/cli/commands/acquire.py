@@ -6,8 +6,8 @@ import shlex
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING
 
 import typer
 
@@ -18,9 +18,6 @@ from service.errors import USER_ERRORS, sentence
 from service.requests.acquire import AcquireRequest, Then
 from service.requests.export import ExportRequest
 from service.requests.solve import SolveRequest
-
-if TYPE_CHECKING:
-    from service.acquisition.early_ingest import EarlyIngest
 
 MAPS, ASSET = "maps", "asset.usdz"
 """Where the results of --then lie in the capture."""
@@ -50,7 +47,13 @@ def _capture(request: AcquireRequest) -> None:
             sender = Sender(request.to, request.out)
         acquisition = Acquisition(request, ask, _tell, bar)
         early = EarlyIngest(request.out, acquisition.shots)
-        result = acquisition.run(stop, [early] if sender is None else [sender, early])
+        try:
+            result = acquisition.run(stop, [early] if sender is None else [sender, early])
+            if result.taken and result.there == result.shots:
+                with suppress(*USER_ERRORS):  # the preview meets them again, and says so
+                    early.finish()
+        finally:
+            early.stop()
     for fault in result.retaken:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
@@ -62,7 +65,7 @@ def _capture(request: AcquireRequest) -> None:
     if result.there < result.shots:
         print("ended    before the last picture: run the same command again to go on")
     else:
-        _preview(request, early, result.taken)
+        _preview(request, result.taken)
         if sender is not None:
             print(f"sent     {sender.finish()}, at {request.to}", flush=True)
         if request.then and not result.faults:
@@ -93,15 +96,13 @@ def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
     print(f"meter    {found.path}, {found.picture}; the lamps are dark")
 
 
-def _preview(request: AcquireRequest, early: "EarlyIngest", taken: int) -> None:
+def _preview(request: AcquireRequest, taken: int) -> None:
     """Write the preview, unless there is one of the same pictures; a capture that has none is as good as others."""
     from service.acquisition.preview import PREVIEW_FILE, write_preview
 
     if taken == 0 and (request.out / PREVIEW_FILE).exists():
-        early.stop()
         return
     try:
-        early.finish()
         print(f"preview  {write_preview(request.out, request.device, review=request.review)}", flush=True)
     except USER_ERRORS as error:
         print(f"preview  none: {sentence(error)}", flush=True)

@@ -32,7 +32,7 @@ def serve(
         show_default=False)] = None,
     rig: Annotated[Path | None, typer.Option(
         "--set", metavar="RIG.json", show_default=False,
-        help="Take captures at this machine, with the lamps of a rig, on the page /set; only on loopback addresses.")] = None,
+        help="Take captures at this machine, with the lamps of a rig, on the page /set, which takes a key of the scope admin.")] = None,
     camera: Annotated[str | None, typer.Option(
         "--camera", help="The camera of --set, as relit capture takes it.", show_default=False)] = None,
     trigger: Annotated[str | None, typer.Option(

@@ -122,7 +122,8 @@ def _scoped(scope: Scope) -> Callable[[Caller], Awaitable[Caller]]:
 
 Reader = Annotated[Caller, Depends(_scoped(Scope.READ))]
 Writer = Annotated[Caller, Depends(_scoped(Scope.WRITE))]
-Admin = Annotated[Caller, Depends(_scoped(Scope.ADMIN))]
+require_admin = _scoped(Scope.ADMIN)
+Admin = Annotated[Caller, Depends(require_admin)]
 IdempotencyKey = Annotated[str | None, Header(
     alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$",
     description="Chosen by the client: the same request sent again with it creates nothing again.")]

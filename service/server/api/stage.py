@@ -1,4 +1,4 @@
-"""The stage at this machine, for the page /set: captures are started and watched, by programs of this machine alone."""
+"""The stage at this machine, for the page /set: captures are started and watched, with a key of the scope admin where there are keys."""
 
 import tempfile
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Protocol
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import BaseModel, ConfigDict
 
-from service.server.api.context import require_local
+from service.server.api.context import require_admin
 from service.server.api.problems import ApiError
 from stage.model import Line
 
@@ -91,7 +91,7 @@ def _stage(request: Request) -> Stage:
 
 
 Given = Annotated[Stage, Depends(_stage)]
-router = APIRouter(prefix="/set", include_in_schema=False, dependencies=[Depends(require_local)])
+router = APIRouter(prefix="/set", include_in_schema=False, dependencies=[Depends(require_admin)])
 
 
 @router.get("/rig")

@@ -21,7 +21,7 @@ from service.server.api.app import create_app
 from service.server.api.stage import Stage
 from service.server.base import telemetry
 from service.server.base.log import logger
-from service.server.base.settings import Settings, is_loopback
+from service.server.base.settings import Settings
 from service.server.database.engine import Database, open_database
 from service.server.jobs.queue import JobQueue, prepare
 from service.server.jobs.supervisor import Supervisor
@@ -44,13 +44,11 @@ def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQ
 
     Args:
         before_answering: gets the address and the parts of the service.
-        set_stage: takes captures at this machine, for the page /set; loopback alone.
+        set_stage: takes captures at this machine, for the page /set.
 
     Raises:
-        RequestError: the service cannot listen, or would show the stage to other machines.
+        RequestError: the service cannot listen.
     """
-    if set_stage is not None and not is_loopback(settings.host):
-        raise RequestError(f"--set: the page of the stage is for this machine alone, and host is {settings.host}: take a loopback address")
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
     configure(settings)

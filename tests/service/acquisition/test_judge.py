@@ -77,20 +77,53 @@ def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
     assert made == found == {}
 
 
+def reviewed(scene: Scene, shots, picture_of, full_scale: float = FULL_SCALE) -> tuple[set[str], dict[str, FaultKind]]:
+    """Return the shots with a fault when they came, and the faults that the judge names at the end."""
+    judge, at_once = Judge(rig_of(scene)), set()
+    for shot in shots:
+        pixels = picture_of(shot).astype(np.float32)
+        faults = judge.judge(shot, pixels, "lin_rec709_scene", full_scale)
+        at_once |= {shot.key for _ in faults}
+        judge.accept(shot, pixels, "lin_rec709_scene", full_scale, faults)
+    return at_once, {fault.shot: fault.kind for fault in judge.review()}
+
+
 @pytest.mark.parametrize("dark", [2, 0])
 @pytest.mark.parametrize("ambient", [0.0, 0.8])
 def test_where_no_lamp_is_reached_all_pictures_are_named(dark, ambient):
-    """In the dark, where pictures are noise, and in a room with its lights on, where all show the same."""
-    scene = relief(1)
-    rig, random, judge = rig_of(scene), np.random.default_rng(1), Judge(rig_of(scene))
+    """In the dark, where pictures are noise, and in a room with its lights on, where all show the same; without a dark picture at
+    once from where lamps at two heights are there, the first ring being of twelve."""
+    scene, random = relief(1), np.random.default_rng(1)
     room = ambient * scene.radiance.mean(axis=0)
-    shots = [shot for shot in shots_on(rig)[2 - dark:] if shot.lamp is not None or not shot.levels.any()]
-    at_once = 0
-    for shot in shots:
-        pixels = np.clip(room + 0.001 * random.standard_normal(room.shape), 0, 1).astype(np.float32)
-        faults = judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE)
-        at_once += bool(faults)
-        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, faults)
+    shots = [shot for shot in shots_on(rig_of(scene))[2 - dark:] if shot.lamp is not None or not shot.levels.any()]
+    at_once, found = reviewed(scene, shots, lambda shot: np.clip(room + 0.001 * random.standard_normal(room.shape), 0, 1))
     lamps = [shot.key for shot in shots if shot.lamp is not None]
-    assert {fault.shot: fault.kind for fault in judge.review()} == dict.fromkeys(lamps, FaultKind.UNLIT)
-    assert at_once >= len(lamps) - 7  # of a room without a dark picture from the eighth on
+    assert found == dict.fromkeys(lamps, FaultKind.UNLIT) and at_once >= set(lamps[12:])
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.004])
+def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
+    """As float images have them whose full scale is any number."""
+    scene, random = relief(1), np.random.default_rng(1)
+    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
+    shape = scene.radiance[0].shape
+    assert reviewed(scene, shots, lambda shot: gain * (scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape))) == (set(), {})
+
+
+def test_a_flat_card_under_a_ring_of_lamps_looks_alike_and_has_no_fault():
+    around = 2 * np.pi * np.arange(24) / 24
+    directions = np.column_stack([0.7 * np.cos(around), 0.7 * np.sin(around), np.full(24, np.sqrt(1 - 0.49))])
+    print_ = np.random.default_rng(1).uniform(0.1, 0.5, (64, 64, 1)).repeat(3, axis=2)
+    scene, random = Scene(np.repeat(print_[None], 24, axis=0).astype(np.float32), directions), np.random.default_rng(2)
+    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
+    assert reviewed(scene, shots, lambda shot: print_ + 0.001 * random.standard_normal(print_.shape)) == (set(), {})
+
+
+def test_light_in_the_dark_picture_is_its_own_fault():
+    """The room's light was on, and is off while lamps shine."""
+    scene, random = relief(1), np.random.default_rng(1)
+    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None or not shot.levels.any()]
+    room = 2 * scene.radiance.mean(axis=0)
+    _, found = reviewed(scene, shots, lambda shot: (room if shot.lamp is None else scene.radiance[shot.lamp])
+                        + 0.002 * random.standard_normal(room.shape))
+    assert found == {shot.key: FaultKind.AMBIENT for shot in shots if shot.lamp is None}

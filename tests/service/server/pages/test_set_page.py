@@ -90,10 +90,31 @@ def test_only_programs_of_this_machine_reach_the_stage_and_bad_input_is_refused(
         assert client.get("/set/live").status_code == 404
     refused = ["serve", "--data", tmp_path / "other"]
     given = ["--set", tmp_path / "rig.json", "--camera", "video:0"]
-    assert "loopback" in relit.refused(*refused, "--host", "0.0.0.0", *given)
     assert "--projector" in relit.refused(*refused, *given, "--projector", "wide")
     for alone in (["--set", tmp_path / "rig.json"], ["--projector", "64x48"]):
         assert "--camera" in relit.refused(*refused, *alone)
+
+
+@pytest.mark.long
+def test_where_there_are_keys_an_administrator_alone_takes_captures_from_anywhere(browser, tmp_path, relit):
+    """Under another name, as a tablet beside the stage asks for it; pictures come with the key too."""
+    with stage(tmp_path, serve=("--device", "none", "--keys-only")) as (server, _):
+        keys = {scope: relit("keys", "create", "--data", server.data, "--project", "larch", "--name", scope, "--scope", scope).out.strip()
+                for scope in ("write", "admin")}
+        elsewhere, good = {"Host": "stage.example", "Origin": "http://elsewhere.example"}, {"name": "ball", "plan": "dark"}
+        with server.client() as client:
+            for headers, status in (({}, 401), ({"Authorization": f"Bearer {keys['write']}"}, 403),
+                                    ({"Authorization": f"Bearer {keys['admin']}", **elsewhere}, 204)):
+                assert client.post("/set/run", json=good, headers=headers).status_code == status
+        context = new_context(browser, base_url=server.url)
+        page = context.new_page()
+        page.goto("/set")
+        page.get_by_role("textbox", name="Key").fill(keys["admin"])
+        page.get_by_role("button", name="Use this key").click()
+        page.get_by_role("heading", name="Set: the little dome").wait_for()
+        page.locator("#now", has_text="1 of 1 pictures").wait_for()
+        page.locator("#picture[data-shown*='0001_dark'][src^='blob:']").wait_for()
+        context.close()
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 import { attempt, post } from "../api.js";
 import { byId, show } from "../element.js";
+import { showPicture } from "./picture.js";
 
 /** Return a function that shows the live view of a state. */
 export function mountLive() {
@@ -19,7 +20,7 @@ export function mountLive() {
     if (live === null) return;
     if (live.number !== shown) {
       shown = live.number;
-      byId("seen-picture").src = `/set/live?number=${shown}`;
+      showPicture(byId("seen-picture"), `/set/live?number=${shown}`);
     }
     best = Math.max(best, live.focus ?? 0);
     byId("seen-words").classList.toggle("fault", live.refused !== null);

@@ -5,6 +5,7 @@ import { byId, show, tell } from "../element.js";
 import { watch } from "../events.js";
 import { progressOf } from "../jobs_table.js";
 import { openView } from "../view_jobs.js";
+import { showPicture } from "./picture.js";
 import { mountTurning } from "./turning.js";
 
 const CHECK_MS = 300;
@@ -118,7 +119,6 @@ export function mountOutcome(patterns, changed) {
     const maps = await solve();
     if (maps !== null) await submit({ kind: "export", maps: maps.id });
   }));
-  byId("preview").addEventListener("load", ({ target }) => { target.dataset.shown = target.src; });
 
   return {
     outcome,
@@ -126,7 +126,7 @@ export function mountOutcome(patterns, changed) {
       const preview = state.files["preview.png"];
       show(byId("result"), preview !== undefined || (state.version !== null && state.shots.some((shot) => shot.step === "object")));
       if (preview !== undefined && byId("preview").dataset.changed !== `${state.name} ${preview}`) {
-        byId("preview").src = `/set/files/preview.png?at=${preview}`;
+        showPicture(byId("preview"), `/set/files/preview.png?at=${preview}`);
         byId("preview").dataset.changed = `${state.name} ${preview}`;
       }
       const now = state.version === null ? null : `${state.name} ${state.version}`;

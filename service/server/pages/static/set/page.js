@@ -5,6 +5,7 @@ import { byId, show } from "../element.js";
 import { mountLive } from "./live.js";
 import { mountNext } from "./next_step.js";
 import { mountOutcome } from "./outcome.js";
+import { showPicture } from "./picture.js";
 import { follow, mountForm } from "./plan_form.js";
 import { mountShots } from "./shots.js";
 import { mountSteps } from "./steps.js";
@@ -29,10 +30,9 @@ function showMeter({ name, files }) {
   const metered = byId("metered");
   show(byId("metering"), changed !== undefined);
   if (changed === undefined || metered.dataset.changed === `${name} ${changed}`) return;
-  metered.src = `/set/files/meter.png?at=${changed}`;
+  showPicture(metered, `/set/files/meter.png?at=${changed}`);
   metered.dataset.changed = `${name} ${changed}`;
 }
-byId("metered").addEventListener("load", ({ target }) => { target.dataset.shown = target.src; });
 
 function paint() {
   if (state === null) return;

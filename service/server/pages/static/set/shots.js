@@ -2,6 +2,7 @@
 
 import { mountLamps } from "../dome.js";
 import { byId, element, show } from "../element.js";
+import { showPicture } from "./picture.js";
 import { start } from "./plan_form.js";
 
 const MISSING = [0.08, 0.08, 0.08];
@@ -11,7 +12,7 @@ const FAULTY = [1, 0.02, 0.02];
 /** Show the picture of a shot. */
 function look(shot) {
   const picture = byId("picture");
-  picture.src = `/set/picture?shot=${encodeURIComponent(shot)}&at=${Date.now()}`;
+  showPicture(picture, `/set/picture?shot=${encodeURIComponent(shot)}&at=${Date.now()}`);
   picture.alt = shot;
   byId("shown-words").textContent = shot;
   show(byId("shown"), true);
@@ -35,7 +36,6 @@ export function mountShots(lamps) {
   const colour = mountLamps(byId("dome"), lamps);
   const body = byId("shots");
   let followed = null; // the picture that was shown because it was the last one
-  byId("picture").addEventListener("load", ({ target }) => { target.dataset.shown = target.src; });
   return (state) => {
     const rows = new Map([...body.rows].map((each) => [each.dataset.shot, each]));
     body.replaceChildren(...state.shots.map((shot) => {
