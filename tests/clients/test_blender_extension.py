@@ -100,6 +100,8 @@ found["another program"] = refused(bpy.ops.relit.solve)
 preferences.backend, preferences.url = "SERVICE", "http://127.0.0.1:1"
 found["no service"] = refused(bpy.ops.relit.solve)
 found["still drawn"] = " ".join(drawn())
+preferences.url = "http://["
+found["no address"] = [refused(bpy.ops.relit.solve), " ".join(drawn())]
 preferences.url = "http://relit.invalid"
 found["offline"] = refused(bpy.ops.relit.solve)
 found["old"] = None
@@ -108,17 +110,73 @@ try:
 except RuntimeError as error:
     found["old"] = str(error)
 
+# a service that has lost an environment, whose stream of events is cut in a line, that hangs up once, and then is gone for good
+import http.server, json, threading
+service, tasks = (importlib.import_module(f"{NAME}.{name}") for name in ("service", "tasks"))
+asked, hang_ups = [], [1]
+
+class Cut(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    def log_message(self, *given): pass
+    def do_GET(self):
+        asked.append(self.path)
+        if self.path.endswith("/events"):
+            self.send_response(200)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            piece = b'data: {"state": "runn'
+            self.wfile.write(f"{len(piece):x}\\r\\n".encode() + piece + b"\\r\\n0\\r\\n\\r\\n")
+            return
+        if self.path.endswith("/results"):
+            return self.say({"results": [{"name": "picture.exr", "url": "/file", "size": 4}], "next": None})
+        if self.path == "/file":
+            return self.say("four")
+        if self.path == "/v1/environments/j":
+            return self.say({"id": "j", "state": "ready"})
+        if hang_ups[0]:
+            hang_ups[0] -= 1
+            self.close_connection = True
+            return
+        self.say({"state": "succeeded", "progress": None, "error": None})
+    def do_POST(self):
+        asked.append(self.path)
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        again = asked.count(self.path) > 1  # an environment of this token was deleted
+        self.say({"id": "j", "state": "ready"}, 200 if again or not self.path.endswith("environments") else 404)
+    def say(self, what, code=200):
+        body = what.encode() if isinstance(what, str) else json.dumps(what).encode()
+        self.send_response(code)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Cut)
+threading.Thread(target=server.serve_forever, daemon=True).start()
+url = f"http://127.0.0.1:{server.server_port}"
+(folder / "served").mkdir()
+(folder / "served" / service.JOB_FILE).write_text(json.dumps({"service": url, "job": "maps"}))
+def shade(name):
+    task = tasks.Task("Shading")
+    task.run(lambda task: service.Service(url, "").shade(
+        folder / "served", {}, folder / "relit.zip", folder / "pictures" / name, task))
+    return task.error
+error = shade("one.exr")
+found["cut"] = [(folder / "pictures" / "one.exr").read_bytes().hex() if error is None else error, error]
+service.PATIENCE_S, hang_ups[0] = 0, 99
+error = shade("two.exr")
+found["given up"] = ["is not reached" if "is not reached" in (error or "") else error, asked[-1].rpartition("/")[2]]
+found["given up"] += [] if not (folder / "pictures" / "two.exr").exists() else ["two.exr"]
+server.shutdown()
+
 # begun and not waited for: Blender goes on, and the timer's function is called by hand, since there is no loop of events
 import time
-tasks = importlib.import_module(NAME + ".tasks")
 preferences.backend, preferences.program = "PROGRAM", given["program"]
-began = time.monotonic()
 bpy.ops.relit.solve(wait=False)
-found["returned"] = time.monotonic() - began
-found["busy"] = refused(bpy.ops.relit.solve)
+found["busy"] = [refused(bpy.ops.relit.solve), refused(bpy.ops.relit.relight)]
 found["shown"] = drawn()
 bpy.ops.relit.cancel()
-while tasks.poll() is not None:
+deadline = time.monotonic() + 50
+while tasks.poll() is not None and time.monotonic() < deadline:
     time.sleep(0.01)
 found["cancelled"] = tasks.current.error
 found["poll"] = bpy.ops.relit.cancel.poll()
@@ -150,10 +208,11 @@ def test_it_draws_refuses_cancels_and_leaves_nothing_behind(tmp_path):
     assert found["another program"].startswith("relit solve: ")
     assert "http://127.0.0.1:1 is not reached" in found["no service"]
     assert "relit.solve" in found["still drawn"] and "is not reached" in found["still drawn"]
+    assert all("'http://[' is no address" in sentence for sentence in found["no address"])
     assert "offline" in found["offline"]
+    assert found["cut"] == [b"four".hex(), None] and found["given up"] == ["is not reached", "cancel"]
     assert found["old"] == "Relit needs Blender 4.2 or later, and this is 4.1.1: update Blender"
-    assert found["returned"] < 1  # a solve takes several seconds to start
-    assert found["busy"] == "Solving is under way: wait for it, or cancel it"
+    assert found["busy"] == 2 * ["Solving is under way: wait for it, or cancel it"]
     assert "relit.cancel" in found["shown"]
     assert found["cancelled"] == "Solving is cancelled" and not found["poll"] and found["registered"]
     assert found["left"] == [] and found["again"]
@@ -168,10 +227,12 @@ settings(capture=given["capture"], out=str(folder / "out"), levels=0)
 import importlib, time
 tasks = importlib.import_module(NAME + ".tasks")
 bpy.ops.relit.solve(wait=False)
+deadline = time.monotonic() + 50
 while tasks.current.stage in ("", "reading cap", "sending cap", "checking cap"):  # until the job is under way
+    assert not tasks.current.ended and time.monotonic() < deadline, (tasks.current.stage, tasks.current.error)
     time.sleep(0.01)
 bpy.ops.relit.cancel()
-while tasks.poll() is not None:
+while tasks.poll() is not None and time.monotonic() < deadline:
     time.sleep(0.01)
 found["cancelled"] = tasks.current.error
 bpy.ops.relit.solve()
@@ -184,7 +245,12 @@ bpy.ops.relit.relight()
 found["cards"] = sorted(each["relit_card"] for each in bpy.data.objects if "relit_card" in each)
 settings(out=str(folder / "other"), method="RELIGHT")
 (folder / "other" / "maps").mkdir(parents=True)
-found["other maps"] = refused(bpy.ops.relit.relight)
+found["other maps"] = [refused(bpy.ops.relit.relight)]
+settings(out=str(folder / "out"))
+preferences.backend, preferences.program = "PROGRAM", "/bin/sh"
+refused(bpy.ops.relit.solve)  # after which the maps may be others than those of the service's job
+preferences.backend = "SERVICE"
+found["other maps"].append(refused(bpy.ops.relit.relight))
 """
 
 
@@ -201,4 +267,4 @@ def test_a_service_solves_and_relights_as_the_program_does(tmp_path):
     picture = np.stack([frame[name] for name in "RGB"], axis=-1)
     np.testing.assert_allclose(picture[scene.mask], scene.images[found["light"]][scene.mask], rtol=2e-3, atol=1e-4)  # half
     assert found["cards"] == [str(tmp_path / "out" / f"{name}_frames" / "frame.0007.exr") for name in ("relit", "shaded")]
-    assert "this service has not solved these maps" in found["other maps"]
+    assert all("this service has not solved these maps" in sentence for sentence in found["other maps"])

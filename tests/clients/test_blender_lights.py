@@ -255,3 +255,99 @@ def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
     np.testing.assert_allclose(found["beside"], [(1.05, 0), (2.05, 0), (2.05, 1), (1.05, 1)], atol=1e-4)
     assert found["other kinds"] == [["CAPTURED", 1], ["CAPTURED", 1]]  # the rig of asset.usda lies beside them too
     assert "has no mesh 'lod1'" in found["no variants"] and "different cameras" in found["another capture"]
+
+
+STAGED = """
+import importlib
+from pathlib import Path
+from mathutils import Matrix
+environment, lights = (importlib.import_module(f"{NAME}.{name}") for name in ("environment", "lights"))
+environment.HEIGHT, folder = 32, Path(given["folder"])
+settings(capture=given["capture"], out=str(folder), asset=str(folder / "asset.usda"), guided=False)
+held = set(bpy.data.user_map())
+settings(mesh="lod4")
+refused(bpy.ops.relit.import_asset)
+found["left"] = [each.name for each in set(bpy.data.user_map()) - held]
+settings(mesh="mesh")
+bpy.ops.relit.import_asset()
+scene, root = bpy.context.scene, bpy.context.scene.relit.root
+settings(light="SCENE")
+
+# lights that Blender does not render, and those that Relit cannot follow
+def collection(name, parent):
+    made = bpy.data.collections.new(name)
+    parent.children.link(made)
+    return made
+
+def lamp(name, home=scene.collection, kind="POINT"):
+    made = bpy.data.objects.new(name, bpy.data.lights.new(name, kind))
+    home.objects.link(made)
+    return made
+
+hidden, excluded = collection("hidden", scene.collection), collection("excluded", scene.collection)
+lamp("below", collection("inner", hidden))
+lamp("excluded", excluded)
+lamp("portal", kind="AREA").data.cycles.is_portal = True
+lamp("shines")
+hidden.hide_render = True
+bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
+found["shining"] = [each.name for each in lights.shining(bpy.context)]
+found["refused"] = []
+unseen, linked, off = lamp("unseen"), lamp("linked"), lamp("off")
+unseen.visible_diffuse, linked.light_linking.receiver_collection, off.hide_viewport = False, hidden, True
+instances = bpy.data.objects.new("instances", None)
+instances.instance_type, instances.instance_collection = "COLLECTION", bpy.data.collections.new("instanced")
+lamp("copied", instances.instance_collection)
+scene.collection.objects.link(instances)
+several = instances, off, linked, unseen
+for each in several:
+    for other in several:
+        other.hide_render = other is not each
+    found["refused"].append(refused(bpy.ops.relit.relight))
+unseen.hide_render = True
+
+# a turntable: the camera frame turns by 180 degrees about its y under a world that stays
+scene.world = scene.relit.environment
+root.rotation_mode = "QUATERNION"
+start = root.matrix_world.copy()
+for frame, angle in ((1, 0), (2, 3.141592653589793)):
+    root.matrix_world = start @ Matrix.Rotation(angle, 4, "Y")
+    root.keyframe_insert("rotation_quaternion", frame=frame)
+found["turned"] = environment.write_world(scene, root, range(1, 3), folder / "turned").name
+preferences.backend, preferences.url = "SERVICE", "http://127.0.0.1:1"
+scene.frame_start, scene.frame_end = 1, 2
+found["service"] = refused(bpy.ops.relit.relight)
+root.animation_data_clear()
+found["still"] = environment.write_world(scene, root, range(1, 3), folder / "still").name
+group = bpy.data.node_groups.new("group", "ShaderNodeTree")
+group.nodes.new("ShaderNodeValue").outputs[0].keyframe_insert("default_value", frame=1)
+scene.world.node_tree.nodes.new("ShaderNodeGroup").node_tree = group
+found["group"] = environment.write_world(scene, root, range(1, 2), folder / "group").name
+scene.world.node_tree.nodes.new("ShaderNodeLightPath")
+found["rays"] = refused(bpy.ops.relit.relight)
+
+first = folder / "frames" / "frame.0001.exr"
+def shown():
+    bpy.ops.relit.show_frames(filepath=str(first))
+    return [len(bpy.data.meshes), len(bpy.data.materials)], bpy.data.images[first.name].source
+
+found["cards"] = [shown(), shown()]
+(folder / "frames" / "frame.0002.exr").unlink()
+found["cards"].append(shown())
+"""
+
+
+def test_what_is_lit_is_what_blender_would_render_and_the_rest_is_refused(a_ball, tmp_path):
+    write_frames(tmp_path / "frames", (1, 2), a_ball.camera, opaque=True)
+    found = in_blender(STAGED, tmp_path, capture=tmp_path / "capture")
+    assert found["left"] == [] and found["shining"] == ["shines"]
+    instances, off, linked, unseen = found["refused"]
+    assert "instances makes instances of lights" in instances and "off is disabled in viewports" in off
+    assert "the light linked has light linking" in linked and "the light unseen has rays that do not see it" in unseen
+    assert [found["turned"], found["still"], found["group"]] == ["world.####.exr", "world.exr", "world.####.exr"]
+    one, other = (exr.read(tmp_path / "turned" / f"world.000{number}.exr")[0]["G"] for number in (1, 2))
+    # half a turn about the axis of the map; noise of 32 paths, and rows at the poles that Blender blends
+    np.testing.assert_allclose(other[2:-2], np.roll(one, one.shape[1] // 2, axis=1)[2:-2], rtol=0.1)
+    assert "camera frame turns" in found["service"] and "Light Path" in found["rays"]
+    (before, sequence), again, (after, single) = found["cards"]
+    assert again == [before, sequence] and after == before and [sequence, single] == ["SEQUENCE", "FILE"]

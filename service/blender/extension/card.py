@@ -27,7 +27,11 @@ def show(root: bpy.types.Object, files: dict[int, Path], place: str) -> bpy.type
     """Return a new card with frames of the capture, behind the object or beside it; an earlier card of the same files goes."""
     first = files[min(files)]
     for each in [each for each in root.children if each.get("relit_card") == str(first)]:
+        mesh, materials = each.data, [*each.data.materials]
         bpy.data.objects.remove(each)
+        for unused in (mesh, *materials):
+            if unused is not None and not unused.users:
+                bpy.data.batch_remove([unused])
     capture = root["relit_camera"].to_dict()
     width, height = capture["resolution"]
     cu, cv = capture.get("principal_px") or (width / 2, height / 2)
@@ -68,8 +72,8 @@ def _material(files: dict[int, Path]) -> bpy.types.Material:
     output, mix, clear, glow, texture = (tree.nodes.new(f"ShaderNode{name}") for name in (
         "OutputMaterial", "MixShader", "BsdfTransparent", "Emission", "TexImage"))
     texture.image, texture.interpolation, texture.extension = image, "Closest", "EXTEND"
+    image.source = "SEQUENCE" if len(files) > 1 else "FILE"  # an earlier card of the file may have set it
     if len(files) > 1:
-        image.source = "SEQUENCE"
         user = texture.image_user
         user.frame_start, user.frame_offset, user.frame_duration = min(files), min(files) - 1, max(files) - min(files) + 1
         user.use_auto_refresh = True

@@ -8,16 +8,21 @@ Source: Blender manual, "Environment Texture"; intern/cycles/kernel/camera/proje
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
 from mathutils import Matrix
+
+from .tasks import Failure
 
 LOOKUP_FROM_CAMERA = Matrix(((0, 0, 1, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 HEIGHT = 256
 """Rows of a map that is written of a world."""
 PATHS = 32
 """Rays of a pixel of such a map: the sun of a sky covers half of one."""
+TURNED = 1e-5
+"""Elements of two rotations that differ by more are not the same rotation in float32."""
 
 
 def world_of(path: Path, root: bpy.types.Object) -> bpy.types.World:
@@ -40,19 +45,31 @@ def world_of(path: Path, root: bpy.types.Object) -> bpy.types.World:
     return world
 
 
-def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, folder: Path) -> Path | None:
-    """Write the world of a scene in the camera frame of `root`, once or for each frame where it is animated.
+def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, folder: Path, *, still: bool = False) -> Path | None:
+    """Write the world of a scene in the camera frame of `root`, once or for each frame where it is animated or the camera frame turns.
 
     Returns the file, with #### for the number where there are several; None if there is no world or it is black.
+
+    Raises:
+        Failure: the world lights in a way that no map holds; with `still` also if one map is not enough.
     """
     world = scene.world
     if world is None:
         return None
-    animated = any(each is not None and each.animation_data is not None for each in (world, world.node_tree)) or bool(
-        world.node_tree and any(node.type == "TEX_ENVIRONMENT" and node.image and node.image.source in ("SEQUENCE", "MOVIE")
-                                for node in world.node_tree.nodes))
-    folder.mkdir(parents=True, exist_ok=True)
+    nodes = [*_nodes(world.node_tree)] if world.node_tree else []
+    seen = world.cycles_visibility
+    if any(node.type == "LIGHT_PATH" for node in nodes) or not (seen.diffuse and seen.glossy):
+        raise Failure(f"the world {world.name} differs by the kind of ray, which no environment holds: remove its Light Path node, and let "
+                      "all rays see it")
     kept = scene.frame_current
+    turns = _turns(scene, root, frames)
+    animated = world.animation_data is not None or any(map(_moves, [world.node_tree, *nodes])) or any(
+        abs(one - other) > TURNED for turn in turns.values() for row, first in zip(turn, turns[frames[0]], strict=True)
+        for one, other in zip(row, first, strict=True))
+    if animated and still:
+        raise Failure("the world is animated, or the camera frame turns, and a service takes one environment for all frames: use the "
+                      "program relit")
+    folder.mkdir(parents=True, exist_ok=True)
     other = bpy.data.scenes.new("Relit world")
     data = bpy.data.cameras.new("Relit world")
     view = bpy.data.objects.new("Relit world", data)
@@ -61,8 +78,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
     try:
         other.collection.objects.link(view)
         other.camera, other.world = view, alone
-        turn = root.matrix_world.to_quaternion().to_matrix().to_4x4()
-        view.matrix_world = turn @ Matrix.Rotation(math.pi, 4, "Y")
+        alone.cycles_visibility.camera = True
         data.type = "PANO"
         (data if hasattr(data, "panorama_type") else data.cycles).panorama_type = "EQUIRECTANGULAR"  # Blender 5, and 4
         render, cycles = other.render, other.cycles
@@ -77,6 +93,7 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         for number in frames if animated else frames[:1]:
             scene.frame_set(number)  # without which the other scene stays at its frame
             other.frame_set(number)
+            view.matrix_world = turns[number].to_4x4() @ Matrix.Rotation(math.pi, 4, "Y")
             path = folder / (f"world.{number:04d}.exr" if animated else "world.exr")
             render.filepath = str(path)
             bpy.ops.render.render(write_still=True, scene=other.name)
@@ -90,3 +107,32 @@ def write_world(scene: bpy.types.Scene, root: bpy.types.Object, frames: range, f
         bpy.data.cameras.remove(data)
         bpy.data.worlds.remove(alone)
     return (folder / ("world.####.exr" if animated else "world.exr")) if brightest > 0 else None
+
+
+def _turns(scene: bpy.types.Scene, root: bpy.types.Object, frames: range) -> dict[int, Matrix]:
+    """Return the rotation of the camera frame in Blender's world at each frame."""
+    kept, found = scene.frame_current, {}
+    try:
+        for number in frames:
+            scene.frame_set(number)
+            found[number] = root.matrix_world.to_quaternion().to_matrix()
+    finally:
+        scene.frame_set(kept)
+    return found
+
+
+def _nodes(tree: bpy.types.NodeTree) -> Iterator[bpy.types.Node]:
+    """Yield the nodes of a tree, and those in its groups."""
+    for node in tree.nodes:
+        yield node
+        if node.type == "GROUP" and node.node_tree is not None:
+            yield from _nodes(node.node_tree)
+
+
+def _moves(part: bpy.types.NodeTree | bpy.types.Node | None) -> bool:
+    """Return True if a tree, the group or the image of a node, or an object by which it places a texture may change with the frame."""
+    if part is None:
+        return False
+    image, tree = getattr(part, "image", None), getattr(part, "node_tree", part)
+    return bool(getattr(tree, "animation_data", None) or getattr(part, "object", None) or (
+        image is not None and image.source in ("SEQUENCE", "MOVIE")))

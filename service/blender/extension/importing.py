@@ -64,22 +64,19 @@ def bring_in(context: bpy.types.Context, path: Path, *, new_scene: bool) -> bpy.
     given = context.scene.relit
     capture = _camera_of(path, given)
     before, made = context.scene, None
+    known = set(bpy.data.user_map())
     if new_scene:
         made = bpy.data.scenes.new(_name(path))
         for name in settings.Settings.__annotations__:
             if name not in ("root", "world", "environment", "light", "light_index"):
                 setattr(made.relit, name, getattr(given, name))
         context.window.scene = made
-    known = {*bpy.data.objects, *bpy.data.collections}
     try:
         return _fill(context, path, capture, new_scene)
     except Exception:
-        for home in (bpy.data.objects, bpy.data.collections):
-            for each in set(home) - known:
-                home.remove(each)
         if made is not None:
             context.window.scene = before
-            bpy.data.scenes.remove(made)
+        bpy.data.batch_remove(set(bpy.data.user_map()) - known)
         raise
 
 

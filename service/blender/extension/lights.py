@@ -7,6 +7,7 @@ Convention:
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import bpy
@@ -42,19 +43,55 @@ def subject_of(root: bpy.types.Object) -> Subject:
     return Subject(root, root.matrix_world @ ((low + high) / 2), (high - low).length / 2 * scale.x, scale.x * root["relit_unit_m"])
 
 
-def shining(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the lights that Blender would render; raise Failure if Relit has none like one of them."""
-    found = [each for each in scene.objects if each.type == "LIGHT" and not each.hide_render
-             and any(not home.hide_render for home in each.users_collection)]
+def shining(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the lights that Blender would render in the view layer, evaluated; raise Failure if Relit has none like one of them."""
+    graph = context.evaluated_depsgraph_get()
+    shown = {each for each in _rendered(context.view_layer.layer_collection) if not each.hide_render}
+    copies = {each.parent.original: each.object.name for each in graph.object_instances
+              if each.is_instance and each.object.type == "LIGHT" and each.parent is not None}
+    for each in shown:
+        if each in copies or (each.instance_type == "COLLECTION" and _has_light(each.instance_collection)):
+            raise Failure(f"{each.name} makes instances of lights{f' ({copies[each]})' if each in copies else ''}, which Relit does not "
+                          "follow: make them real, or disable it in renders")
+    found = [evaluated(each, graph) for each in sorted(shown, key=lambda each: each.name) if each.type == "LIGHT" and not _is_portal(each)]
     for lamp in found:
-        data = lamp.data
+        data, linking = lamp.data, getattr(lamp, "light_linking", None)
         cannot = [("nodes", data.use_nodes and data.node_tree is not None), ("no shadow", not data.use_shadow),
                   ("a spread below 180°", data.type == "AREA" and data.spread < math.pi - 1e-3),
                   ("a diffuse or specular factor", data.diffuse_factor != 1 or data.specular_factor != 1),
+                  ("light linking", linking and (linking.receiver_collection or linking.blocker_collection)),
+                  ("rays that do not see it", not (lamp.visible_diffuse and lamp.visible_glossy)),
                   ("a scale", max(abs(each - 1) for each in lamp.matrix_world.to_scale()) > 1e-3 and data.type != "SUN")]
         if what := [words for words, true in cannot if true]:
             raise Failure(f"the light {lamp.name} has {what[0]}, which Relit does not know: change it, or disable it in renders")
     return found
+
+
+def evaluated(each: bpy.types.Object, graph: bpy.types.Depsgraph) -> bpy.types.Object:
+    """Return an object as it is at the frame; raise Failure where Blender does not move it, because viewports do not show it."""
+    found = each.evaluated_get(graph)
+    if not found.is_evaluated:
+        raise Failure(f"{each.name} is disabled in viewports, where Blender does not move it: enable it there")
+    return found
+
+
+def _rendered(layer: bpy.types.LayerCollection) -> Iterator[bpy.types.Object]:
+    """Yield the objects of the collections that renders show."""
+    if layer.collection.hide_render:
+        return
+    if not layer.exclude:
+        yield from layer.collection.objects
+    for each in layer.children:
+        yield from _rendered(each)
+
+
+def _has_light(collection: bpy.types.Collection | None) -> bool:
+    return collection is not None and any(each.type == "LIGHT" or _has_light(each.instance_collection) for each in collection.all_objects)
+
+
+def _is_portal(lamp: bpy.types.Object) -> bool:
+    """Return True for an area that only guides the rays of the world."""
+    return lamp.data.type == "AREA" and lamp.data.cycles.is_portal
 
 
 def distant(lamp: bpy.types.Object, subject: Subject) -> dict:

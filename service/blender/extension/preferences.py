@@ -1,5 +1,6 @@
 """The preferences of the extension: the program `relit`, or a service."""
 
+import functools
 import shutil
 import urllib.parse
 
@@ -38,12 +39,25 @@ def preferences(context: bpy.types.Context) -> Preferences:
     return context.preferences.addons[__package__].preferences
 
 
+@functools.cache
+def _found(program: str) -> bool:
+    """Return True if a program is there; panels ask at each redraw, and the disk is asked once, and again before work."""
+    return shutil.which(program) is not None
+
+
 def problem(given: Preferences) -> str | None:
     """Return a sentence that says why no work can be done, as far as it is known without trying."""
     if given.backend == "PROGRAM":
-        if shutil.which(bpy.path.abspath(given.program)) is None:
+        if not _found(bpy.path.abspath(given.program)):
             return f"relit is not found at {given.program!r}: give its path in the preferences of the extension"
-    elif urllib.parse.urlsplit(given.url).hostname not in LOOPBACK and not bpy.app.online_access:
+        return None
+    try:
+        host = urllib.parse.urlsplit(given.url).hostname
+    except ValueError:
+        host = None
+    if host is None:
+        return f"{given.url!r} is no address of a service: give one such as http://127.0.0.1:8470 in the preferences of the extension"
+    if host not in LOOPBACK and not bpy.app.online_access:
         return "Blender is offline: allow online access in its preferences (System), or use the program relit"
     return None
 
@@ -51,6 +65,7 @@ def problem(given: Preferences) -> str | None:
 def backend(context: bpy.types.Context) -> Program | Service:
     """Return who does the work; raise Failure where it is known that nobody can."""
     given = preferences(context)
+    _found.cache_clear()
     if sentence := problem(given):
         raise Failure(sentence)
     return Program(bpy.path.abspath(given.program)) if given.backend == "PROGRAM" else Service(given.url, given.key)

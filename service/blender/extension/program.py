@@ -7,6 +7,7 @@ import json
 import subprocess
 from pathlib import Path
 
+from .service import JOB_FILE
 from .tasks import Cancelled, Failure, Task
 
 STATUS, PROGRESS, ERROR = "openjd_status: ", "openjd_progress: ", "relit: "
@@ -21,6 +22,7 @@ class Program:
     def solve(self, capture: Path, out: Path, environment: Path | None, levels: int, task: Task) -> Path:
         """Solve a capture into the folder `out` and export its asset with its rig; return the asset."""
         asset = out / "asset.usda"
+        (out / "maps" / JOB_FILE).unlink(missing_ok=True)  # the maps are no longer those of a job
         self._run(["solve", capture, "--out", out / "maps"], task)
         words = ["export", out / "maps", "--out", asset, "--rig", capture, "--levels", levels]
         self._run([*words, *([] if environment is None else ["--environment", environment])], task)
@@ -61,13 +63,14 @@ class Program:
                     stage = f"{words[0]}: {line.removeprefix(STATUS)}"
                     task.tell(stage, 0)
                 elif line.startswith(PROGRESS):
-                    task.tell(stage, int(line.removeprefix(PROGRESS)))
+                    task.tell(stage, int(float(line.removeprefix(PROGRESS))))
                 elif line:
                     said.append(line)
+        except BaseException:
+            process.terminate()
+            raise
         finally:
             task.stoppable(None)
-            if task.cancelled:
-                process.terminate()
             process.stdout.close()
             code = process.wait()
         if task.cancelled:

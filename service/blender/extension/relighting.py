@@ -9,6 +9,7 @@ from bpy.props import StringProperty
 from . import card, environment, lights, settings, tasks
 from .operator import RelitOperator, WorkOperator
 from .preferences import backend
+from .service import Service
 
 KEYS = "relit.keys/1"
 REC709 = ("lin_rec709_scene", "srgb_texture", "srgb_rec709_scene", "g22_rec709_scene", "g18_rec709_scene")
@@ -23,6 +24,7 @@ class RELIT_OT_relight(WorkOperator):
 
     def act(self, context: bpy.types.Context) -> None:
         """Read world and lights of all frames, and begin the work."""
+        tasks.require_free()  # since other work may be reading the files that are written here
         scene, given = context.scene, context.scene.relit
         frames = range(scene.frame_start, scene.frame_end + 1)
         if not frames or frames[0] < 0:
@@ -37,7 +39,8 @@ class RELIT_OT_relight(WorkOperator):
             raise tasks.Failure(f"{maps} is not there: solve the capture first, or relight without its maps")
         guide = maps if given.guided else None
         keys, shades = sampled(context, frames, root, method)
-        sky = environment.write_world(scene, root, frames, out.parent)
+        still = method == "RELIGHT" and isinstance(relit, Service)
+        sky = environment.write_world(scene, root, frames, out.parent, still=still)
         if sky is None and not keys["lights"] and not any(shades):
             raise tasks.Failure("the scene has no light: add a light or a world, or choose another light in the panel")
 
@@ -99,8 +102,9 @@ def sampled(context: bpy.types.Context, frames: range, root: bpy.types.Object, m
         for number in frames:
             scene.frame_set(number)
             graph = context.evaluated_depsgraph_get()
+            lights.evaluated(root, graph)
             subject = lights.subject_of(root)
-            lamps = [each.evaluated_get(graph) for each in lights.shining(scene)]
+            lamps = lights.shining(context)
             if method == "SHADE":
                 shades.append(lights.near(lamps, subject))
                 continue

@@ -6,12 +6,13 @@ Source: https://tus.io/protocols/resumable-upload; https://html.spec.whatwg.org/
 import hashlib
 import http.client
 import json
-import shutil
+import tempfile
 import threading
 import time
 import urllib.error
 import urllib.parse
 import urllib.request
+import uuid
 from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import suppress
@@ -23,6 +24,8 @@ TUS = {"Tus-Resumable": "1.0.0"}
 PIECE_BYTES = 8 << 20
 SILENCE_S = 45
 """A connection without a byte for this long is given up: streams of events have at least a comment every 15 s."""
+PATIENCE_S = 60
+"""A service that does not answer for this long while a job is under way is given up, and the job is cancelled."""
 JOB_FILE = "relit_job.json"
 """Beside the maps that a service has solved: which job they are of."""
 
@@ -35,6 +38,14 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
 
 OPENER = urllib.request.build_opener(_NoRedirect)
+
+
+class Unreached(Failure):
+    """The service does not answer, or has no time."""
+
+
+class Missing(Failure):
+    """The service does not have what was asked for."""
 
 
 class Service:
@@ -62,8 +73,6 @@ class Service:
         if maps is not None:
             request["maps"] = self._job_of(maps)
         if environment is not None:
-            if "#" in environment.name:
-                raise Failure("the world is animated, and a service takes one environment for all frames: use the program relit")
             request["environment"] = self._upload("environments", environment, task)
         self._download(self._job(request, task), out.parent, task)
 
@@ -96,9 +105,12 @@ class Service:
             with open(each, "rb") as opened:
                 sums.append(hashlib.file_digest(opened, "sha256").hexdigest())
         token = hashlib.sha256(f"{what}\0{source.name}\0{json.dumps([names, sums])}".encode()).hexdigest()
-        found = self._json("POST", f"/v1/{what}", {"name": source.name}, {"Idempotency-Key": token})
+        try:
+            found = self._json("POST", f"/v1/{what}", {"name": source.name}, {"Idempotency-Key": token})
+        except Missing:  # it was there, and has been deleted since
+            found = self._json("POST", f"/v1/{what}", {"name": source.name}, {"Idempotency-Key": uuid.uuid4().hex})
         place = f"/v1/{what}/{found['id']}"
-        if found["state"] == "receiving":
+        if found["state"] in ("receiving", "refused"):  # which may be taken now, by another version or with other settings
             for number, (each, name, digest) in enumerate(zip(files, names, sums, strict=True)):
                 task.tell(f"sending {source.name}", 100 * number // len(files))
                 self._send(place, each, name, digest, task)
@@ -135,8 +147,10 @@ class Service:
                 self._json("POST", f"/v1/jobs/{job}/cancel", {})
 
         task.stoppable(lambda: threading.Thread(target=cancel, daemon=True).start())
+        ended = False
         try:
-            for view in self._views(job):
+            for view in self._views(job, task):
+                ended = view["state"] in ("succeeded", "failed", "cancelled")
                 if view["state"] == "succeeded":
                     return job
                 if view["state"] in ("failed", "cancelled"):
@@ -147,46 +161,70 @@ class Service:
                     task.tell(f"{request['kind']}: {progress['stage']}", 100 * progress["done"] // max(progress["total"], 1))
         finally:
             task.stoppable(None)
+            if not ended:
+                cancel()
         raise AssertionError("views end with the job")
 
-    def _views(self, job: str) -> Iterator[dict]:
+    def _views(self, job: str, task: Task) -> Iterator[dict]:
         """Yield the job after every change until it has ended, also where its stream of events is cut."""
+        silent_since = time.monotonic()
         while True:
-            with suppress(OSError, http.client.HTTPException), self._open("GET", f"/v1/jobs/{job}/events") as stream:
-                for line in stream:
-                    if line.startswith(b"data:"):
-                        yield json.loads(line[5:])
-            yield self._json("GET", f"/v1/jobs/{job}")
+            try:
+                with suppress(Unreached, OSError, http.client.HTTPException), self._open("GET", f"/v1/jobs/{job}/events") as stream:
+                    for line in stream:
+                        silent_since = time.monotonic()
+                        if line.startswith(b"data:") and line.endswith(b"\n"):  # the last line of a stream that is cut may be a part
+                            yield json.loads(line[5:])
+                yield self._json("GET", f"/v1/jobs/{job}")
+                silent_since = time.monotonic()
+            except Unreached:
+                if task.cancelled:
+                    raise Cancelled from None
+                if time.monotonic() - silent_since > PATIENCE_S:
+                    raise
             time.sleep(0.5)
 
     def _download(self, job: str, folder: Path, task: Task, names: dict | None = None) -> None:
-        """Fetch what a job has made, each file whole or not at all."""
+        """Fetch what a job has made into a folder, all of it or nothing."""
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".relit_", dir=folder) as name:
+            part = Path(name)
+            self._fetch(job, part, task, names)
+            (folder / JOB_FILE).unlink(missing_ok=True)  # it names the job of the files that go
+            for source in [each for each in part.rglob("*") if each.is_file()]:
+                target = folder / source.relative_to(part)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                source.replace(target)
+
+    def _fetch(self, job: str, folder: Path, task: Task, names: dict | None) -> None:
+        """Fetch results of a job, by their own names or those that `names` gives them."""
         after = ""
         while after is not None:
             page = self._json("GET", f"/v1/jobs/{job}/results" + (f"?after={urllib.parse.quote(after)}" if after else ""))
             for number, found in enumerate(page["results"]):
                 if names is not None and found["name"] not in names:
                     continue
-                task.tell("fetching the results", 100 * number // len(page["results"]))
+                percent = 100 * number // len(page["results"])
                 target = folder / (names[found["name"]] if names is not None else found["name"])
                 if not target.resolve().is_relative_to(folder.resolve()):
                     raise Failure(f"the service names a result outside of its folder: {found['name']}")
                 target.parent.mkdir(parents=True, exist_ok=True)
-                part = target.with_name(f".{target.name}.part")
-                try:
-                    with self._open("GET", found["url"]) as answer, open(part, "wb") as opened:
-                        shutil.copyfileobj(answer, opened)
-                    if part.stat().st_size != found["size"]:
-                        raise Failure(f"{found['name']}: the service at {self._url} ended in the middle of it: try again")
-                    part.replace(target)
-                finally:
-                    part.unlink(missing_ok=True)
+                with self._open("GET", found["url"]) as answer, open(target, "wb") as opened:
+                    task.tell("fetching the results", percent)
+                    while piece := answer.read(PIECE_BYTES):
+                        opened.write(piece)
+                        task.tell("fetching the results", percent)
+                if target.stat().st_size != found["size"]:
+                    raise Failure(f"{found['name']}: the service at {self._url} ended in the middle of it: try again")
             after = page["next"]
 
     def _json(self, method: str, path: str, body: dict | None = None, headers: dict | None = None) -> dict:
         data = None if body is None else json.dumps(body).encode()
         with self._open(method, path, data, {"Content-Type": "application/json", **(headers or {})}) as answer:
-            return json.load(answer)
+            try:
+                return json.load(answer)
+            except (OSError, http.client.HTTPException, ValueError) as error:
+                raise Unreached(f"the service at {self._url} ended in the middle of an answer ({error}): try again") from error
 
     def _open(self, method: str, path: str, data: bytes | None = None, headers: dict | None = None) -> http.client.HTTPResponse:
         key = {"Authorization": f"Bearer {self._key}"} if self._key else {}
@@ -198,8 +236,9 @@ class Service:
                 sentence = said.get("detail") or said["title"]
             except (ValueError, KeyError, AttributeError):
                 sentence = f"{error.code} {error.reason}"
-            raise Failure(f"the service at {self._url} says: {sentence}") from error
+            kind = {404: Missing, 429: Unreached, 502: Unreached, 503: Unreached, 504: Unreached}.get(error.code, Failure)
+            raise kind(f"the service at {self._url} says: {sentence}") from error
         except (OSError, http.client.HTTPException, ValueError) as error:
             why = getattr(error, "reason", None) or error
-            raise Failure(f"the service at {self._url} is not reached ({why}): start it, or correct its address in the preferences of the "
-                          "extension") from error
+            raise Unreached(f"the service at {self._url} is not reached ({why}): start it, or correct its address in the preferences of "
+                            "the extension") from error

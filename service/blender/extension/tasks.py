@@ -48,8 +48,9 @@ class Task:
     def cancel(self) -> None:
         """Ask the thread to end."""
         self._cancelled.set()
-        if self._stop is not None:
-            self._stop()
+        stop = self._stop  # once, since the thread may take it away meanwhile
+        if stop is not None:
+            stop()
 
     @property
     def cancelled(self) -> bool:
@@ -74,6 +75,12 @@ current: Task | None = None
 _finish: Callable[[object], object] | None = None
 
 
+def require_free() -> None:
+    """Raise Failure if work is under way."""
+    if current is not None and not current.ended:
+        raise Failure(f"{current.title} is under way: wait for it, or cancel it")
+
+
 def start(title: str, work: Callable[[Task], object], finish: Callable[[object], object], *, wait: bool) -> None:
     """Begin work, if none is under way; with `wait` return when it has ended.
 
@@ -81,8 +88,7 @@ def start(title: str, work: Callable[[Task], object], finish: Callable[[object],
         Failure: another task is under way; with `wait` also if this one failed.
     """
     global current, _finish
-    if current is not None and not current.ended:
-        raise Failure(f"{current.title} is under way: wait for it, or cancel it")
+    require_free()
     current, _finish = Task(title), finish
     if wait:
         current.run(work)
