@@ -24,9 +24,10 @@ def test_a_capture_is_calibrated_by_the_ball_and_the_chart_that_belong_to_it(tmp
     turned = DIRECTIONS @ rotation_about((0, 1, 0), 6).T
     rig = write_rig(tmp_path / "rig.json", SimpleNamespace(scene=SimpleNamespace(directions=turned)), "manual")
     watched, captures, random = tmp_path / "watched", tmp_path / "set", np.random.default_rng(1)
+    surface = random.uniform(0.1, 0.5, (240, 320, 3))
     watched.mkdir()
     monkeypatch.setattr("service.acquisition.cameras.watched_folder.WatchedFolder._release", lambda camera, exposure: write_exr(
-        watched / f"{len(list(watched.iterdir())):04d}.exr", random.uniform(0.1, 0.5, (240, 320, 3))))
+        watched / f"{len(list(watched.iterdir())):04d}.exr", random.uniform(0.5, 1) * surface))
     acquire(AcquireRequest(plan="olat", rig=rig, camera=f"watch:{watched}", out=captures / "owl", trigger="true"), lambda what: None)
     stage = RemoteControl(rig, f"watch:{watched}", captures)
     with pytest.raises(RequestError, match="'ball' is not there"):
