@@ -133,7 +133,7 @@ hooks = sa.Table(  # URLs that are told how the jobs of a project ended
     sa.Column("events", sa.JSON, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),  # as it is: it signs
     sa.Column("created_at", sa.Float, nullable=False),
-    sa.Column("due_at", sa.Float, nullable=False),  # nothing is tried before, unless the try under way counts as lost
+    sa.Column("due_at", sa.Float, nullable=False),  # of the next try: the end of a pause, or when the try under way counts as lost
     sa.Column("failures", sa.Integer, nullable=False),  # tries since the last one that was accepted
     sa.Index("relit_hooks_of_project", "project"))
 
