@@ -150,8 +150,6 @@ class DeliveryView(View):
     tries: int
     made_at: Time
     tried_at: Time | None
-    due_at: Time | None
-    """The time of the next try; None: it is delivered or given up."""
     answer: str | None
     """The status of the answer to the last try, or why there was none; None: it was not tried yet, or is being tried."""
 
@@ -163,6 +161,8 @@ class HookView(View):
     url: str
     events: list[HookEvent]
     created_at: Time
+    due_at: Time
+    """Nothing is tried before this time: a pause after a refusal, or the time within which the try under way ends."""
     waiting: int
     """Deliveries that the receiver has not accepted yet."""
     last_delivery: DeliveryView | None

@@ -97,10 +97,11 @@ def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
 
 
 def _preview(request: AcquireRequest, taken: int) -> None:
-    """Write the preview, unless there is one of the same pictures; a capture that has none is as good as others."""
+    """Write the preview, unless there is one of the same pictures and no view is asked for; a capture without one is as good as others."""
     from service.acquisition.preview import PREVIEW_FILE, write_preview
+    from service.relight.sheet import AS_EVER
 
-    if taken == 0 and (request.out / PREVIEW_FILE).exists():
+    if taken == 0 and request.review == AS_EVER and (request.out / PREVIEW_FILE).exists():
         return
     try:
         print(f"preview  {write_preview(request.out, request.device, review=request.review)}", flush=True)

@@ -15,7 +15,6 @@ from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.base import outgoing
 from service.server.database import audit, hooks, quotas
-from service.server.database.keys import Caller
 
 router = APIRouter(prefix="/v1/hooks", tags=["hooks"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 
@@ -51,18 +50,23 @@ def list_hooks(service: ServiceDep, caller: Admin) -> HookList:
 @router.get("/{hook}", responses=responses(404), summary="Look at a hook")
 def get_hook(service: ServiceDep, caller: Admin, hook: HookName) -> HookView:
     """Return a hook, how many deliveries wait, and the one that was tried last."""
-    return _view(service, _row(service, caller, hook))
+    found = hooks.listing(service.database, caller.project, hook)
+    if not found:
+        raise _missing(hook)
+    return _view(service, found[0])
 
 
 @router.post("/{hook}/test", status_code=202, responses=responses(404), summary="Send a test to a hook")
 def send_test(service: ServiceDep, caller: Admin, hook: HookName) -> DeliveryView:
-    """Queue a delivery of the type `hook.test`, which is signed, sent and tried again as the others are."""
-    _row(service, caller, hook)
+    """Queue a delivery of the type `hook.test`, which is signed, sent and tried again as the others are, and end the pause of the hook."""
     service.limiter.take(caller.key, CREATION_COST - 1)
 
     def work(connection: sa.Connection) -> sa.RowMapping:
+        made = hooks.record_test(connection, caller.project, hook)
+        if made is None:
+            raise _missing(hook)
         audit.record(connection, caller, "hook.test", hook)
-        return hooks.record_test(connection, hook)
+        return made
 
     return DeliveryView.model_validate(dict(service.database.transact(work)))
 
@@ -78,13 +82,6 @@ def delete_hook(service: ServiceDep, caller: Admin, hook: HookName) -> None:
 
     if not service.database.transact(work):
         raise _missing(hook)
-
-
-def _row(service: Service, caller: Caller, hook: str) -> sa.RowMapping:
-    found = hooks.listing(service.database, caller.project, hook)
-    if not found:
-        raise _missing(hook)
-    return found[0]
 
 
 def _missing(hook: str) -> ApiError:

@@ -19,8 +19,8 @@ from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
-from service.server.api.views import job_view
 from service.server.database import audit, idempotency, jobs, quotas
+from service.server.database.job_view import job_view
 from service.server.database.keys import Caller
 from service.server.storage import layout
 

@@ -1,22 +1,11 @@
 """Views made from rows of the database and files of the storage; service.requests.answers declares their fields."""
 
-from typing import Any
 from urllib.parse import quote
 
 import sqlalchemy as sa
 
-from service.requests.answers import IntakeView, JobView, ProgressView, ResultView
+from service.requests.answers import IntakeView, ResultView
 from service.server.storage.folder import StoredFile
-
-
-def job_view(row: sa.RowMapping | dict[str, Any]) -> JobView:
-    """Return the view of a row of `jobs`."""
-    progress = None
-    if row["stage"] is not None:
-        left = max(0, row["total"] - row["done"])
-        progress = ProgressView(stage=row["stage"], done=row["done"], total=row["total"], rate=row["rate"],
-                                remaining_s=left / row["rate"] if row["rate"] else None)
-    return JobView.model_validate({**row, "progress": progress})
 
 
 def intake_view(row: sa.RowMapping) -> IntakeView:

@@ -10,10 +10,10 @@ import sqlalchemy as sa
 from service.requests.base.identifiers import JOB, KEY
 from service.requests.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
-from service.server.api.views import job_view
 from service.server.base.log import logger
 from service.server.database import jobs, keys
 from service.server.database.engine import UNANSWERED, Database, message_of
+from service.server.database.job_view import job_view
 from service.server.database.keys import Caller
 
 TICK_S = 0.25

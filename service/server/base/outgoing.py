@@ -7,15 +7,19 @@ points elsewhere a moment later (DNS rebinding) leads nowhere. Redirects and pro
 import asyncio
 import socket
 import ssl
+import threading
+import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from functools import cache
 from ipaddress import IPv4Address, IPv6Address, ip_address, ip_network
-from typing import NamedTuple
-from urllib.parse import urlsplit
+from typing import Any, NamedTuple
+from urllib.parse import SplitResult, urlsplit
 
 import httpx2
 
 from service.errors import RequestError
+from service.server.base.log import logger
 
 TIMEOUT_S = 10.0
 """Seconds from the look-up of the name to the header of the answer; of its body nothing is read."""
@@ -24,6 +28,10 @@ NAT64 = ip_network("64:ff9b::/96")
 
 UNICAST = ip_network("2000::/3")
 """The IPv6 addresses that are given to hosts (RFC 4291). Others, such as ::127.0.0.1, can lead to addresses of IPv4."""
+
+
+NO_ADDRESS = "the host has no address for hooks: it needs a public one and https://, or one in a network of the setting hook_networks"
+"""What users read where a name is not found or not allowed, so that nobody learns the names inside; the log of the service says which."""
 
 
 class Answer(NamedTuple):
@@ -40,7 +48,8 @@ def require_target(url: str, networks: Sequence[str]) -> None:
     try:
         parts = urlsplit(url)
         host, _ = parts.hostname, parts.port
-    except ValueError:  # a port that is no number, or one bracket
+        (host or "").encode("idna")  # as the look-up does
+    except ValueError:  # a port that is no number, one bracket, or a part of the name that is empty or longer than 63
         host = None
     if not host or "@" in parts.netloc:
         raise RequestError(f"url: {url[:200]} is not of the form https://host/path")
@@ -53,40 +62,54 @@ def require_target(url: str, networks: Sequence[str]) -> None:
 
 def post(url: str, body: bytes, headers: Mapping[str, str], networks: Sequence[str]) -> Answer:
     """Send a body to a URL, to no address but a public one or one of `networks`, and return what came back."""
+    deadline = time.monotonic() + TIMEOUT_S
     try:
-        status = asyncio.run(_post(url, body, headers, networks))
-    except RequestError as error:
-        return Answer(False, str(error))
+        addresses = _allowed_addresses(urlsplit(url), networks)
+        status = asyncio.run(_post(url, body, headers, addresses, deadline))
+    except (RequestError, socket.gaierror) as error:
+        logger.info("hook without an address", host=urlsplit(url).hostname, error=str(error))
+        return Answer(False, NO_ADDRESS)
     except (TimeoutError, httpx2.TimeoutException):
         return Answer(False, f"no answer within {TIMEOUT_S:g} s")
-    except socket.gaierror as error:
-        return Answer(False, f"the name of the host is not found ({error.strerror})")
     except (httpx2.HTTPError, httpx2.InvalidURL, OSError) as error:
         return Answer(False, f"no answer: {' '.join(str(error).split())[:200] or type(error).__name__}")
     words = f"{status}: redirects are not followed" if 300 <= status < 400 else str(status)
     return Answer(200 <= status < 300, words)
 
 
-async def _post(url: str, body: bytes, headers: Mapping[str, str], networks: Sequence[str]) -> int:
-    parts = urlsplit(url)
-    host, refused = parts.hostname or "", None
-    async with asyncio.timeout(TIMEOUT_S):
-        port = parts.port or {"http": 80, "https": 443}[parts.scheme]
-        found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        addresses = dict.fromkeys(str(place[0]) for *_, place in found)
+def _allowed_addresses(parts: SplitResult, networks: Sequence[str]) -> list[str]:
+    """Return the addresses of a host, or raise RequestError if one of them is not allowed.
+
+    A look-up cannot be ended, so that it has a thread, for which nobody waits longer than TIMEOUT_S, nor the end of the process.
+    """
+    found: Future[list[Any]] = Future()
+
+    def look_up() -> None:
+        try:
+            found.set_result(socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_STREAM))
+        except Exception as error:
+            found.set_exception(error)
+
+    threading.Thread(target=look_up, name="relit-look-up", daemon=True).start()
+    addresses = list(dict.fromkeys(str(place[0]) for *_, place in found.result(TIMEOUT_S)))
+    for address in addresses:
+        _require_allowed(parts.scheme, ip_address(address), networks)
+    return addresses
+
+
+async def _post(url: str, body: bytes, headers: Mapping[str, str], addresses: Sequence[str], deadline: float) -> int:
+    parts, refused = urlsplit(url), None
+    async with asyncio.timeout(deadline - time.monotonic()), httpx2.AsyncClient(trust_env=False, verify=_certificates()) as client:
         for address in addresses:
-            _require_allowed(parts.scheme, ip_address(address), networks)
-        async with httpx2.AsyncClient(trust_env=False, verify=_certificates()) as client:
-            for address in addresses:
-                request = client.build_request("POST", httpx2.URL(url).copy_with(host=address), content=body, timeout=TIMEOUT_S,
-                                               headers={**headers, "Host": parts.netloc}, extensions={"sni_hostname": host})
-                try:
-                    answer = await client.send(request, stream=True, follow_redirects=False)
-                except httpx2.ConnectError as error:  # the next address may answer
-                    refused = error
-                    continue
-                await answer.aclose()
-                return answer.status_code
+            request = client.build_request("POST", httpx2.URL(url).copy_with(host=address), content=body, timeout=TIMEOUT_S,
+                                           headers={**headers, "Host": parts.netloc}, extensions={"sni_hostname": parts.hostname})
+            try:
+                answer = await client.send(request, stream=True, follow_redirects=False)
+            except httpx2.ConnectError as error:  # the next address may answer
+                refused = error
+                continue
+            await answer.aclose()
+            return answer.status_code
     raise refused or OSError("the host has no address")
 
 

@@ -133,6 +133,8 @@ hooks = sa.Table(  # URLs that are told how the jobs of a project ended
     sa.Column("events", sa.JSON, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),  # as it is: it signs
     sa.Column("created_at", sa.Float, nullable=False),
+    sa.Column("due_at", sa.Float, nullable=False),  # of the next try: the end of a pause, or when the try under way counts as lost
+    sa.Column("failures", sa.Integer, nullable=False),  # tries since the last one that was accepted
     sa.Index("relit_hooks_of_project", "project"))
 
 deliveries = sa.Table(  # an event and the hook to be told of it
@@ -140,15 +142,14 @@ deliveries = sa.Table(  # an event and the hook to be told of it
     sa.Column("hook", sa.String(32), sa.ForeignKey("relit_hooks.id", ondelete="CASCADE"), nullable=False),
     sa.Column("event", sa.String(16), nullable=False),
     sa.Column("job", sa.String(32)),  # which may have been deleted since; NULL: a test
-    sa.Column("snapshot", sa.JSON(none_as_null=True)),  # columns of the job's row as they were when it ended
+    sa.Column("body", sa.Text),  # of the requests, with the job as it was when it ended; NULL: no try follows
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("tries", sa.Integer, nullable=False),
     sa.Column("made_at", sa.Float, nullable=False),
     sa.Column("tried_at", sa.Float),
-    sa.Column("due_at", sa.Float),  # of the next try, or when the one under way counts as lost; NULL: there is none
     sa.Column("answer", sa.Text),  # to the last try: its status, or why there was none
-    sa.Index("relit_deliveries_of_hook", "hook", "made_at"),
-    sa.Index("relit_deliveries_of_time", "due_at"))
+    sa.Index("relit_deliveries_of_hook", "hook", "state"),
+    sa.Index("relit_deliveries_of_time", "made_at"))
 
 idempotency = sa.Table(
     "relit_idempotency", metadata, _project(),

@@ -30,6 +30,8 @@ EVERY_S = 600.0
 HOUR_S, DAY_S = 3600.0, 86_400.0
 TOKEN_S = DAY_S
 """Seconds for which an idempotency token is remembered."""
+GIVE_UP_S = 2 * DAY_S
+"""Seconds after which a delivery to a hook is given up, however often it was tried."""
 DELIVERY_S = 30 * DAY_S
 """Seconds for which a delivery to a hook is kept that was accepted or given up."""
 UNFINISHED_S = DAY_S
@@ -123,7 +125,13 @@ class Housekeeper:
         self._database.transact(lambda connection: idempotency.drop_before(connection, self._clock() - TOKEN_S))
 
     def _deliveries(self) -> None:
-        self._database.transact(lambda connection: hooks.drop_before(connection, self._clock() - DELIVERY_S))
+        def work(connection: sa.Connection) -> None:
+            for row in hooks.give_up(connection, self._clock() - GIVE_UP_S):
+                if row["job"] is not None:
+                    jobs.note(connection, row["job"], f"{row['hook']} given up after {row['tries']} tries: {row['answer']}")
+            hooks.drop_before(connection, self._clock() - DELIVERY_S)
+
+        self._database.transact(work)
 
     def _audit(self) -> None:
         now = self._clock()

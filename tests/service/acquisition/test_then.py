@@ -73,6 +73,16 @@ def test_a_step_that_fails_keeps_the_capture_and_says_one_command(tmp_path, stag
     assert (tmp_path / "capture" / "asset.usdz").exists()
 
 
+def test_a_view_that_is_given_later_makes_the_preview_anew(tmp_path, stage, relit):
+    path = tmp_path / "capture" / PREVIEW_FILE
+    with controller(tmp_path, stage) as (rig, _):
+        relit.done(*arguments(tmp_path, stage, rig))
+        shown = images.read_pixels(path)
+        assert "preview" not in relit.done(*arguments(tmp_path, stage, rig)).out
+        assert str(path) in relit.done(*arguments(tmp_path, stage, rig), "--view", "Un-tone-mapped").out
+    assert not np.array_equal(images.read_pixels(path), shown)
+
+
 def test_a_capture_with_a_fault_is_not_solved(tmp_path, stage, relit):
     stage.faults = {4: FaultKind.CLIPPED}
     with controller(tmp_path, stage) as (rig, _):

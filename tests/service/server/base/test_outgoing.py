@@ -2,12 +2,13 @@
 
 import socket
 import ssl
+import threading
 
 import pytest
 
 from service.errors import RequestError
 from service.server.base import outgoing
-from service.server.base.outgoing import post, require_target
+from service.server.base.outgoing import NO_ADDRESS, post, require_target
 from tests.service.server.receiver import receiving
 from tests.service.server.test_nginx import write_certificate
 
@@ -37,11 +38,11 @@ def test_addresses_that_are_not_public_are_refused_as_numbers_and_behind_names(h
     with pytest.raises(RequestError, match="is not a public address, and no network of the setting hook_networks has it"):
         require_target(f"https://{host}/x", ())
     named(monkeypatch, [host.strip("[]")])
-    answer = post("https://hook.test/x", b"", {}, ())
-    assert not answer.accepted and "is not a public address" in answer.words
+    assert post("https://hook.test/x", b"", {}, ()) == (False, NO_ADDRESS)
 
 
-@pytest.mark.parametrize("url", ["https://", "https:///x", "https://user:word@host/", "https://host:port/", "https://[::1/", "https://@host/"])
+@pytest.mark.parametrize("url", ["https://", "https:///x", "https://user:word@host/", "https://host:port/", "https://[::1/", "https://@host/",
+                                 "https://a..b/", f"https://{'a' * 64}.example/"])
 def test_urls_without_a_host_or_with_a_password_are_refused(url):
     with pytest.raises(RequestError, match="is not of the form https://host/path"):
         require_target(url, ("0.0.0.0/0",))
@@ -57,7 +58,37 @@ def test_public_addresses_are_taken_with_tls_alone():
 def test_other_spellings_of_an_address_are_resolved_and_refused():
     for host in ("127.1", "2130706433", "0x7f000001", "localhost"):
         require_target(f"https://{host}/x", ())  # a name, as it seems
-        assert "is not a public address" in post(f"https://{host}/x", b"", {}, ()).words
+        assert post(f"https://{host}/x", b"", {}, ()) == (False, NO_ADDRESS)
+
+
+def test_users_do_not_learn_which_names_there_are_inside_and_the_operator_does(monkeypatch):
+    logged = []
+    monkeypatch.setattr(outgoing.logger, "info", lambda _event, **fields: logged.append(f"{fields['host']} {fields['error']}"))
+    named(monkeypatch, ["10.1.2.3"])
+    assert post("https://vault.test/", b"", {}, ()) == (False, NO_ADDRESS)
+
+    def unknown(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    assert post("https://nothing.test/", b"", {}, ()) == (False, NO_ADDRESS)
+    assert "vault.test url: 10.1.2.3 is not a public address" in logged[0] and "nothing.test" in logged[1] and "not known" in logged[1]
+
+
+def test_a_name_server_that_does_not_answer_is_not_waited_for(monkeypatch):
+    held, ended = threading.Event(), threading.Event()
+
+    def look_up(*_: object, **__: object) -> list:
+        held.wait(60)
+        ended.set()
+        return []
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    monkeypatch.setattr(outgoing, "TIMEOUT_S", 0.1)
+    assert post("https://hook.test/", b"", {}, ()) == (False, "no answer within 0.1 s")
+    assert not ended.is_set()
+    held.set()
+    ended.wait(60)
 
 
 def test_a_name_that_points_elsewhere_after_it_was_checked_leads_nowhere(monkeypatch):
@@ -69,7 +100,7 @@ def test_a_name_that_points_elsewhere_after_it_was_checked_leads_nowhere(monkeyp
         assert asked == ["hook.test"] and forbidden.received == []
         assert allowed.received[0].headers["host"] == url.split("/")[2]
         refused = post(url, b"{}", {}, ("127.0.0.2/32",))
-        assert "127.0.0.3 is not a public address" in refused.words and forbidden.received == []
+        assert refused == (False, NO_ADDRESS) and forbidden.received == []
 
 
 def test_a_name_of_which_one_address_is_private_is_refused_and_the_next_address_is_tried(monkeypatch):
