@@ -14,14 +14,13 @@ from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, 
 from service.acquisition.capture_files import CaptureFiles
 from service.acquisition.checks.fault import Fault, FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
+from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.journal import Journal
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
 from service.acquisition.plans.shots import TRACKING, Shot, shots_of
 from service.acquisition.projector import Projector
-from service.acquisition.projector_response import measure, shown_through
-from service.calibrate.response import Response
-from service.depth.patterns.projection import stored
+from service.acquisition.projector_response import PatternImages
 from service.errors import RequestError
 from service.play.play import ended_by_signals
 from service.reporting.progress import Progress, Timings
@@ -30,8 +29,6 @@ from service.requests.acquire import AcquireRequest
 from stage.files import write_text
 from stage.formats import images
 from stage.importers.layout import color_space_of
-from stage.patterns.base import UniformPattern
-from stage.patterns.codes import draw
 from stage.rig.controllers import Controllers
 from stage.rig.cues import rig_digest
 from stage.rig.rig import Rig, read_rig
@@ -94,13 +91,10 @@ class Acquisition:
         """
         self._request, self._ask, self._tell, self._timings = request, ask, tell, Timings(progress)
         self._projector: Projector | None = None
-        self.response: Response | None = None
-        """The response of the projector, once the plan has measured it."""
         self.rig: Rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
         self.plan: Plan = read_plan(request.plan)
         self.shots: tuple[Shot, ...] = shots_of(self.plan, self.rig, request.projector)
-        if request.gamma != 1 and any(shot.grey is not None for shot in self.shots):
-            raise RequestError(f"--gamma: is {request.gamma:g}, and the plan measures the projector's response: leave one of them out")
+        self.patterns: PatternImages = PatternImages(request, self.shots)
         head = {"plan": self.plan.model_dump(mode="json", by_alias=True), "rig": rig_digest(self.rig), "camera": request.camera}
         self.journal = Journal(request.out, head)
         self._camera: Camera = open_camera(request.camera, Setup(
@@ -170,19 +164,12 @@ class Acquisition:
         """Switch the lamps of a shot, and show its pattern; other shots find the projector black."""
         lights.set(shot.levels)
         if self._projector is not None:
-            self._projector.show(self._image(shot))
+            self._projector.show(self.patterns.image(shot, self._greys))
 
-    def _image(self, shot: Shot) -> np.ndarray:
-        """Return what the projector shows for a shot, [rows, cols] uint8; its response is measured when the first pattern is shown."""
-        assert self._request.projector is not None
-        if shot.grey is not None:
-            return stored(np.full(self._request.projector[::-1], shot.grey), 8, 1.0)
-        if shot.pattern is not None and self.response is None and (greys := [each for each in self.shots if each.grey is not None]):
-            pictures = {each.grey: self._request.out / self.journal.taken[each.key]["file"] for each in greys
-                        if each.grey is not None and each.key in self.journal.taken}
-            self.response = measure(pictures, self._request.color_space, self._request.saturation or FULL_SCALE)
-        levels = draw(shot.pattern or UniformPattern(code="black"), self._request.projector)
-        return stored(levels, 8, self._request.gamma) if self.response is None else shown_through(self.response, levels)
+    def _greys(self) -> dict[float, Path]:
+        """Return the pictures of even grey that there are, by its level."""
+        return {shot.grey: self._request.out / self.journal.taken[shot.key]["file"] for shot in self.shots
+                if shot.grey is not None and shot.key in self.journal.taken}
 
     def _recall(self) -> None:
         """Take note of the pictures that an earlier run has taken."""
@@ -281,7 +268,7 @@ class Acquisition:
         lamps = {each.key for each in self.shots if each.lamp is not None and each.key in self.journal.taken}
         if lamps and all(any(fault.kind is FaultKind.UNLIT for fault in self.faults.get(key, ())) for key in lamps):
             self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
-            raise RequestError(f"no lamp has lit yet: {faults[0].sentence} Then run the same command again, with --retake {min(lamps)}")
+            raise RequestError(f"no lamp has lit yet: {ADVICE} Then run the same command again, with --retake {min(lamps)}")
 
     def _await(self, shot: Shot, owed: int, stopping: threading.Event) -> None:
         """Wait for pictures that are late, while the lamps shine for which they were asked, so that none is taken for another shot's."""
@@ -346,9 +333,7 @@ class Acquisition:
                       rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots), pictures=len(self.journal.taken),
                       missing=missing, faults=[fault._asdict() for fault in faults],
                       retaken=[fault._asdict() for fault in self.retaken], own_ms=own,
-                      projector_response=None if self.response is None else {
-                          "gamma": float(f"{self.response.gamma:.4g}"), "spread": float(f"{self.response.spread:.3g}"),
-                          "values": [float(f"{value:.7g}") for value in self.response.values]}, seconds=self._timings.close())
+                      projector_response=self.patterns.entry(), seconds=self._timings.close())
         write_text(self._request.out / REPORT_FILE, text)
 
 

@@ -58,8 +58,8 @@ def _capture(request: AcquireRequest) -> None:
         print(f"retaken  {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
     for fault in result.faults:
         print(f"fault    {fault.shot}: {fault.kind.replace('_', ' ')}: {fault.sentence}")
-    if acquisition.response is not None:
-        print(f"response that of the projector is near a gamma of {acquisition.response.gamma:.2f}; patterns are shown in linear light")
+    if (response := acquisition.patterns.response) is not None:
+        print(f"response that of the projector is near a gamma of {response.gamma:.2f}; patterns are shown in linear light")
     print(f"capture  {result.path}")
     print(f"pictures {result.there} of {result.shots}, {result.taken} taken now; the lamps are dark")
     if result.there < result.shots:
