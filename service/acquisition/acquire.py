@@ -327,13 +327,11 @@ class Acquisition:
         """Write report.json of the capture."""
         missing = [shot.key for shot in self.shots if shot.key not in self.journal.taken]
         own = {"median": round(1e3 * float(np.median(self._own)), 1)} if self._own else {}
-        rig = self._request.rig
-        inputs = {} if rig is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
-        text = report(self._request, inputs=inputs,
-                      rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots), pictures=len(self.journal.taken),
-                      missing=missing, faults=[fault._asdict() for fault in faults],
-                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own,
-                      projector_response=self.patterns.entry(), seconds=self._timings.close())
+        inputs = {} if (rig := self._request.rig) is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
+        text = report(self._request, inputs=inputs, rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots),
+                      pictures=len(self.journal.taken), missing=missing, faults=[fault._asdict() for fault in faults],
+                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own, projector_response=self.patterns.entry(),
+                      seconds=self._timings.close())
         write_text(self._request.out / REPORT_FILE, text)
 
 

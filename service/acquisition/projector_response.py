@@ -62,7 +62,7 @@ class PatternImages:
 
     def _measured(self, pictures: Mapping[float, Path]) -> Response:
         if not pictures:
-            raise RequestError("projector-response: none of its pictures came, and the patterns need them: look at the camera, and run again")
+            raise RequestError("projector-response: none of its pictures came: look at the camera, and run the same command again")
         usable, readings = [], []
         for path in pictures.values():
             recorded = images.read_pixels(path)
