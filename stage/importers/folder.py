@@ -67,12 +67,12 @@ def made(layout: str, reason: str, words: list[object], source: Path, *, solve: 
         words: the layout and arguments of `relit import`.
         source: the folder of the capture.
         solve: whether `relit solve` makes the result; else `relit depth`.
-        summary: what the folder holds; without it the layout and the reason say so.
+        summary: what the folder holds; without it the layout says so.
     """
     program = "solve" if solve else "depth"
     return Guess(source, layout, reason, assumed, tuple(map(str, words)), sure,
                  shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]),
-                 summary or f"{layout}: {reason}")
+                 summary or layout)
 
 
 def lit(count: int, lights: str, file: Path) -> str:

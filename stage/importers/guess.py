@@ -222,7 +222,7 @@ def _correlations(folder: Folder) -> Guess | None:
     phases = ",".join(map(str, numbers)) if told else ",".join(f"{360 * step / len(chosen):g}" for step in range(len(chosen)))
     return made("correlation images of a time-of-flight camera", f"{len(chosen)} arrays of one image each, {chosen[0]} to {chosen[-1]}",
                  ["tof", folder.path, "--arrays", group, "--frequencies-hz", "HZ", "--phases-deg", phases, "--signal", "minus"],
-                 folder.path, solve=False, assumed=(
+                 folder.path, solve=False, summary=f"{len(chosen)} correlation images of a time-of-flight camera", assumed=(
                      "HZ is the modulation frequency", "the images are P + Q cos(φ − δ): if ranges run backwards, --signal plus",
                      *(() if told else ("one frequency at even phases: their order is not in the names",))))
 

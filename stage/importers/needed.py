@@ -19,6 +19,7 @@ ARRAYS = (".npy", ".npz", ".mat")
 TABLES = (".csv", ".txt", ".json", ".xml", ".yml", ".yaml")
 MOST_TABLE_BYTES = 64 << 20
 """Length of the longest text that can be a table of lights or a calibration."""
+MOST_CAPTURES = 100
 FEWEST_IMAGES = 3
 """Images in a folder that may be a capture: phases have three."""
 
@@ -45,7 +46,10 @@ def needed_files(lengths: Mapping[str, int]) -> tuple[Needed, ...]:
     """
     shown = {path: length for path, length in lengths.items() if not any(part.startswith(".") for part in path.split("/"))}
     inside: dict[str, list[str]] = defaultdict(list)
+    tables: dict[str, list[str]] = defaultdict(list)
     for path, length in shown.items():
+        if _is_table(path, length):
+            tables[_folder(path)].append(path)
         if _is_data(path, length):
             inside[_folder(path)].append(path)
     captures = [folder for folder, paths in inside.items()
@@ -53,17 +57,21 @@ def needed_files(lengths: Mapping[str, int]) -> tuple[Needed, ...]:
     if not captures:
         raise ManifestError(_nothing_found(shown))
     depth = min(map(_depth, captures))
+    captures = sorted(folder for folder in captures if _depth(folder) == depth)
+    if len(captures) > MOST_CAPTURES:
+        raise ManifestError(f"the folder holds {len(captures)} folders with images, and {MOST_CAPTURES} are taken at one time: give some "
+                            "of them")
     found = []
-    for folder in sorted(folder for folder in captures if _depth(folder) == depth):
-        chosen = [path for path in shown if _folder(path) == folder and (path in inside[folder] or _is_table(path, shown[path]))]
+    for folder in captures:
+        chosen = [*inside[folder], *tables.get(folder, [])]
         files = {path: PurePosixPath(path).name for path in chosen}
         if any(_suffix(path) in PROJECTS for path in chosen):
             below = f"{folder}/" if folder else ""
             files |= {path: path.removeprefix(below) for path in shown
                       if path.startswith(below) and path not in files and _suffix(path) in images.SUFFIXES}
         taken = set(files.values())
-        files |= {path: PurePosixPath(path).name for path in shown if folder and _folder(path) == _folder(folder)
-                  and _is_table(path, shown[path]) and PurePosixPath(path).name not in taken}
+        if folder:
+            files |= {path: PurePosixPath(path).name for path in tables.get(_folder(folder), []) if PurePosixPath(path).name not in taken}
         found.append(Needed(folder, files))
     sides = [words_of(PurePosixPath(needed.folder).name) for needed in found]
     if any(words & LEFT_WORDS for words in sides) and any(words & RIGHT_WORDS for words in sides):
@@ -83,8 +91,9 @@ def _is_data(path: str, length: int) -> bool:
 
 def _is_table(path: str, length: int) -> bool:
     """Return whether a file may hold lights, planes or a calibration."""
-    return (_suffix(path) in TABLES and length <= MOST_TABLE_BYTES and PurePosixPath(path).name != FILE_NAME) or (
-        "p0" in PurePosixPath(path).name.lower() and length >= kinect.P0_BYTES) or _suffix(path) in ARRAYS
+    name, suffix = PurePosixPath(path).name, _suffix(path)
+    is_p0 = "p0" in name.lower() and kinect.P0_BYTES <= length <= MOST_TABLE_BYTES and suffix not in video.SUFFIXES
+    return suffix in ARRAYS or is_p0 or (suffix in TABLES and length <= MOST_TABLE_BYTES and name != FILE_NAME)
 
 
 def _nothing_found(lengths: Mapping[str, int]) -> str:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from service.requests.base.base import Choice, Commas, JobRequest, Role
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
@@ -66,7 +67,7 @@ class Field(NamedTuple):
     off: str
     is_argument: bool
     choices: tuple[tuple[str, str], ...]
-    """Values and their words, of a select."""
+    """Values and their words, of a select; examples of a text."""
     default: str
     required: bool
     low: str
@@ -136,7 +137,13 @@ def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
         return "number", "integer", ()
     if kind is float:
         return "number", "number", ()
-    return "text", "string", ()
+    return "text", "string", tuple((str(each), "") for each in _examples(option))
+
+
+def _examples(option: Option) -> list[Any]:
+    """Return the examples that a field, or the type of its values, declares."""
+    kinds = [option.field, *map(FieldInfo.from_annotation, get_args(option.field.annotation))]
+    return next((kind.examples for kind in kinds if kind.examples), [])
 
 
 def _bare(kind: Any) -> Any:

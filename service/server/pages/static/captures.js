@@ -13,9 +13,22 @@ async function list(what) {
     const name = what === "captures" ? element("a", { href: `/captures/${item.id}` }, item.name) : item.name;
     rows.push(element("tr", {}, element("td", {}, name, " ", element("small", {}, item.id)),
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
-      element("td", {}, item.problem ?? content(item.facts)), element("td", {}, time(item.created_at))));
+      element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
   }
   body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
+}
+
+/** Return the button that asks how files are imported that were looked at, perhaps in another tab; null where there is nothing to ask. */
+function question(item) {
+  if (item.facts?.proposal === undefined || item.state === "checking") return null;
+  const ask = () => {
+    const status = element("span", { role: "status" });
+    const line = element("li", {}, element("strong", {}, item.name), " ", status);
+    byId("uploads").append(line);
+    line.scrollIntoView({ block: "nearest" });
+    return attempt(() => end("captures", { ...item, state: "receiving" }, line, status, { signal: new AbortController().signal, lost: () => {} }));
+  };
+  return element("button", { type: "button", class: "quiet", onclick: ask }, "Choose and import");
 }
 
 function content(facts) {

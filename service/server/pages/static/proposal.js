@@ -14,12 +14,12 @@ const ASKED = ["color_space", "focal_px", "pixel_size_m"]; // what files seldom 
  */
 export async function proposalOf(capture, done) {
   const { proposal } = capture.facts;
-  const { fault, form } = await formOf(proposal, capture.id);
+  const { labels, fault, form } = await formOf(proposal, capture.id);
   const shown = element("div", { class: "proposal" },
     element("p", {}, element("strong", {}, proposal.summary)),
     element("p", {}, proposal.sure ? "Sure" : "Not sure", `: ${proposal.because}.`),
     proposal.assumed.length === 0 ? null : element("p", {}, "Taken for granted: "),
-    element("ul", {}, ...proposal.assumed.map((sentence) => element("li", {}, sentence))), form);
+    element("ul", {}, ...proposal.assumed.map((sentence) => element("li", {}, sentence.replace(/--[a-z-]+/g, (flag) => labels.get(flag) ?? flag)))), form);
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const button = form.querySelector("button");
@@ -45,20 +45,23 @@ async function formOf(proposal, id) {
   const page = new DOMParser().parseFromString(await (await send(`/import-form/${proposal.layout}`)).text(), "text/html");
   const fields = [...page.querySelectorAll(".field")];
   for (const field of fields) {
-    for (const name of ["id", "for", "aria-describedby"]) { // several captures may be asked about at once
+    for (const name of ["id", "for", "list", "aria-describedby"]) { // several captures may be asked about at once
       for (const each of field.querySelectorAll(`[${name}]`)) each.setAttribute(name, `${id}-${each.getAttribute(name)}`);
     }
     const control = field.querySelector("input, select, textarea");
     fill(control, proposal.options[field.dataset.paths]);
     control.required = proposal.missing.includes(field.dataset.paths);
   }
-  const first = fields.filter(({ dataset }) => proposal.missing.includes(dataset.paths) || ASKED.includes(dataset.paths));
+  const wanted = [...proposal.missing, ...ASKED];
+  const first = fields.filter(({ dataset }) => wanted.includes(dataset.paths));
+  first.sort((one, other) => wanted.indexOf(one.dataset.paths) - wanted.indexOf(other.dataset.paths));
   const rest = fields.filter((field) => !first.includes(field));
   const fault = element("p", { class: "fault", role: "alert", hidden: true });
   const form = element("form", { "data-kind": proposal.layout, novalidate: true }, ...first,
     rest.length === 0 ? null : element("details", {}, element("summary", {}, "More choices"), ...rest),
     element("p", { class: "actions" }, element("button", { type: "submit" }, "Import")), fault);
-  return { fault, form };
+  const labels = new Map(fields.map((field) => [field.dataset.flag, `“${field.querySelector("label").textContent}”`]));
+  return { labels, fault, form };
 }
 
 function fill(control, value) {

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stage.errors import ManifestError
 from tests.scenes.captures import write_image
 from tests.scenes.foreign import LIGHTS, write_four_phases, write_photographs
 from tests.service.server.api.job_calls import refused
@@ -43,7 +44,7 @@ def test_what_is_needed_is_told_from_names_and_lengths():
     from stage.importers.needed import needed_files
 
     photos = {f"p{number}.jpg": 5_000_000 for number in range(9)}
-    found, = needed_files({**photos, "light_directions.txt": 900, "making_of.mov": 3_200_000_000, ".DS_Store": 6, "notes.pdf": 9,
+    found, = needed_files({**photos, "light_directions.txt": 900, "clip0.mov": 3_200_000_000, "short p0.mov": 9_000_000, ".DS_Store": 6, "notes.pdf": 9,
                            "raw/.cache/x.jpg": 3, "log.txt": 80 << 20})
     assert (found.folder, sorted(found.files)) == ("", sorted([*photos, "light_directions.txt"]))
     poses = needed_files({f"{pose}/{step}.png": 9 for pose in ("pose2", "pose1") for step in range(4)} | {"calibration.xml": 8, "x.txt": 1})
@@ -52,6 +53,8 @@ def test_what_is_needed_is_told_from_names_and_lengths():
                               "x.txt": "x.txt"}
     listed_below, = needed_files({"dome.lp": 90, "jpg/a.jpg": 5, "jpg/b.jpg": 5, "film.mp4": 7})
     assert listed_below.files == {"dome.lp": "dome.lp", "jpg/a.jpg": "jpg/a.jpg", "jpg/b.jpg": "jpg/b.jpg"}
+    with pytest.raises(ManifestError, match="holds 20000 folders with images, and 100 are taken"):
+        needed_files({f"{number}/a.npy": 5 for number in range(20_000)})
     picture_above, = needed_files({"overview.png": 5, "photos/a.png": 4, "photos/b.png": 4, "photos/c.png": 4})
     assert picture_above.folder == "photos"
 
