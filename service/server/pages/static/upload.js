@@ -30,7 +30,7 @@ export class Stopped extends Error {}
  */
 export async function upload(listingName, name, files, progress, link, then = "validate") {
   const [intake, known] = await begun(listingName, name, then === "guess" ? files : null);
-  if (intake.state === "ready") return intake;
+  if (intake.state === "ready" || intake.state === "checking") return settled(intake, listingName, link);
   const total = files.reduce((sum, { file }) => sum + file.size, 0);
   const sent = new Map();
   let over = false; // one file failed, or the person stopped: the others end too, and tell nothing any more
@@ -51,7 +51,18 @@ export async function upload(listingName, name, files, progress, link, then = "v
     over = true;
   }
   progress(total, total, "checking");
-  return settled(await post(`/v1/${listingName}/${intake.id}/${then}`), listingName, link);
+  return settled(await asked(`/v1/${listingName}/${intake.id}`, then, link), listingName, link);
+}
+
+/** Ask for a look at the files; an answer that was lost with the connection is asked for again. */
+async function asked(place, then, link) {
+  try {
+    return await persist(() => post(`${place}/${then}`), link);
+  } catch (error) {
+    const found = error instanceof Refusal && error.status === 409 ? await persist(() => read(place), link) : null;
+    if (found === null || found.state === "receiving") throw error;
+    return found;
+  }
 }
 
 /** Return a capture or environment when nothing looks at it any more. */
@@ -68,7 +79,7 @@ export async function settled(found, listingName, link) {
 async function begun(listingName, name, same) {
   for await (const intake of listing(`/v1/${listingName}`, "items")) {
     if (intake.name !== name || intake.registered) continue;
-    if (same === null ? intake.state !== "receiving" : intake.state === "checking") continue;
+    if (same === null && intake.state !== "receiving") continue;
     const known = new Map();
     for await (const file of listing(`/v1/${listingName}/${intake.id}/files`, "files", "after")) known.set(file.path, file);
     if (same === null || (await isOf(intake, known, same))) return [intake, known];
@@ -77,7 +88,7 @@ async function begun(listingName, name, same) {
 }
 
 async function isOf(intake, known, files) {
-  if (intake.state !== "ready") {
+  if (intake.state === "receiving" || intake.state === "refused") {
     const sizes = new Map(files.map(({ path, file }) => [path, file.size]));
     return [...known.values()].every(({ path, length }) => sizes.get(path) === length);
   }
