@@ -62,7 +62,7 @@ def _opencv_gray(request: OpencvGrayImport) -> Imported:
     from stage.importers.patterns import import_opencv_gray
 
     return Imported(import_opencv_gray(request.source, request.folder, projector=request.projector, calibration=request.calibration,
-                                   unit_m=request.unit_m), ())
+                                       unit_m=request.unit_m), ())
 
 
 def _olat(request: OlatImport) -> Imported:

@@ -31,12 +31,13 @@ def propose(folder: Path) -> dict[str, Any]:
     typed = taken_apart(found.arguments)
     missing = unsettled(typed.layout, typed.options)
     known = options_of_layout(typed.layout)
-    asked = [typed.options[name] for name in missing if name in typed.options]  # such as FOCAL, which the form asks for
+    asked = [str(typed.options[name]) for name in missing if name in typed.options]  # such as FOCAL, which the form asks for
+    assumed = [sentence for sentence in found.assumed if not any(word in sentence for word in asked)]
     options = {name: str(Path(value).relative_to(folder)) if known[name].role is Role.INPUT else value
                for name, value in typed.options.items() if name not in missing}
     return {"summary": found.summary, "because": found.reason, "layout": typed.layout,
             "file": None if typed.source == folder else str(typed.source.relative_to(folder)), "options": options, "missing": missing,
-            "assumed": [sentence for sentence in found.assumed if not any(word in sentence for word in asked)], "sure": found.sure and not missing}
+            "assumed": assumed, "sure": found.sure and not missing}
 
 
 def import_chosen(folder: Path, choices: ImportChoices, assumed: tuple[str, ...], name: str) -> None:
