@@ -13,7 +13,7 @@ from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
 from service.requests.drive import RIG, ChartDocument, DriveOptions, RigDocument
 from service.requests.export import AssetFormat, ExportOptions
-from service.requests.imports.layouts import ImportChoices
+from service.requests.import_choices import ImportChoices
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions

@@ -1,37 +1,22 @@
-"""The layouts of `relit import` that make one capture, and their options by name, as a guess proposes them and a person chooses them."""
+"""The requests of the layouts of `relit import` that make one capture, and their options by name, as a guess proposes them."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from service.requests.base.base import Options
 from service.requests.base.options import Option, places_of
+from service.requests.import_choices import Layout
 from service.requests.imports.base import ImportRequest
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport
 from service.requests.imports.patterns import GrayImport, LaserImport, OpencvGrayImport, PhaseImport, ScannerImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
-from stage.model import Line
 
-Layout = Literal["diligent", "lp", "relightlab", "olat", "photos", "near-lights", "opencv-gray", "gray", "phase", "scanner", "tof",
-                 "histogram", "kinect", "laser"]
 LAYOUTS: dict[str, type[ImportRequest]] = dict(zip(get_args(Layout), (
     DiligentImport, LpImport, RelightlabImport, OlatImport, PhotosImport, NearLightsImport, OpencvGrayImport, GrayImport, PhaseImport,
     ScannerImport, TofImport, HistogramImport, KinectImport, LaserImport), strict=True))
 """The request of each layout."""
-
-
-class ImportChoices(Options):
-    """How the files of a capture are laid out, and the options of that import."""
-
-    layout: Layout
-    """The word behind relit import."""
-    file: Line | None = None
-    """The file of the capture that is imported, such as a light list; None: all of them."""
-    options: Annotated[dict[str, Any], Field(default_factory=dict)]
-    """The options of the import by the names of docs/importing.md, with _ for -: {"color_space": "lin_rec709_scene"}. Files are named as
-    in the capture."""
 
 
 class Typed(NamedTuple):

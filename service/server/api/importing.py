@@ -9,9 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from service.errors import sentence
 from service.requests.answers import CaptureFiles, IntakeView, NeededFile, NeededFiles
 from service.requests.base.identifiers import CAPTURE, pattern
-from service.requests.imports.layouts import ImportChoices, leads_out, request_of
+from service.requests.import_choices import ImportChoices
+from service.requests.imports.layouts import leads_out, request_of
 from service.requests.jobs import CheckJob
-from service.server.api.context import FOR_WORK, Reader, Service, ServiceDep, Writer, require_space
+from service.server.api.context import FOR_WORK, Service, ServiceDep, Writer, require_space
 from service.server.api.intakes import begin_check, row_of
 from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
@@ -44,7 +45,7 @@ class FolderListing(BaseModel):
 
 
 @router.post("/needed-files", summary="Say which files of a folder are needed")
-def needed_files(_caller: Reader, listing: Annotated[FolderListing, Body(openapi_examples={"photographs": {
+def needed_files(_caller: Writer, listing: Annotated[FolderListing, Body(openapi_examples={"photographs": {
         "value": {"files": [{"path": "000.png", "length": 90210}, {"path": "lights.txt", "length": 3000}]}}})]) -> NeededFiles:
     """Return the captures that a folder without a capture.json may hold, and the files of each, told from names and lengths alone: so
     nothing else is uploaded. Each is then created, uploaded, and looked at by `guess`."""
