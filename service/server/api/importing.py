@@ -20,7 +20,7 @@ from service.server.base.safe_names import MAX_PATH_BYTES, check_path
 from service.server.database.keys import Caller
 from stage.errors import StageError
 
-router = APIRouter(prefix="/v1/captures", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
+router = APIRouter(prefix="/v1", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 MOST_LISTED = 20_000
 CaptureIdPath = Annotated[str, Path(alias="capture", pattern=pattern(CAPTURE))]
 
@@ -28,7 +28,7 @@ CaptureIdPath = Annotated[str, Path(alias="capture", pattern=pattern(CAPTURE))]
 class ListedFile(BaseModel):
     """A file of a folder that is to be uploaded."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     path: Annotated[str, Field(min_length=1, max_length=MAX_PATH_BYTES)]
     """Below the folder, with / between folders."""
@@ -63,14 +63,14 @@ def needed_files(_caller: Writer, listing: Annotated[FolderListing, Body(openapi
         NeededFile(path=path, name=name, length=lengths[path]) for path, name in needed.files.items()]) for needed in found])
 
 
-@router.post("/{capture}/guess", status_code=202, responses=responses(404, 409, 507), summary="Say what uploaded files seem to be")
+@router.post("/captures/{capture}/guess", status_code=202, responses=responses(404, 409, 507), summary="Say what uploaded files seem to be")
 def guess_capture(service: ServiceDep, caller: Writer, capture: CaptureIdPath) -> IntakeView:
     """Look at the files of a capture that has no capture.json, as `relit import guess` does. While it is `checking` it takes no files; then
     it is `receiving` again, and its fact `proposal` says what the files are and what is to be chosen; or it is `refused`."""
     return _begin(service, caller, CheckJob(kind="check", intake=capture, guess=True), "intake.guess")
 
 
-@router.post("/{capture}/import", status_code=202, responses=responses(404, 409, 507), summary="Import uploaded files as a capture")
+@router.post("/captures/{capture}/import", status_code=202, responses=responses(404, 409, 507), summary="Import uploaded files as a capture")
 def import_capture(service: ServiceDep, caller: Writer, capture: CaptureIdPath, choices: Annotated[ImportChoices, Body(openapi_examples={
         "photographs": {"value": {"layout": "photos", "options": {"color_space": "srgb_texture"}}}})]) -> IntakeView:
     """Write the capture.json of uploaded files, as `relit import` does, and check the capture: it is `ready` then, or `refused`, and can be

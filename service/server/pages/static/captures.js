@@ -102,7 +102,7 @@ async function take(found) {
   if (isCapture(found)) return begin("captures", found.name, found.files);
   try {
     const local = new Map(found.files.map(({ path, file }) => [path, file]));
-    const { captures } = await post("/v1/captures/needed-files",
+    const { captures } = await post("/v1/needed-files",
       { files: found.files.map(({ path, file }) => ({ path, length: file.size })) });
     leftOut(found, captures.flatMap(({ files }) => files));
     return Promise.all(captures.map(({ folder, files }) => begin("captures", folder === "" ? found.name : `${found.name}/${folder}`,

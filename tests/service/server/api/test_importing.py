@@ -21,7 +21,7 @@ def listed(folder: Path) -> list[dict]:
 
 def looked_at(server, client, tus, folder: Path, name: str = "dropped") -> dict:
     """The capture of a folder when the service has looked at its files."""
-    found, = client.post("/v1/captures/needed-files", json={"files": listed(folder)}).raise_for_status().json()["captures"]
+    found, = client.post("/v1/needed-files", json={"files": listed(folder)}).raise_for_status().json()["captures"]
     place = f"/v1/captures/{client.post('/v1/captures', json={'name': name}).raise_for_status().json()['id']}"
     for file in found["files"]:
         tus.send(place, file["name"], (folder / file["path"]).read_bytes())
@@ -66,14 +66,14 @@ def test_what_is_needed_is_told_from_names_and_lengths():
     ([(f"{side}/{number}.png", 9) for side in ("left", "right") for number in range(5)], "two cameras, left and right"),
     ([("a\n<b>.pdf", 1)], "looked for"), ([("../../lights.csv", 1)], "looked for")])
 def test_files_that_fit_nothing_are_told_in_a_sentence(client, files, words):
-    refused(client.post("/v1/captures/needed-files", json={"files": [{"path": path, "length": length} for path, length in files]}), 422,
+    refused(client.post("/v1/needed-files", json={"files": [{"path": path, "length": length} for path, length in files]}), 422,
             words)
 
 
 @pytest.mark.parametrize("name", ["a:b.png", "aux.png", "a\nb.png"])
 def test_a_name_that_cannot_be_stored_is_named_before_anything_is_sent(client, name):
     files = [{"path": path, "length": 9} for path in ("1.png", "2.png", "3.png", name)]
-    refused(client.post("/v1/captures/needed-files", json={"files": files}), 422, name.replace("\n", "\\n"))
+    refused(client.post("/v1/needed-files", json={"files": files}), 422, name.replace("\n", "\\n"))
 
 
 def test_photographs_with_a_table_of_lights_become_a_capture(server, client, tus, tmp_path):
