@@ -2,20 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
 from service.requests.base.options import Option, places_of
-from service.requests.import_choices import Layout
 from service.requests.imports.base import ImportRequest
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport
 from service.requests.imports.patterns import GrayImport, LaserImport, OpencvGrayImport, PhaseImport, ScannerImport
 from service.requests.imports.tof import HistogramImport, KinectImport, TofImport
 
-LAYOUTS: dict[str, type[ImportRequest]] = dict(zip(get_args(Layout), (
-    DiligentImport, LpImport, RelightlabImport, OlatImport, PhotosImport, NearLightsImport, OpencvGrayImport, GrayImport, PhaseImport,
-    ScannerImport, TofImport, HistogramImport, KinectImport, LaserImport), strict=True))
+LAYOUTS: dict[str, type[ImportRequest]] = {
+    "diligent": DiligentImport, "lp": LpImport, "relightlab": RelightlabImport, "olat": OlatImport, "photos": PhotosImport,
+    "near-lights": NearLightsImport, "opencv-gray": OpencvGrayImport, "gray": GrayImport, "phase": PhaseImport, "scanner": ScannerImport,
+    "tof": TofImport, "histogram": HistogramImport, "kinect": KinectImport, "laser": LaserImport}
 """The request of each layout."""
 
 

@@ -2,10 +2,13 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from service.requests.import_choices import Layout
+from service.requests.imports.layouts import LAYOUTS
 from stage.errors import ManifestError
 from tests.scenes.captures import write_image
 from tests.scenes.foreign import LIGHTS, write_four_phases, write_photographs
@@ -38,6 +41,10 @@ def imported(server, client, capture: dict, **choices) -> dict:
 def manifest_of(server, capture: dict) -> dict:
     found, = server.data.glob(f"projects/*/captures/{capture['id']}/capture.json")
     return json.loads(found.read_text())
+
+
+def test_every_layout_that_can_be_chosen_is_imported():
+    assert set(get_args(Layout)) == set(LAYOUTS)
 
 
 def test_what_is_needed_is_told_from_names_and_lengths():
