@@ -25,7 +25,7 @@ from typing import Any
 from service.captures.processes import bare_environment, limit
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.reporting.progress import Progress
-from service.requests.import_choices import ImportChoices
+from service.requests.base.import_choices import ImportChoices
 
 MEMORY_BYTES = 2 << 30
 """Bytes of data that a check may have; the largest capture.json takes a third."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from service.captures.importing import import_files
 from service.requests.base.base import Role
-from service.requests.import_choices import ImportChoices
+from service.requests.base.import_choices import ImportChoices
 from service.requests.imports.layouts import LAYOUTS, options_of_layout, request_of, taken_apart, unsettled
 from stage.capture.manifest import read_manifest, write_manifest
 from stage.errors import ManifestError

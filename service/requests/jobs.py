@@ -7,13 +7,13 @@ from pydantic import Field, TypeAdapter, ValidatorFunctionWrapHandler, WrapValid
 
 from service.requests.base.base import CAPTURE, JobRequest, Role, SequenceOptions, Spelling
 from service.requests.base.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
+from service.requests.base.import_choices import ImportChoices
 from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
 from service.requests.drive import RIG, ChartDocument, DriveOptions, RigDocument
 from service.requests.export import AssetFormat, ExportOptions
-from service.requests.import_choices import ImportChoices
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from service.errors import sentence
 from service.requests.answers import CaptureFiles, IntakeView, NeededFile, NeededFiles
 from service.requests.base.identifiers import CAPTURE, pattern
-from service.requests.import_choices import ImportChoices
+from service.requests.base.import_choices import ImportChoices
 from service.requests.imports.layouts import leads_out, request_of
 from service.requests.jobs import CheckJob
 from service.server.api.context import FOR_WORK, Service, ServiceDep, Writer, require_space
@@ -21,7 +21,8 @@ from service.server.database.keys import Caller
 from stage.errors import StageError
 
 router = APIRouter(prefix="/v1", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
-MOST_LISTED = 20_000
+MOST_LISTED = 5_000
+"""Files of a listing; with the longest names it is as long as a body may be."""
 CaptureIdPath = Annotated[str, Path(alias="capture", pattern=pattern(CAPTURE))]
 
 

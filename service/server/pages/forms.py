@@ -14,8 +14,8 @@ from pydantic.fields import FieldInfo
 
 from service.requests.base.base import Choice, Commas, JobRequest, Role
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.base.import_choices import Layout
 from service.requests.base.options import Option, help_text, is_document, places_of, typed
-from service.requests.import_choices import Layout
 from service.requests.imports.layouts import LAYOUTS, options_of_layout
 from service.requests.jobs import JOBS
 

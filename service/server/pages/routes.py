@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
-from service.requests.import_choices import Layout
+from service.requests.base.import_choices import Layout
 from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))

@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from service.requests.import_choices import Layout
+from service.requests.base.import_choices import Layout
 from service.requests.imports.layouts import LAYOUTS
 from stage.errors import ManifestError
 from tests.scenes.captures import write_image

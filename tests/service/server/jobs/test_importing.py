@@ -6,7 +6,7 @@ import pytest
 
 from service.errors import RequestError
 from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
-from service.requests.import_choices import ImportChoices
+from service.requests.base.import_choices import ImportChoices
 from service.requests.jobs import CheckJob
 from service.server.database import intakes, uploads
 from service.server.jobs.context import Job, WorkerContext
