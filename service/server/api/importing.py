@@ -22,7 +22,7 @@ from stage.errors import StageError
 
 router = APIRouter(prefix="/v1", tags=["captures"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
 MOST_LISTED = 5_000
-"""Files of a listing; with the longest names it is as long as a body may be."""
+"""Files of a listing: more do not fit into a body of JSON, which has at most middleware.MAX_BYTES."""
 CaptureIdPath = Annotated[str, Path(alias="capture", pattern=pattern(CAPTURE))]
 
 
