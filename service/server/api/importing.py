@@ -71,7 +71,8 @@ def guess_capture(service: ServiceDep, caller: Writer, capture: CaptureIdPath) -
     return _begin(service, caller, CheckJob(kind="check", intake=capture, guess=True), "intake.guess")
 
 
-@router.post("/captures/{capture}/import", status_code=202, responses=responses(404, 409, 507), summary="Import uploaded files as a capture")
+@router.post("/captures/{capture}/import", status_code=202, responses=responses(404, 409, 507),
+             summary="Import uploaded files as a capture")
 def import_capture(service: ServiceDep, caller: Writer, capture: CaptureIdPath, choices: Annotated[ImportChoices, Body(openapi_examples={
         "photographs": {"value": {"layout": "photos", "options": {"color_space": "srgb_texture"}}}})]) -> IntakeView:
     """Write the capture.json of uploaded files, as `relit import` does, and check the capture: it is `ready` then, or `refused`, and can be

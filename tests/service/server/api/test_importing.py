@@ -53,7 +53,7 @@ def test_what_is_needed_is_told_from_names_and_lengths():
     photos = {f"p{number}.jpg": 5_000_000 for number in range(9)}
     found, = needed_files({
         **photos, "light_directions.txt": 900, "clip0.mov": 3_200_000_000, "short p0.mov": 9_000_000, ".DS_Store": 6, "notes.pdf": 9,
-                           "raw/.cache/x.jpg": 3, "log.txt": 80 << 20})
+        "raw/.cache/x.jpg": 3, "log.txt": 80 << 20})
     assert (found.folder, sorted(found.files)) == ("", sorted([*photos, "light_directions.txt"]))
     poses = needed_files({f"{pose}/{step}.png": 9 for pose in ("pose2", "pose1") for step in range(4)} | {"calibration.xml": 8, "x.txt": 1})
     assert [each.folder for each in poses] == ["pose1", "pose2"]
