@@ -130,6 +130,42 @@ def test_the_page_can_be_used_by_everybody(owl, page, viewport):
     assert violations(page) == []
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl, page):
+    page.goto(owl[1])
+    picture(page)
+    page.locator("#embed summary").click()
+    code = page.locator("#embed textarea").input_value()
+    bar = page.locator("#scale")
+    length = {"4 cm": 40, "5 cm": 50, "2 cm": 20, "1 cm": 10}[bar.inner_text()]
+    zoom = page.evaluate("document.getElementById('stage').getBoundingClientRect().height") / 320  # the whole height is shown
+    assert bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
+    page.locator("#full").click()
+    page.wait_for_function("document.fullscreenElement?.id === 'stage'")
+    page.keyboard.press("Escape")
+    page.route(f"{owl[1]}museum.html", lambda route: route.fulfill(body=code, content_type="text/html"))
+    page.goto(f"{owl[1]}museum.html")
+    frame = page.frame_locator("iframe")
+    frame.locator("#picture[data-ready='whole']").wait_for()
+    assert frame.locator("h1").count() == 0 or not frame.locator("h1").is_visible()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+def test_two_fingers_zoom(owl, page):
+    page.goto(owl[1])
+    picture(page)
+    box, fingers = page.locator("#picture").bounding_box(), page.context.new_cdp_session(page)
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 80), ("touchEnd", None)):
+        points = [] if apart is None else [{"x": middle[0] + side * apart, "y": middle[1], "id": number}
+                                           for number, side in enumerate((-1, 1))]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.wait_for_function("location.hash.includes('zoom=')")
+    assert float(re.search(r"zoom=([\d.]+)", page.evaluate("location.hash"))[1]) == pytest.approx(2, rel=0.02)  # from 80 to 160 pixels
+
+
 def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):
     context = new_context(browser)
     page = context.new_page()
