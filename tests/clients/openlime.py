@@ -55,8 +55,8 @@ class Shown:
 
 @contextmanager
 def opened(browser: Any, folder: Path, layout: str, *, size: tuple[int, int], scale: float) -> Iterator[Shown]:
-    """Open the folder `owl-planes` in `folder`, with images of `size`, columns and rows, in OpenLIME's `layout`, in a window that is `scale`
-    times as large as they are."""
+    """Open the folder `owl-planes` in `folder`, with images of `size`, columns and rows, in the layout of OpenLIME, in a window that is
+    `scale` times as large as they are."""
     package = installed.openlime()
     [documented] = re.findall(r"```html\n(<div id=\"view\".*?)```", DOCUMENTED.read_text(), re.DOTALL)
     body = "<!doctype html>" + documented.replace('layout: "deepzoom"', f'layout: "{layout}"').replace("</script>", HELPERS)
