@@ -1,9 +1,6 @@
 """The page of relit publish --as web in a browser, from a server of files that knows nothing of Relit."""
 
 import re
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -12,7 +9,7 @@ import pytest
 
 from service.publish.publish import publish
 from service.requests.publish import PublishRequest
-from tests.service.publish.published import shown
+from tests.service.publish.published import Files, served, shown
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
 
@@ -20,20 +17,6 @@ MOST_BYTES = 2_000_000
 """What the page may weigh until its first picture, tiles included."""
 NOTES = ('[{"body": "The beak", "target": "#xywh=145,70,30,50"},'
          ' {"body": "An eye", "target": {"selector": {"type": "PointSelector", "x": 128, "y": 80}}}]')
-
-
-class Files(SimpleHTTPRequestHandler):
-    """Serves files, and counts their bytes."""
-
-    sent = 0
-
-    def copyfile(self, source, outputfile):
-        content = source.read()
-        Files.sent += len(content)
-        outputfile.write(content)
-
-    def log_message(self, *_):
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +27,8 @@ def owl(tmp_path_factory):
     common = {"capture": SAMPLES / "owl", "cache": folder / "cache"}
     publish(PublishRequest(out=folder / "planes", kind="openlime", **common))
     publish(PublishRequest(out=folder / "page", kind="web", annotations=folder / "notes.json", attribution="Relit's sample", **common))
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=folder / "page")) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield folder / "planes", f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    with served(folder / "page") as address:
+        yield folder / "planes", address
 
 
 @pytest.fixture(params=[False])
