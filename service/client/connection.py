@@ -19,7 +19,8 @@ LATER = (429, 503)
 """Statuses of a request that was not carried out, and may be if it is sent again later."""
 PROXY = (502, 504)
 """Statuses of a proxy that got no answer from the service: the request may have been carried out."""
-Answer, Page = TypeVar("Answer", bound=BaseModel), TypeVar("Page", IntakePage, JobPage, ResultPage)
+Answer = TypeVar("Answer", bound=BaseModel)
+Page = TypeVar("Page", IntakePage, JobPage, ResultPage)
 NOT_SENT = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 
 
