@@ -70,11 +70,7 @@ class TwinCamera:
         """Number of releases."""
 
     def release(self, exposure_s: float | None) -> None:
-        """Write the picture of this moment into the folder.
-
-        Args:
-            exposure_s: the exposure time; None: 1.
-        """
+        """Write the picture of this moment into the folder; `exposure_s`: the exposure time; None: 1."""
         with self._lock:
             self.released += 1
             faults = {span.kind for span in self._spans if span.first <= self.released <= (span.last or self.released)}

@@ -35,7 +35,6 @@ class Guess(NamedTuple):
     then: str
     """The command that makes the result."""
 
-
     @property
     def command(self) -> str:
         """The command to run."""
