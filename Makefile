@@ -29,7 +29,8 @@ test-all: $(VENV)/installed-dev
 compiled: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -q --collect-only >/dev/null
 
-# Blender, Mitsuba and three.js, which tests/clients opens assets with; needs Python 3.11 exactly, npm, and Chromium beside it
+# Blender, Mitsuba and three.js, which tests/clients opens assets with; needs Python 3.11 exactly, npm, and Chromium beside it.
+# OpenLIME too, where the registry has it: not all do
 clients: .clients/installed
 
 lint: $(VENV)/installed-dev
@@ -97,12 +98,15 @@ $(VENV)/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit("relit needs Python 3.11 or newer: make PYTHON=python3.11 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV) || (rm -rf $(VENV); echo "the venv module is missing: on Debian, apt-get install python3-venv"; exit 1)
 
+OPENLIME := openlime@1.2.6
 .clients/installed: tests/clients/requirements.lock tests/clients/package-lock.json
 	$(PYTHON) -c 'import sys; sys.exit("bpy needs Python 3.11: make clients PYTHON=python3.11") if sys.version_info[:2] != (3, 11) else None'
 	$(PYTHON) -m venv .clients
 	.clients/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r tests/clients/requirements.lock
 	cp tests/clients/package.json tests/clients/package-lock.json .clients
 	cd .clients && npm ci --silent --no-audit --no-fund
+	cd .clients && npm install --silent --no-audit --no-fund --no-save --ignore-scripts $(OPENLIME) \
+	  || echo "$(OPENLIME) is not to be had from npm's registry here: what relit publish --as openlime writes is not opened with it"
 	touch $@
 
 $(VENV)/installed: requirements.lock pyproject.toml | $(VENV)/bin/python

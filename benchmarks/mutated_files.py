@@ -21,7 +21,6 @@ from stage.capture.manifest import read_manifest
 from stage.colour.environment_maps import check_environment, read_environment
 from stage.colour.radiance import check_radiance
 from stage.formats import exr, images
-from stage.formats.rti import Hsh, Ptm, Quantization, read_hsh, read_ptm, write_hsh, write_ptm
 from stage.importers import lp
 from stage.importers.opencv_file import read_matrices
 from stage.results.maps import SurfaceMaps
@@ -175,11 +174,6 @@ def kinds(folder: Path) -> list[Kind]:
              Kind("shots of a scan", folder / "scan" / "shots.npy", lambda path: read_scan(path.parent))]
     sample = shutil.copy(SAMPLES / "rig" / "capture.json", folder / "rig.json")
     made.append(Kind("capture.json of the sample rig", sample, read_manifest, True))
-    quantization = Quantization(np.ones(6, dtype=np.float32), np.zeros(6, dtype=int))
-    write_ptm(folder / "a.ptm", Ptm(rng.integers(0, 256, (3, 4, 4, 6), dtype=np.uint8), quantization, None))
-    of_four = Quantization(np.ones(4, dtype=np.float32), np.zeros(4, dtype=int))
-    write_hsh(folder / "a.rti", Hsh(rng.integers(0, 256, (3, 4, 4, 4), dtype=np.uint8), of_four))
-    made += [Kind("PTM", folder / "a.ptm", read_ptm), Kind("HSH", folder / "a.rti", read_hsh)]
     for suffix in (".yml", ".xml", ".json"):
         storage = cv2.FileStorage(str(folder / f"camera{suffix}"), cv2.FILE_STORAGE_WRITE)
         storage.write("camera_matrix", np.eye(3))

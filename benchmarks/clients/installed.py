@@ -4,7 +4,7 @@
 
 RELIT_TEST_BLENDER_PYTHON   a Python 3.11 with the package bpy (Blender as a module)
 RELIT_TEST_MITSUBA_PYTHON   a Python with the package mitsuba
-RELIT_TEST_NODE_MODULES     a node_modules folder with three and gltf-validator
+RELIT_TEST_NODE_MODULES     a node_modules folder with three and gltf-validator, and with openlime where the package registry has it
 RELIT_TEST_CHROMIUM         the browser
 """
 
@@ -50,6 +50,19 @@ def node_modules() -> Path:
         raise MissingClientError(f"three.js is missing: no {folder / 'three'}; `make clients` installs it, "
                                  "RELIT_TEST_NODE_MODULES names another folder")
     return folder
+
+
+def openlime() -> Path:
+    """Return the module of OpenLIME for browsers.
+
+    Raises:
+        MissingClientError: it is missing.
+    """
+    file = Path(os.environ.get("RELIT_TEST_NODE_MODULES", HOME / "node_modules")) / "openlime" / "dist" / "js" / "openlime.esm.js"
+    if not file.exists():
+        raise MissingClientError(f"OpenLIME is missing: no {file}; `make clients` installs it where npm's registry has the package "
+                                 "openlime, RELIT_TEST_NODE_MODULES names another folder")
+    return file
 
 
 def browser() -> str:

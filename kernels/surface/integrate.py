@@ -123,11 +123,7 @@ def integrate_normals(
 
 
 def cut_edges(weights: EdgeWeights, cuts: Iterable[np.ndarray], *, grid: Grid) -> None:
-    """Take edges away, in place.
-
-    Args:
-        cuts: [rows, cols] bool, edges to the right and edges down.
-    """
+    """Take edges away, in place; `cuts`: [rows, cols] bool, edges to the right and edges down."""
     for plane, cut in zip((weights.right, weights.down), cuts, strict=True):
         kept = plane.numpy()
         kept[: grid.pitch * (grid.rows + 2)].reshape(-1, grid.pitch)[1 : grid.rows + 1, 1 : grid.cols + 1][cut] = 0

@@ -106,8 +106,7 @@ class Acquisition:
         self.judge = Judge(self.rig)
         self.faults: dict[str, list[Fault]] = {}
         """The faults of each shot's picture, or of its absence, by the key of the shot."""
-        self.retaken: list[Fault] = []
-        """The faults of pictures that were taken again, and of pictures that came late."""
+        self.retaken: list[Fault] = []  # the faults of pictures that were taken again, and of pictures that came late
         self._own: list[float] = []
         self._receivers: list[Receiver] = []
 
@@ -144,11 +143,11 @@ class Acquisition:
                 else:
                     self._review(lights, stopping)
             finally:
-                self._close(lights)
+                settings = self._close(lights)
             if len(self.journal.taken) == len(self.shots):
                 receiving.pop_all()
         faults = tuple(fault for found in self.faults.values() for fault in found)
-        self._report(faults)
+        self._report(faults, settings)
         return AcquireResult(self._request.out, len(self._own), len(self.journal.taken), len(self.shots), faults, tuple(self.retaken),
                              tuple(self._own))
 
@@ -314,21 +313,22 @@ class Acquisition:
         for fault in self.judge.review():
             self.faults[fault.shot] = [fault]
 
-    def _close(self, lights: Lights | None) -> None:
-        try:
-            if lights is not None:
-                lights.close()
-        finally:
+    def _close(self, lights: Lights | None) -> Mapping[str, str]:
+        """Turn the lamps dark, end the projector's page, and let go of the camera; return the settings that it told."""
+        with ExitStack() as closing:
+            closing.callback(self._camera.close)
             if self._projector is not None:
-                self._projector.close()
-            self._camera.close()
+                closing.callback(self._projector.close)
+            if lights is not None:
+                closing.callback(lights.close)
+            return self._camera.settings  # a question would open a closed camera anew, or find nothing
 
-    def _report(self, faults: tuple[Fault, ...]) -> None:
+    def _report(self, faults: tuple[Fault, ...], settings: Mapping[str, str]) -> None:
         """Write report.json of the capture."""
         missing = [shot.key for shot in self.shots if shot.key not in self.journal.taken]
         own = {"median": round(1e3 * float(np.median(self._own)), 1)} if self._own else {}
         inputs = {} if (rig := self._request.rig) is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
-        text = report(self._request, inputs=inputs, rig=self.rig.name, camera_settings=self._camera.settings, shots=len(self.shots),
+        text = report(self._request, inputs=inputs, rig=self.rig.name, camera_settings=settings, shots=len(self.shots),
                       pictures=len(self.journal.taken), missing=missing, faults=[fault._asdict() for fault in faults],
                       retaken=[fault._asdict() for fault in self.retaken], own_ms=own, projector_response=self.patterns.entry(),
                       seconds=self._timings.close())

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from service.boards.stitching.comparison import Deviation
-from service.boards.stitching.grid import BoardGrid
+from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import RegionResult
 from service.boards.stitching.significance import Scan, grown, mean_of, region_of, weighted_centre
 
@@ -47,7 +46,7 @@ class Defect(NamedTuple):
     volume_m3: float
 
 
-def find_defects(deviation: Deviation, scan: Scan, tolerance_m: np.ndarray) -> tuple[list[Defect], np.ndarray]:
+def find_defects(deviation: HeightMap, scan: Scan, tolerance_m: np.ndarray) -> tuple[list[Defect], np.ndarray]:
     """Return the significant areas, the most significant first, and their pixels, [rows, cols] bool.
 
     Areas to one side that are nearer to each other than two smallest windows are one. An area whose own mean is not significant, because
@@ -69,14 +68,14 @@ def find_defects(deviation: Deviation, scan: Scan, tolerance_m: np.ndarray) -> t
     return sorted(found, key=lambda defect: -defect.significance), taken
 
 
-def _region(deviation: Deviation, scan: Scan, box: tuple[slice, slice], part: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
+def _region(deviation: HeightMap, scan: Scan, box: tuple[slice, slice], part: np.ndarray) -> tuple[tuple[slice, slice], np.ndarray]:
     """Return the whole area that a significant part of a box belongs to: the rows and columns of a box around it, and its pixels there."""
     rows, cols = scan.side.shape
     grow = 2 * scan.sides_px[-1]
     while True:
         where = (slice(max(box[0].start - grow, 0), min(box[0].stop + grow, rows)),
                  slice(max(box[1].start - grow, 0), min(box[1].stop + grow, cols)))
-        cut = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
+        cut = deviation.cut(where)
         top, left = box[0].start - where[0].start, box[1].start - where[1].start
         inside = np.zeros(cut.height.shape, dtype=bool)
         inside[top : top + part.shape[0], left : left + part.shape[1]] = part
@@ -87,9 +86,9 @@ def _region(deviation: Deviation, scan: Scan, box: tuple[slice, slice], part: np
         grow *= 4
 
 
-def _defect(deviation: Deviation, scan: Scan, tolerance_m: np.ndarray, where: tuple[slice, slice], pixels: np.ndarray) -> Defect | None:
+def _defect(deviation: HeightMap, scan: Scan, tolerance_m: np.ndarray, where: tuple[slice, slice], pixels: np.ndarray) -> Defect | None:
     """Return what is said of some pixels of a box; None of no pixel."""
-    cut = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
+    cut = deviation.cut(where)
     factor = max(value for side, value in scan.spread.items() if side == scan.sides_px[0] or side * side <= pixels.sum())
     mean = mean_of(cut, pixels, spread=factor)
     if mean is None:

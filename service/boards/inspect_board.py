@@ -15,7 +15,7 @@ from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, 
 from service.boards.height_files import BOARD_FILE, Nominal, read_design, read_golden, write_board
 from service.boards.inspection_picture import PICTURE_FILE, write_picture
 from service.boards.matching import Match, check_size, match
-from service.boards.stitching.comparison import Deviation, Form, bow_and_twist, compare, fit_form
+from service.boards.stitching.comparison import Form, bow_and_twist, compare, fit_form
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
 from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
@@ -64,7 +64,7 @@ class _Judged(NamedTuple):
 
     nominal: Nominal
     match: Match
-    deviation: Deviation
+    deviation: HeightMap
     bow_m: float
     wanted: np.ndarray  # [rows, cols] bool: pixels with a nominal height
     inspected: np.ndarray  # [rows, cols] bool
@@ -163,12 +163,12 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     tolerance = tolerances_over(grid, nominal.regions, elsewhere_m=request.tolerance_m)
     scan = scan_windows(deviation, tolerance_m=tolerance, false_alarm=request.false_alarm / 2, smallest_px=smallest)
     wanted = nominal.heights.measured
-    inspected = wanted & deviation.known & np.isfinite(scan.mean_sigma)
+    inspected = wanted & deviation.measured & np.isfinite(scan.mean_sigma)
     if request.must_find_m is not None:
         inspected &= np.nan_to_num(scan.findable, nan=np.inf) <= request.must_find_m
     defects, significant = find_defects(deviation, scan, tolerance)
     scan = scan._replace(significant=significant)
-    inspected |= wanted & significant & deviation.known
+    inspected |= wanted & significant & deviation.measured
     regions, k = check_regions(deviation, nominal.regions, false_alarm=request.false_alarm / 2)
     return heights, _Judged(nominal, found, deviation, bow_and_twist(curved, grid), wanted, inspected, scan, defects, regions, k,
                             _verdict(defects, regions, inspected, wanted, request))
@@ -192,7 +192,7 @@ def _share(judged: _Judged) -> float:
 def _write_deviation(path: Path, judged: _Judged, provenance: dict[str, str]) -> None:
     """Write deviation.exr: deviation, σ, score, mask (inspected) and defect (1 in significant areas), 0 where nothing is known."""
     deviation, scan = judged.deviation, judged.scan
-    known = deviation.known
+    known = deviation.measured
     layers: dict[str, np.ndarray] = {"deviation.Z": deviation.height, "sigma.Z": deviation.sigma, "score.Y": np.where(known, scan.score, 0)}
     channels = {name: np.where(known, values, 0).astype(np.float32) for name, values in layers.items()}
     exr.write(path, {**channels, "mask.Y": judged.inspected.astype(np.float16), "defect.Y": scan.significant.astype(np.float16)},
@@ -227,7 +227,7 @@ def _stitching(board: BoardTiles, stitched: Stitched) -> dict[str, Any]:
 def _comparison(judged: _Judged, area_count: int) -> dict[str, Any]:
     """Return what the report says about the comparison with the nominal heights."""
     scan, found = judged.scan, judged.match
-    known = judged.deviation.known
+    known = judged.deviation.measured
     return {
         "nominal": judged.nominal.name, "verdict": str(judged.verdict),
         "registration": {"evidence": str(found.evidence), "shift_m": [float(f"{value:.4g}") for value in found.motion[:2]],

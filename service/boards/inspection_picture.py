@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from service.boards.findings import Defect
-from service.boards.stitching.comparison import Deviation
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import RegionResult, Verdict
 from service.relight.sheet import fit, write_sheet
@@ -22,7 +21,7 @@ SPAN_SIGMA = 6.0
 """The least deviation, in median σ, that has the full colour."""
 
 
-def write_picture(path: Path, heights: HeightMap, deviation: Deviation | None, inspected: np.ndarray | None, wanted: np.ndarray | None,
+def write_picture(path: Path, heights: HeightMap, deviation: HeightMap | None, inspected: np.ndarray | None, wanted: np.ndarray | None,
                   defects: Sequence[Defect], regions: Sequence[RegionResult]) -> None:
     """Write the panels as one PNG.
 
@@ -35,8 +34,8 @@ def write_picture(path: Path, heights: HeightMap, deviation: Deviation | None, i
     shown = np.where(heights.measured[..., None], grey[..., None] * np.ones(3), OUTSIDE)
     panels = [(f"height, {1e6 * low:.4g} to {1e6 * high:.4g} µm", shown)]
     if deviation is not None and inspected is not None and wanted is not None:
-        span = max([abs(defect.peak_m) for defect in defects] + [SPAN_SIGMA * float(np.median(deviation.sigma[deviation.known]))])
-        panels.append((f"deviation, {-1e6 * span:.3g} to {1e6 * span:.3g} µm", _signed(deviation.height / span, deviation.known)))
+        span = max([abs(defect.peak_m) for defect in defects] + [SPAN_SIGMA * float(np.median(deviation.sigma[deviation.measured]))])
+        panels.append((f"deviation, {-1e6 * span:.3g} to {1e6 * span:.3g} µm", _signed(deviation.height / span, deviation.measured)))
         panels.append((f"{len(defects)} defects; yellow: not inspected or undecided",
                        _verdicts(deviation.grid, inspected, wanted, defects, regions)))
     write_sheet(path, [[(title, _reduced(np.nan_to_num(image).astype(np.float32))) for title, image in panels]], height=TILE_PX)

@@ -54,11 +54,7 @@ class Sender:
         self._thread.start()
 
     def send(self, name: str, *, new: bool) -> None:
-        """Send a file of the capture, when those before it are sent; returns at once.
-
-        Args:
-            new: whether it was taken in this run.
-        """
+        """Send a file of the capture, when those before it are sent; returns at once. `new`: whether it was taken in this run."""
         self._new = self._new or new
         self._waiting.put(name)
 

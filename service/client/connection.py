@@ -3,19 +3,24 @@
 import random
 import secrets
 import time
+from collections.abc import Iterator
 from email.utils import parsedate_to_datetime
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 import httpx2
+from pydantic import BaseModel
 
 from service.client.errors import ClientError, Unreachable, refusal
+from service.requests.answers import IntakePage, JobPage, ResultPage
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 LATER = (429, 503)
 """Statuses of a request that was not carried out, and may be if it is sent again later."""
 PROXY = (502, 504)
 """Statuses of a proxy that got no answer from the service: the request may have been carried out."""
+Answer = TypeVar("Answer", bound=BaseModel)
+Page = TypeVar("Page", IntakePage, JobPage, ResultPage)
 NOT_SENT = (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout)
 
 
@@ -93,6 +98,18 @@ class Connection:
             if (answer.status_code in LATER or (repeatable and answer.status_code in PROXY)) and backoff.wait(retry_after(answer)):
                 continue
             raise refusal(answer)
+
+    def ask(self, kind: type[Answer], method: str, path: str, **options: Any) -> Answer:
+        """Send a request as `send` does, and return its answer as the model `kind`."""
+        return kind.model_validate_json(self.send(method, path, **options).content)
+
+    def pages(self, kind: type[Page], path: str, cursor: str, **params: Any) -> Iterator[Page]:
+        """Yield the pages of a listing, each a `kind` whose `next` is the value of the parameter `cursor` for the page after it."""
+        page = self.ask(kind, "GET", path, params=params)
+        yield page
+        while (place := page.next) is not None:
+            page = self.ask(kind, "GET", path, params={**params, cursor: place})
+            yield page
 
     def unreachable(self, error: Exception, *, unknown: bool = False) -> Unreachable:
         """Return the error for a service that does not answer; `unknown`: the request may have been carried out all the same."""

@@ -15,21 +15,19 @@ class Hooks:
 
     def create(self, wanted: NewHook) -> NewHookView:
         """Create a hook, and return it with its secret, which is not shown again."""
-        answer = self._connection.send("POST", PATH, json=wanted.model_dump(mode="json"), repeatable=False)
-        return NewHookView.model_validate_json(answer.content)
+        return self._connection.ask(NewHookView, "POST", PATH, json=wanted.model_dump(mode="json"), repeatable=False)
 
     def all(self) -> list[HookView]:
         """Return the hooks of the project, the oldest first."""
-        return HookList.model_validate_json(self._connection.send("GET", PATH).content).hooks
+        return self._connection.ask(HookList, "GET", PATH).hooks
 
     def get(self, hook: str) -> HookView:
         """Return one hook."""
-        return HookView.model_validate_json(self._connection.send("GET", self._connection.path(PATH, hook)).content)
+        return self._connection.ask(HookView, "GET", self._connection.path(PATH, hook))
 
     def test(self, hook: str) -> DeliveryView:
         """Queue a delivery of the type hook.test; `get` tells what came of it."""
-        answer = self._connection.send("POST", f"{self._connection.path(PATH, hook)}/test", repeatable=False)
-        return DeliveryView.model_validate_json(answer.content)
+        return self._connection.ask(DeliveryView, "POST", f"{self._connection.path(PATH, hook)}/test", repeatable=False)
 
     def delete(self, hook: str) -> None:
         """Delete a hook; what waits is not sent any more."""

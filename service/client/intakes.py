@@ -78,9 +78,8 @@ class Intakes:
 
         `token` is the Idempotency-Key; None: a new one.
         """
-        answer = self._connection.send("POST", self._path, json={"name": name, **({} if path is None else {self._source: path})},
-                                       headers={"Idempotency-Key": token or self._connection.new_token()})
-        return IntakeView.model_validate_json(answer.content)
+        return self._connection.ask(IntakeView, "POST", self._path, json={"name": name, **({} if path is None else {self._source: path})},
+                                    headers={"Idempotency-Key": token or self._connection.new_token()})
 
     def send(self, intake: str, files: list[tuple[Path, str]]) -> None:
         """Send files to an intake that receives them; bytes that the server has are not sent twice, and a file of a path replaces another.
@@ -95,7 +94,7 @@ class Intakes:
     def validate(self, intake: str) -> IntakeView:
         """End the upload and begin the check; an intake that is being checked or is ready does not change."""
         try:
-            return IntakeView.model_validate_json(self._connection.send("POST", f"{self._at(intake)}/validate").content)
+            return self._connection.ask(IntakeView, "POST", f"{self._at(intake)}/validate")
         except Conflict:
             found = self.get(intake)
             if found.state == RECEIVING:
@@ -114,17 +113,12 @@ class Intakes:
 
     def get(self, intake: str) -> IntakeView:
         """Return one capture or environment."""
-        return IntakeView.model_validate_json(self._connection.send("GET", self._at(intake)).content)
+        return self._connection.ask(IntakeView, "GET", self._at(intake))
 
     def all(self) -> Iterator[IntakeView]:
         """Iterate over all captures or environments of the project, the newest first."""
-        before: str | None = None
-        while True:
-            answer = self._connection.send("GET", self._path, params={} if before is None else {"before": before})
-            page = IntakePage.model_validate_json(answer.content)
+        for page in self._connection.pages(IntakePage, self._path, "before"):
             yield from page.items
-            if (before := page.next) is None:
-                return
 
     def delete(self, intake: str) -> None:
         """Delete one that no queued or running job reads; files that were registered stay where they lie."""

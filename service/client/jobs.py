@@ -34,23 +34,17 @@ class Jobs:
 
         The same request with the same token (Idempotency-Key) returns the same job; None: a new job.
         """
-        answer = self._connection.send("POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
-                                       headers={"Idempotency-Key": token or self._connection.new_token()})
-        return JobView.model_validate_json(answer.content)
+        return self._connection.ask(JobView, "POST", PATH, json=request.model_dump(mode="json", by_alias=True, exclude_defaults=True),
+                                    headers={"Idempotency-Key": token or self._connection.new_token()})
 
     def get(self, job: str) -> JobView:
         """Return one job."""
-        return JobView.model_validate_json(self._connection.send("GET", self._at(job)).content)
+        return self._connection.ask(JobView, "GET", self._at(job))
 
     def all(self, states: Sequence[JobState] = ()) -> Iterator[JobView]:
         """Iterate over the jobs of the project, the newest first; if `states` are given, over the jobs in one of them."""
-        before: str | None = None
-        while True:
-            answer = self._connection.send("GET", PATH, params={"state": list(states)} | ({} if before is None else {"before": before}))
-            page = JobPage.model_validate_json(answer.content)
+        for page in self._connection.pages(JobPage, PATH, "before", state=list(states)):
             yield from page.jobs
-            if (before := page.next) is None:
-                return
 
     def follow(self, job: str) -> Iterator[JobView]:
         """Yield the job now, and again after every change, until it has ended."""
@@ -84,7 +78,7 @@ class Jobs:
 
     def prioritise(self, job: str, priority: int) -> JobView:
         """Change the priority of a queued job; higher priorities go first."""
-        return JobView.model_validate_json(self._connection.send("PATCH", self._at(job), json={"priority": priority}).content)
+        return self._connection.ask(JobView, "PATCH", self._at(job), json={"priority": priority})
 
     def delete(self, job: str) -> None:
         """Delete a job that has ended, and its results."""
@@ -92,14 +86,7 @@ class Jobs:
 
     def results(self, job: str) -> list[ResultView]:
         """Return the files that a job has made so far, by name."""
-        after: str | None = None
-        found: list[ResultView] = []
-        while True:
-            answer = self._connection.send("GET", f"{self._at(job)}/results", params={} if after is None else {"after": after})
-            page = ResultPage.model_validate_json(answer.content)
-            found += page.results
-            if (after := page.next) is None:
-                return found
+        return [file for page in self._connection.pages(ResultPage, f"{self._at(job)}/results", "after") for file in page.results]
 
     def download(self, job: str, folder: Path, *, names: Sequence[str] | None = None, progress: Progress | None = None) -> list[Path]:
         """Download results, several files at once, and return their paths by name; an interrupted download is continued.
@@ -119,7 +106,7 @@ class Jobs:
                             parallel=self._parallel)
 
     def _act(self, job: str, action: str) -> JobView:
-        return JobView.model_validate_json(self._connection.send("POST", f"{self._at(job)}/{action}", repeatable=False).content)
+        return self._connection.ask(JobView, "POST", f"{self._at(job)}/{action}", repeatable=False)
 
     def _at(self, job: str) -> str:
         return self._connection.path(PATH, job)
@@ -143,7 +130,7 @@ def follow(connection: Connection, job: str) -> Iterator[JobView]:
         if last is not before:
             pause = FIRST_PAUSE_S
             continue
-        view = JobView.model_validate_json(connection.send("GET", job).content)  # its error also says why there are no events
+        view = connection.ask(JobView, "GET", job)  # its error also says why there are no events
         if last is None or view.revision > last.revision:
             last = view
             yield view

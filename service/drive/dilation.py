@@ -32,12 +32,7 @@ class Dilated(NamedTuple):
 
 
 def dilate(level: np.ndarray, rig: Rig) -> Dilated:
-    """Return the levels with what is above 1 given to neighbours.
-
-    Args:
-        level: [frames, emitters] float64, 0 or more.
-        rig: its lamps.
-    """
+    """Return the levels with what is above 1 given to neighbours; `level`: [frames, emitters] float64, 0 or more; `rig`: its lamps."""
     result, radius, left = np.minimum(level, 1.0), np.zeros(len(level)), np.zeros((len(level), 3))
     irradiance = np.array([primary.irradiance for _, primary in rig.emitters])
     lamp = np.array([index for index, _ in rig.emitters])

@@ -209,8 +209,9 @@ def _free_directions(sample: Sample, given: Fit) -> Explanation | None:
     left out. A misfit is compared relative to the bright readings of each pixel, because |b| is not defined.
     """
     readings = grey_readings(sample.radiance, sample.irradiance)
-    top = np.maximum(bright_readings(readings, sample.usable), TINY)
-    readings = readings / top
+    bright = bright_readings(readings, sample.usable)
+    top = np.maximum(bright, TINY)
+    readings = np.where(bright > 0, readings / top, 0)  # few lights reach some of the background, as the codes of a JPEG file have it
     lit = sample.usable & (readings > SHADOW)
     enough = lit.sum(axis=0) >= MIN_READINGS_FREE
     if enough.mean() < MIN_PART:

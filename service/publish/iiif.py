@@ -25,6 +25,8 @@ from stage.files import write_text
 from stage.results.light_basis import numbers
 
 MANIFEST_FILE = "manifest.json"
+FACTS = {"relit:version": "Version", "relit:inputs": "Inputs", "relit:ocio": "Colour configuration"}
+"""The entries of the provenance that the manifest has, and their labels."""
 SMALL_SIDE = 1024
 """The longest side of images that are there whole."""
 THUMBNAIL_SIDE = 256
@@ -154,7 +156,7 @@ def _manifest(images: _Images, canvases: list[tuple[str, list[_Picture]]], sourc
     url = (request.url or "").rstrip("/")
     camera = source.capture.camera
     facts = {"Capture": source.capture.name, "Lights": str(source.stack.light_count), **{
-        name.partition(":")[2].capitalize(): text for name, text in source.provenance.items() if name in ("relit:version", "relit:inputs")}}
+        FACTS[name]: text for name, text in source.provenance.items() if name in FACTS}}
     service = [] if camera.pixel_size_m is None else [{
         "@context": "http://iiif.io/api/annex/services/physdim/1/context.json", "@id": f"{url}/physical-dimensions",
         "@type": "PhysicalDimensions", "profile": "http://iiif.io/api/annex/services/physdim",

@@ -56,6 +56,7 @@ class PictureFormat(Choice):
 
     EXR = "exr", "scene-linear floating point"
     PNG = "png", "8 bits, sRGB"
+    CARD = "card", "one JPEG that shows the lamps as they are now: the card of libgphoto2's virtual camera"
 
 
 class PictureFault(Choice):
@@ -93,7 +94,8 @@ class TwinRequest(ReviewOptions, DrivenOptions, PixelOptions, Request):
     record: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FILE.csv")] = None
     """Write the levels of all frames that are received, a line for each."""
     pictures: Annotated[Path | None, Role.OUTPUT, Spelling(metavar="FOLDER")] = None
-    """Be a camera too: write a picture into this folder at each POST to /release of the page, which may have ?exposure_s=."""
+    """Be a camera too: write a picture into this folder at each POST to /release of the page, which may have ?exposure_s=; with the format
+    `card`, whenever a frame comes."""
     picture_format: PictureFormat = PictureFormat.EXR
     """The format of these pictures."""
     noise: NotNegative = 0.0

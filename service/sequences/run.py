@@ -151,7 +151,8 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
     if len(methods) > 1:
         warnings.append("the steps are not of one method: " + ", ".join(f"{method} from {name} on" for method, name in methods.items())
                         + ": give the method")
-    write_sequence(_with_results(sequence, request.out), request.out / SEQUENCE_FILE)
+    results = sequence._replace(steps=tuple(step._replace(folder=request.out / step.name) for step in sequence.steps))
+    write_sequence(results, request.out / SEQUENCE_FILE)
     report_path = request.out / REPORT_FILE
     write_text(report_path, report(
         request,
@@ -164,9 +165,3 @@ def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Calla
     ))
     return SequenceResult(request.out / SEQUENCE_FILE, report_path, tuple(step.name for step in sequence.steps), kept,
                           agreed / compared if compared else 0.0, solved, tuple(warnings))
-
-
-def _with_results(sequence: Sequence, out: Path) -> Sequence:
-    """Return the sequence of the results."""
-    return sequence._replace(steps=tuple(step._replace(folder=out / step.name) for step in sequence.steps))
-

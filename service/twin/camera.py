@@ -1,7 +1,13 @@
-"""The camera of the twin: a picture in a folder for each release, as a tethering program writes it, with noise, and faults on request."""
+"""The camera of the twin: a picture in a folder for each release, as a tethering program writes it, with noise, and faults on request; or
+one picture that is always that of this moment, which libgphoto2's virtual camera takes."""
 
 import re
+import tempfile
 import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,13 +15,14 @@ import numpy as np
 from scipy import ndimage
 
 from service.errors import RequestError
-from service.requests.play import PictureFault, TwinRequest
+from service.requests.play import PictureFault, PictureFormat, TwinRequest
 from service.twin.listener import Listener
 from service.twin.picture import TwinPicture
 from stage.colour.colour import convert
+from stage.errors import storage
 from stage.files import replacing
 from stage.formats import exr
-from stage.formats.images import write_png
+from stage.formats.images import write_jpeg, write_png
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import Rig
 
@@ -28,6 +35,12 @@ BLUR_PX = 2.0
 AMBIENT = 0.2
 """The light that is not the rig's, over that of all lamps at their share of full level."""
 OVEREXPOSED = 16.0
+CARD_FILE = "TWIN.JPG"
+CARD_QUALITY = 98
+CARD_POLL_S = 0.5
+"""The longest time after which a card whose twin has ended is not written any more."""
+CARD_HEADER_BYTES = 4096
+"""The room for tables of a JPEG, beside three bytes for each pixel."""
 
 
 class FaultSpan(NamedTuple):
@@ -40,11 +53,15 @@ class FaultSpan(NamedTuple):
 
 
 class TwinCamera:
-    """Writes a picture of what the lamps show at each release."""
+    """Writes pictures of what the lamps show."""
 
     def __init__(self, rig: Rig, picture: TwinPicture, listener: Listener, folder: Path, request: TwinRequest) -> None:
         self._rig, self._picture, self._listener, self._folder = rig, picture, listener, folder
         self._gain, self._noise, self._suffix = 2.0**request.exposure, request.noise, f".{request.picture_format}"
+        self.card = request.picture_format is PictureFormat.CARD
+        """Whether there is one picture, which is always that of this moment, and none is released."""
+        self.on_card = -1
+        """The number of the frame that the card shows."""
         self._spans = fault_spans(request.faults)
         self._random = np.random.default_rng(request.seed)
         self._lock = threading.Lock()
@@ -53,11 +70,7 @@ class TwinCamera:
         """Number of releases."""
 
     def release(self, exposure_s: float | None) -> None:
-        """Write the picture of this moment into the folder.
-
-        Args:
-            exposure_s: the exposure time; None: 1.
-        """
+        """Write the picture of this moment into the folder; `exposure_s`: the exposure time; None: 1."""
         with self._lock:
             self.released += 1
             faults = {span.kind for span in self._spans if span.first <= self.released <= (span.last or self.released)}
@@ -70,6 +83,28 @@ class TwinCamera:
             threading.Timer(LATE_S, self._write, [path, pixels]).start()
         elif PictureFault.DROPPED not in faults:
             self._write(path, pixels)
+
+    def keep_card(self, stop: threading.Event) -> None:
+        """Write the picture of this moment over the one on the card at each frame that comes, until an event, as a JPEG of one size.
+
+        The virtual camera looks at the size of its card's file when it is opened, and reads so many bytes at each release; what follows
+        the end of a JPEG is ignored.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        path = self._folder / CARD_FILE
+        while not stop.is_set():
+            number = self._listener.last.number
+            if number != self.on_card:
+                pixels = self._pixels(set(), 1.0)
+                with storage("write", path), tempfile.TemporaryDirectory(prefix="relit-twin-") as folder:
+                    picture = Path(folder) / CARD_FILE
+                    write_jpeg(picture, self._codes(pixels), CARD_QUALITY, subsampled=False)
+                    with replacing(path, flush=False) as temporary:
+                        temporary.write_bytes(picture.read_bytes().ljust(pixels.size + CARD_HEADER_BYTES, b"\0"))
+                self.on_card = number
+            self._listener.wait(number + 1, time.monotonic() + CARD_POLL_S)
 
     def _pixels(self, faults: set[PictureFault], exposure: float) -> np.ndarray:
         """Return the picture, [rows, cols, 3] float32, full scale 1."""
@@ -94,8 +129,30 @@ class TwinCamera:
             if path.suffix == ".exr":
                 exr.write(temporary, {name: pixels[..., c] for c, name in enumerate("RGB")}, color_space=self._picture.space, metadata={})
             else:
-                encoded = convert(np.maximum(pixels, 0), self._picture.space, "srgb_texture")
-                write_png(temporary, np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8), srgb=True)
+                write_png(temporary, self._codes(pixels), srgb=True)
+
+    def _codes(self, pixels: np.ndarray) -> np.ndarray:
+        """Return a picture as a camera encodes it, [rows, cols, 3] uint8."""
+        encoded = convert(np.maximum(pixels, 0), self._picture.space, "srgb_texture")
+        return np.asarray(np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8))
+
+
+@contextmanager
+def card_kept(camera: TwinCamera | None) -> Iterator[None]:
+    """Keep the picture on the card of a camera, if it has one, from a thread until the block ends; it is there when the block begins."""
+    if camera is None or not camera.card:
+        yield
+        return
+    stop = threading.Event()
+    with ThreadPoolExecutor(1, thread_name_prefix="relit-card") as pool:
+        keeping = pool.submit(camera.keep_card, stop)
+        while camera.on_card < 0 and not keeping.done():
+            time.sleep(CARD_POLL_S / 100)
+        try:
+            yield
+        finally:
+            stop.set()
+    keeping.result()
 
 
 def fault_spans(given: tuple[str, ...]) -> list[FaultSpan]:

@@ -34,7 +34,7 @@ def serve_page(listening: socket.socket, rig: Rig, listener: Listener, picture: 
 
 
 def make_app(rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCamera | None = None) -> FastAPI:
-    """Return the app of the page; with a camera, a POST to /release takes a picture."""
+    """Return the app of the page; with a camera that has no card, a POST to /release takes a picture."""
     app = FastAPI(title="Relit twin", docs_url=None, redoc_url=None, openapi_url=None)
     app.mount("/static", StaticFiles(directory=STATIC))
     lamps = np.array([index for index, _ in rig.emitters])
@@ -72,7 +72,7 @@ def make_app(rig: Rig, listener: Listener, picture: TwinPicture, camera: TwinCam
             picture.write(path, levels, most_rows=PICTURE_ROWS)
             return Response(path.read_bytes(), media_type="image/png", headers=HEADERS)
 
-    if camera is not None:
+    if camera is not None and not camera.card:
         @app.post("/release")
         def release(exposure_s: Annotated[float | None, Query(gt=0, allow_inf_nan=False)] = None) -> dict[str, int]:
             camera.release(exposure_s)

@@ -14,8 +14,8 @@ from service.errors import RequestError
 from service.play.addresses import driven_universes, with_protocol
 from service.play.play import Prepared, prepare, run
 from service.reporting.progress import Progress, Timings
-from service.requests.play import PlayRequest, TwinRequest
-from service.twin.camera import TwinCamera, fault_spans
+from service.requests.play import PictureFormat, PlayRequest, TwinRequest
+from service.twin.camera import TwinCamera, card_kept, fault_spans
 from service.twin.fixtures import UniverseId
 from service.twin.listener import ANY, Listener
 from service.twin.local_page import page_address, page_socket
@@ -60,7 +60,8 @@ def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
         raise RequestError(f"--snapshot {request.snapshot}: end the name in {' or '.join(PICTURES)}")
     if request.pictures is not None and (request.snapshot or request.frames or request.after):
         raise RequestError("--pictures needs the page: leave out --snapshot, --frames and --after")
-    fault_spans(request.faults)
+    if fault_spans(request.faults) and request.picture_format is PictureFormat.CARD:
+        raise RequestError("--faults counts releases, and the twin sees none with --picture-format card: leave it out")
     rig = with_protocol(read_rig(request.rig), request.protocol)
     universes = driven_universes(request.rig, rig).keys()
     player = None
@@ -93,7 +94,8 @@ def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None],
             with _playing(player):
                 if page is not None:
                     camera = None if request.pictures is None else TwinCamera(rig, picture, listener, request.pictures, request)
-                    serve_page(page, rig, listener, picture, camera)
+                    with card_kept(camera):
+                        serve_page(page, rig, listener, picture, camera)
                 else:
                     listener.wait(most, None if request.after is None else time.monotonic() + request.after)
         except KeyboardInterrupt:

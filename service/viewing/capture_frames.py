@@ -19,6 +19,7 @@ from stage.capture.manifest import LIT_BY, Frame
 from stage.colour.colour import convert, pixels_of
 from stage.errors import ImageError, StageError, storage
 from stage.files import replacing
+from stage.formats.images import write_jpeg
 from stage.results.light_basis import numbers
 from stage.stack.correction import Correction
 from stage.stack.ingest import BYTES_PER_PIXEL, DECODE_BYTES
@@ -220,7 +221,7 @@ def write_thumbnails(path: Path, found: CaptureImages, space: str) -> list[list[
     bytes_ = np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)
     for quality in QUALITIES:
         with replacing(path) as temporary:
-            _write_jpeg(temporary, bytes_, quality)
+            write_jpeg(temporary, bytes_, quality, subsampled=True)
         if path.stat().st_size <= MOST_BYTES:
             break
     return places
@@ -238,12 +239,3 @@ def _fit(preview: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return a preview [rows, cols, 3] with another size."""
     source = oiio.ImageBuf(np.ascontiguousarray(preview, dtype=np.float32))
     return pixels_of(oiio.ImageBufAlgo.resize(source, "triangle", roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray, quality: int) -> None:
-    rows, cols, _ = pixels.shape
-    spec = oiio.ImageSpec(cols, rows, 3, "uint8")
-    spec.attribute("Compression", f"jpeg:{quality}")
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not (output.open(str(path), spec) and output.write_image(pixels) and output.close()):
-        raise OSError(f"{path.name}: {oiio.geterror() if output is None else output.geterror()}")

@@ -36,11 +36,7 @@ class Component(Enum):
     PARALLEL = "parallel"
 
     def gains(self, leak: float) -> tuple[float, float]:
-        """Return the factors of the cross and of the parallel image.
-
-        Args:
-            leak: ε, from 0 to below one half.
-        """
+        """Return the factors of the cross and of the parallel image; `leak`: ε, from 0 to below one half."""
         apart = 1 - 2 * leak
         return {Component.WHOLE: (1.0, 1.0), Component.SPECULAR: (-1 / apart, 1 / apart),
                 Component.DIFFUSE: (2 * (1 - leak) / apart, -2 * leak / apart),
@@ -48,11 +44,7 @@ class Component(Enum):
 
 
 def first_in_place(place: np.ndarray) -> np.ndarray:
-    """Return [lights] the first light in the place of each.
-
-    Args:
-        place: [lights, 3] unit directions, or [lights, 4] of `PlacedLights`.
-    """
+    """Return [lights] the first light in the place of each; `place`: [lights, 3] unit directions, or [lights, 4] of `PlacedLights`."""
     distance = np.linalg.norm(place[:, None] - place, axis=2)
     return np.asarray((distance < SAME_PLACE * np.linalg.norm(place[:, :3], axis=1)).argmax(axis=1))
 

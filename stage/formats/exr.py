@@ -136,11 +136,7 @@ def read_open(source: inputs.Source) -> tuple[dict[str, np.ndarray], dict[str, A
 
 def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: str, metadata: Mapping[str, Any],
           compression: Any = Compression.ZIP) -> None:
-    """Write an EXR file of one part whole or not at all.
-
-    Args:
-        channels: the channels by name, each [rows, cols] float16 or float32.
-    """
+    """Write an EXR file of one part whole or not at all; `channels`: the channels by name, each [rows, cols] float16 or float32."""
     write_parts(path, [Part("", channels, color_space, compression)], metadata=metadata)
 
 

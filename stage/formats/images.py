@@ -233,6 +233,25 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
         raise OSError(f"{path.name}: the disk took only part of it") from error
 
 
+def write_jpeg(path: Path, codes: np.ndarray, quality: int, *, subsampled: bool) -> None:
+    """Write [rows, cols, 3] uint8 as a JPEG file.
+
+    Args:
+        quality: 1 to 100.
+        subsampled: whether colour has half of the resolution of brightness.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    rows, cols, _ = codes.shape
+    spec = oiio.ImageSpec(cols, rows, 3, "uint8")
+    spec.attribute("compression", f"jpeg:{quality}")
+    spec.attribute("jpeg:subsampling", "4:2:0" if subsampled else "4:4:4")
+    output = oiio.ImageOutput.create(str(path))
+    if output is None or not (output.open(str(path), spec) and output.write_image(np.ascontiguousarray(codes)) and output.close()):
+        raise OSError(f"{path.name}: {oiio.geterror() if output is None else output.geterror()}")
+
+
 def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared: str = "camera.resolution") -> ImageHeader:
     """Check that an image has the width and height that a camera declares, and return its header."""
     header = read_header(path)

@@ -38,12 +38,7 @@ TURNS = {
 
 
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:
-    """Return an image, [rows, cols, ...], as it is seen upright.
-
-    Args:
-        image: as recorded.
-        orientation: 1 to 8.
-    """
+    """Return an image, [rows, cols, ...], as it is seen upright; `image`: as recorded; `orientation`: 1 to 8."""
     turn = TURNS[orientation]
     turned = image.swapaxes(0, 1) if turn.exchanged else image
     turned = turned[::-1] if turn.rows_reversed else turned

@@ -33,23 +33,18 @@ Source: the file format of RTIBuilder and RTIViewer (Cultural Heritage Imaging, 
     truncate coefficients to whole numbers, which changes what they show by up to 4 of 255.
 """
 
-import struct
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from stage.errors import ImageError, storage
 from stage.files import replacing
 
 TOP = 255
 """The largest byte."""
 FILE_TYPE = 3
-CHANNELS, SEPARATE, ELEMENT_SIZE = 3, 2, 1
-HSH_TERMS = (4, 9, 16)
-PTM_TERMS = 6
+SEPARATE, ELEMENT_SIZE = 2, 1
 RGB, LRGB = "PTM_FORMAT_RGB", "PTM_FORMAT_LRGB"
-HEADER_LINES = 6
 
 
 class Quantization(NamedTuple):
@@ -100,35 +95,6 @@ def write_hsh(path: str | Path, hsh: Hsh) -> None:
             stream.write(np.ascontiguousarray(np.swapaxes(hsh.stored[:, row], 0, 1)).tobytes())
 
 
-def read_hsh(path: str | Path) -> Hsh:
-    """Read an `.rti` file with separate coefficients of three channels, one byte each."""
-    with storage("read", path):
-        data = Path(path).read_bytes()
-    lines: list[bytes] = []
-    place = 0
-    while len(lines) < 3 and (end := data.find(b"\n", place)) >= 0:
-        if data[place : place + 1] != b"#":
-            lines.append(data[place:end])
-        place = end + 1
-    if not data.startswith(b"#HSH") or len(lines) < 3:
-        raise ImageError(f"{path}: is not an RTI file of hemispherical harmonics")
-    try:
-        (kind,), (cols, rows, channels), (terms, basis, size) = (tuple(map(int, line.split())) for line in lines)
-    except ValueError as error:
-        raise ImageError(f"{path}: has a damaged header: it holds file type, size and channels, terms and basis type") from error
-    if (kind, channels, basis, size) != (FILE_TYPE, CHANNELS, SEPARATE, ELEMENT_SIZE) or terms not in HSH_TERMS or min(rows, cols) < 1:
-        raise ImageError(f"{path}: is of file type {kind} with {channels} channels of {terms} terms, basis type {basis}: relit reads "
-                         "type 3 with 3 separate channels of 4, 9 or 16")
-    wanted = 8 * terms + rows * cols * channels * terms
-    if len(data) - place != wanted:
-        raise ImageError(f"{path}: holds {len(data) - place} bytes after its header, {cols}x{rows} with {terms} terms take {wanted}")
-    numbers = np.array(struct.unpack_from(f"<{2 * terms}f", data, place), dtype=np.float64)
-    step = numbers[:terms] / TOP
-    zero = np.rint(-numbers[terms:] / np.where(step > 0, step, 1)).astype(int)
-    stored = np.frombuffer(data, dtype=np.uint8, offset=place + 8 * terms).reshape(rows, cols, channels, terms)
-    return Hsh(np.moveaxis(stored, 2, 0), Quantization(step.astype(np.float32), zero))
-
-
 class Ptm(NamedTuple):
     """A polynomial texture map with quantised coefficients. Row 0 is the top of the image."""
 
@@ -152,30 +118,3 @@ def write_ptm(path: str | Path, ptm: Ptm) -> None:
         if ptm.colour is not None:
             for row in ptm.colour[::-1]:
                 stream.write(np.ascontiguousarray(row).tobytes())
-
-
-def read_ptm(path: str | Path) -> Ptm:
-    """Read an uncompressed `.ptm` file, RGB or LRGB."""
-    with storage("read", path):
-        data = Path(path).read_bytes()
-    *lines, body = data.split(b"\n", HEADER_LINES) if data.count(b"\n") >= HEADER_LINES else [b""]
-    if not lines or lines[0].strip() != b"PTM_1.2":
-        raise ImageError(f"{path}: is not a PTM file of version 1.2")
-    name = lines[1].strip().decode("ascii", "replace")
-    if name not in (RGB, LRGB):
-        raise ImageError(f"{path}: is {name[:40]}: relit reads {RGB} and {LRGB}")
-    try:
-        cols, rows = int(lines[2]), int(lines[3])
-        step, zero = np.array(lines[4].split(), dtype=np.float32), np.array([int(bias) for bias in lines[5].split()])
-    except ValueError as error:
-        raise ImageError(f"{path}: has a damaged header: lines 3 to 6 are width, height, scales and biases") from error
-    if rows < 1 or cols < 1 or step.shape != (PTM_TERMS,) or zero.shape != (PTM_TERMS,):
-        raise ImageError(f"{path}: has a damaged header: lines 3 to 6 are width, height, six scales and six biases")
-    channels, colours = (3, 0) if name == RGB else (1, 3)
-    pixels = rows * cols
-    if len(body) != pixels * (channels * PTM_TERMS + colours):
-        raise ImageError(f"{path}: holds {len(body)} bytes of pixels, {cols}x{rows} take {pixels * (channels * PTM_TERMS + colours)}")
-    values = np.frombuffer(body, dtype=np.uint8)
-    stored = values[: pixels * channels * PTM_TERMS].reshape(channels, rows, cols, PTM_TERMS)[:, ::-1]
-    colour = values[pixels * PTM_TERMS :].reshape(rows, cols, 3)[::-1] if colours else None
-    return Ptm(stored, Quantization(step, zero), colour)

@@ -63,11 +63,7 @@ def draw(pattern: Pattern, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def collect(patterns: Sequence[Pattern | None]) -> Collected:
-    """Sort frames into codes, whatever their order.
-
-    Args:
-        patterns: the entry of each frame; None for frames that are something else.
-    """
+    """Sort frames into codes, whatever their order; `patterns`: the entry of each frame; None for frames that are something else."""
     first: dict[Pattern, int] = {}
     for index, pattern in enumerate(patterns):
         if pattern is None:

@@ -145,11 +145,7 @@ class ScanSet(Strict):
 
 
 def read_scan_set(path: Path) -> tuple[Path, ScanSet]:
-    """Read and check a scan-set.json.
-
-    Args:
-        path: the file, or the folder with it.
-    """
+    """Read and check a scan-set.json; `path`: the file, or the folder with it."""
     file = path / SCAN_SET_FILE if path.is_dir() else path
     return file, read_record(file, ScanSet, SCAN_SET_SCHEMA, _faults)
 

@@ -26,11 +26,7 @@ _sound_lock = threading.Lock()
 
 
 def of_plane(plane: np.ndarray, padding: int) -> int:
-    """Return the checksum of a plane that is followed by zeros.
-
-    Args:
-        padding: the bytes of zeros behind it.
-    """
+    """Return the checksum of a plane that is followed by zeros; `padding`: the bytes of zeros behind it."""
     return zlib.crc32(bytes(padding), zlib.crc32(plane.data))
 
 

@@ -113,11 +113,7 @@ class Shots:
 
 
 def read_scan(path: str | Path) -> Shots:
-    """Read a scan.
-
-    Args:
-        path: the folder of the scan, or the scan.json in it.
-    """
+    """Read a scan; `path`: the folder of the scan, or the scan.json in it."""
     given = Path(path)
     folder = given.parent if given.name == FILE_NAME else given
     with storage("read", folder):

@@ -20,7 +20,7 @@ MIB = 1 << 20
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("size", [(8, 8), (100, 37), (64, 64), (640, 480), (513, 511), (3000, 3), (1200, 1000)])
+@pytest.mark.parametrize("size", [(8, 8), (100, 37), (640, 480), (3000, 3)])
 @pytest.mark.parametrize("bare", [False, True])
 def test_the_size_of_a_jxl_is_read_without_decoding_it(tmp_path, size, bare):
     path = tmp_path / "a.jxl"

@@ -48,7 +48,7 @@ def metals_of(shared: np.ndarray, single: Material) -> Metals:
         single: material of some hundreds of pixels, spread over the object.
     """
     lobes = shared[shared[:, :3].max(axis=1) > BRIGHTEST_DIELECTRIC][:MOST_METALS]
-    costs = single.cost[_is_metal(single)]
+    costs = single.cost[single.specular.max(axis=1) > BRIGHTEST_DIELECTRIC]
     return Metals(lobes, float(np.percentile(costs, EXPLAINED)) if len(costs) else 0.0)
 
 
@@ -85,10 +85,6 @@ def search_metals(samples: Samples, normal: np.ndarray, material: Material, meta
     replaced = normal.copy()
     replaced[tried[kept]] = found[kept]
     return replaced
-
-
-def _is_metal(material: Material) -> np.ndarray:
-    return material.specular.max(axis=1) > BRIGHTEST_DIELECTRIC
 
 
 def moved(normal: np.ndarray, offset: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -81,11 +81,6 @@ def scratch_type(lanes: int) -> Any:
     return Scratch
 
 
-def lanes_of(device: str) -> int:
-    """Return the number of pixels that one thread takes on this device."""
-    return devices.pack_width(device) if device == "cpu" else LANES_CUDA
-
-
 def evenly(count: int, most: int) -> np.ndarray:
     """Return indices at even steps from 0 to count - 1: all of them, or `most` where there are more.
 
@@ -121,7 +116,8 @@ def gather(band: Band, pixels: np.ndarray, view: np.ndarray, lights: Lights, fac
     if field is not None and (field.points.shape != (3, len(pixels)) or len(field.places.place) != len(lights.direction)):
         raise ArrayError(f"points are {field.points.shape} under {len(field.places.place)} padded lights, expected "
                          f"{(3, len(pixels))} under {len(lights.direction)}")
-    device, lanes = band.device, lanes_of(band.device)
+    device = band.device
+    lanes = devices.pack_width(device) if device == "cpu" else LANES_CUDA
     packs = -(-len(pixels) // lanes)
     last = len(pixels) - 1
     order = np.minimum(np.arange(packs * lanes), last)

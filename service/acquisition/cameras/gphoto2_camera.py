@@ -30,6 +30,7 @@ REASONS = {
     gp.GP_ERROR_IO_INIT: "the USB device may not be opened: give your user the right to use it (udev rules of libgphoto2)",
     gp.GP_ERROR_NOT_SUPPORTED: "libgphoto2 does not know how this camera does that",
     gp.GP_ERROR_NO_SPACE: "the card of the camera is full: empty it",
+    gp.GP_ERROR_NO_MEMORY: "the card of the camera is full: empty it",  # which cameras that speak PTP say
     gp.GP_ERROR_CAMERA_BUSY: "the camera is busy: wait until it has stored its pictures",
     gp.GP_ERROR_TIMEOUT: "the camera does not answer: check the cable and the battery",
     gp.GP_ERROR_IO: "the camera does not answer: check the cable and the battery",

@@ -1,7 +1,7 @@
 """The picture that a lamp should give, predicted from the pictures of the lamps around it.
 
-Per pixel, the light of a distant lamp is nearly linear in its direction where the surface faces it; near the borders of shadows it is
-linear over small angles only. So the prediction at a direction is a linear fit in the direction to the pictures of the lamps, weighted by
+Per pixel, the light of a distant lamp is linear in the unit vector towards it where a matte surface faces it; near the borders of shadows
+it is so over small angles only. So the prediction at a direction is a fit, linear in the vector, to the pictures of the lamps, weighted by
 their distance on the sphere (local linear regression, Cleveland 1979). It is linear in the pictures, and the weights follow from directions
 alone.
 """
@@ -35,8 +35,7 @@ def prediction_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray
     angle = np.arccos(np.clip(directions @ wanted, -1, 1))
     width = WIDTH_SPACINGS * np.sort(angle)[NEIGHBOUR - 1]
     weight = np.exp(-0.5 * (angle / max(width, 1e-3)) ** 2)
-    offset = directions - wanted
-    basis = np.column_stack([np.ones(len(directions)), offset @ _tangents(wanted)])
+    basis = directions @ np.column_stack([wanted, _tangents(wanted)])
     normal = basis.T @ (weight[:, None] * basis)
     if np.linalg.cond(normal) > MOST_CONDITION:
         return None

@@ -67,11 +67,7 @@ def find_frames(pattern: Path, camera: Camera) -> dict[int, Path]:
 
 
 def write_card(frames: Mapping[int, Path], folder: Path, *, as_png: bool) -> CardImages:
-    """Write the images of a card.
-
-    Args:
-        as_png: colours as PNG of 16 bits with the sRGB curve, clipped at 1, and not as half EXR.
-    """
+    """Write the images of a card; `as_png`: colours as PNG of 16 bits with the sRGB curve, clipped at 1, and not as half EXR."""
     colours: dict[int, str] = {}
     opacities: dict[int, str] = {}
     clipped_pixels, covered = 0, True

@@ -56,11 +56,7 @@ class MeasuredPoints(NamedTuple):
 
 
 def measured_points(maps: DepthMaps, cloud: PointCloud | None) -> MeasuredPoints:
-    """Return the points of a depth.
-
-    Args:
-        cloud: what points.ply holds; None: a point is made for each pixel of the depth, without a colour.
-    """
+    """Return the points of a depth; `cloud`: what points.ply holds; None: a point is made for each pixel of the depth, without a colour."""
     if cloud is None:
         rows, cols = np.nonzero(valid_heights(SurfaceMaps(camera=maps.camera, mask=maps.mask, height=-maps.depth)))
         found = MeasuredPoints(maps.camera.points(-maps.depth)[rows, cols], rows, cols, None, None)

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from pygltflib import GLTF2, Accessor, Buffer, BufferView, Image
@@ -56,8 +56,9 @@ class Glb:
         values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         components = values.shape[1] if values.ndim == 2 else 1
         least, greatest = (np.atleast_1d(edge).tolist() for edge in (values.min(axis=0), values.max(axis=0))) if bounds else ([], [])
+        kind = _COMPONENT_TYPES[f"<{values.dtype.kind}{values.dtype.itemsize}"]  # single bytes have no order of their own
         self.document.accessors.append(Accessor(
-            bufferView=self._add_part(values, values.nbytes, target), componentType=_COMPONENT_TYPES[_type_code(values.dtype)],
+            bufferView=self._add_part(values, values.nbytes, target), componentType=kind,
             normalized=normalized, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
         return len(self.document.accessors) - 1
 
@@ -135,11 +136,6 @@ def read_glb(path: Path) -> GlbContents:
         return GlbContents(GLTF2.gltf_from_json(text.decode()), data_start, data_size, tuple(faults))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise AssetError(f"{path}: holds no glTF document that can be read: {error}") from error
-
-
-def _type_code(dtype: np.dtype[Any]) -> str:
-    """Return the byte order, kind and size of a type; single bytes have no order of their own."""
-    return f"<{dtype.kind}{dtype.itemsize}"
 
 
 def _append(stream: BinaryIO, part: np.ndarray | Path) -> None:

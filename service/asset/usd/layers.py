@@ -98,7 +98,7 @@ class AssetLayers:
             self.files: tuple[Path, ...] = (self._interface_file,)
             self.geometry = self.materials = self._interface
         else:
-            layers = folder / layer_folder(target)
+            layers = folder / f"{target.stem}_layers"
             layers.mkdir()
             self.files = (self._interface_file, *(layers / file for file in LAYER_FILES))
             self.geometry, self.materials = self._create(layers / GEOMETRY), self._create(layers / MATERIALS)
@@ -292,11 +292,6 @@ def describe_lights(root: Usd.Prim) -> None:
     collection = Usd.CollectionAPI.Apply(root, "lights")
     collection.CreateExpansionRuleAttr(Usd.Tokens.explicitOnly)
     collection.CreateIncludesRel().SetTargets(paths)
-
-
-def layer_folder(target: Path) -> str:
-    """Return the name of the folder beside an asset that holds the layers of its payload."""
-    return f"{target.stem}_layers"
 
 
 def light_folder(target: Path) -> str:

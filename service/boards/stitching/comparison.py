@@ -18,25 +18,6 @@ MATCH_PX = 0.05
 ROUNDS = 12
 
 
-class Deviation(NamedTuple):
-    """Measured less nominal height, on the grid of the nominal height map."""
-
-    grid: BoardGrid
-    height: np.ndarray  # [rows, cols] float64 metres, NaN where either is missing
-    variance: np.ndarray  # [rows, cols] float64 m²: noise
-    systematic: np.ndarray  # [rows, cols] float64 m: standard deviation of the errors that neighbours share
-
-    @property
-    def known(self) -> np.ndarray:
-        """Return where there is a deviation, [rows, cols] bool."""
-        return np.isfinite(self.height)
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """Return the standard deviation of each pixel in metres, noise and shared errors together."""
-        return np.sqrt(self.variance + self.systematic**2)
-
-
 class Form(NamedTuple):
     """A plane or a quadratic surface: coefficients of 1, x, y and, for the latter, x², x·y, y²; x and y run from -1 to 1 over a board."""
 
@@ -47,7 +28,7 @@ class Form(NamedTuple):
         return np.asarray(np.tensordot(self.coefficients, _basis(*_unit(grid), count=len(self.coefficients)), axes=1))
 
 
-def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[float, float]) -> Deviation:
+def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[float, float]) -> HeightMap:
     """Return the deviation of two height maps on one grid.
 
     To the shared errors of both maps come those of edges, where a shift and interpolation change heights: slope times the uncertainty
@@ -68,7 +49,7 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     edges = np.where(bend > CLEAR_BEND * BEND_NOISE * noise, BEND_SHARE * bend, 0) ** 2
     edges += shift_error((whole + seen) / 2, (right, up), noise) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
-    return Deviation(measured.grid, deviation, variance, np.where(known, systematic, np.nan))
+    return HeightMap(measured.grid, deviation, variance, np.where(known, systematic, np.nan))
 
 
 def fit_form(grid: BoardGrid, height: np.ndarray, *, quadratic: bool) -> Form:

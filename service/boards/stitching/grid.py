@@ -87,7 +87,7 @@ class HeightPatch(NamedTuple):
 
 
 class HeightMap(NamedTuple):
-    """Heights on a whole grid, with both kinds of their errors."""
+    """Heights on a whole grid, or their deviations from those of another map, with both kinds of their errors."""
 
     grid: BoardGrid
     height: np.ndarray  # [rows, cols] float64 metres, NaN where not measured
@@ -103,6 +103,10 @@ class HeightMap(NamedTuple):
     def sigma(self) -> np.ndarray:
         """Return the standard deviation of each pixel in metres, noise and shared errors together."""
         return np.sqrt(self.variance + self.systematic**2)
+
+    def cut(self, where: tuple[slice, slice]) -> "HeightMap":
+        """Return the heights of a part, which still names the whole grid."""
+        return HeightMap(self.grid, self.height[where], self.variance[where], self.systematic[where])
 
 
 def gradients(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

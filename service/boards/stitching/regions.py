@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.boards.stitching.comparison import Deviation
-from service.boards.stitching.grid import BoardGrid
+from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.significance import mean_of, threshold
 from stage.sets.board import Region
 
@@ -63,7 +62,7 @@ def tolerances_over(grid: BoardGrid, regions: Sequence[Region], *, elsewhere_m: 
     return out
 
 
-def check_regions(deviation: Deviation, regions: Sequence[Region], *, false_alarm: float) -> tuple[list[RegionResult], float]:
+def check_regions(deviation: HeightMap, regions: Sequence[Region], *, false_alarm: float) -> tuple[list[RegionResult], float]:
     """Decide about every region.
 
     With k the threshold of as many one-sided tests as there are limits, a region fails if its mean deviation is more than k σ outside of
@@ -78,16 +77,16 @@ def check_regions(deviation: Deviation, regions: Sequence[Region], *, false_alar
     return [_decide(deviation, region, taken, k) for region in regions], k
 
 
-def _decide(deviation: Deviation, region: Region, taken: np.ndarray, k: float) -> RegionResult:
+def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float) -> RegionResult:
     where, inside = pixels_of(region, deviation.grid)
-    part = Deviation(deviation.grid, deviation.height[where], deviation.variance[where], deviation.systematic[where])
+    part = deviation.cut(where)
     mean, count = mean_of(part, inside), int(inside.sum())
     if mean is None or mean.pixels < region.least_inspected * expected_pixels(region, deviation.grid):
         return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, 0 if mean is None else mean.pixels)
     value, sigma = mean.value, mean.sigma
     if region.datum == "surround":
         around, ring = pixels_of(region, deviation.grid, grow=1.0)
-        whole = Deviation(deviation.grid, deviation.height[around], deviation.variance[around], deviation.systematic[around])
+        whole = deviation.cut(around)
         datum = mean_of(whole, ring & ~taken[around])
         if datum is None or datum.pixels < region.least_inspected * max(int((ring & ~taken[around]).sum()), 1):
             return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, mean.pixels)

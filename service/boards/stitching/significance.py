@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import label
 
-from service.boards.stitching.comparison import Deviation
-from service.boards.stitching.grid import robust_sigma
+from service.boards.stitching.grid import HeightMap, robust_sigma
 
 CLIP = 6.0
 ENOUGH_WINDOWS = 100
@@ -70,9 +69,9 @@ def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))
 
 
-def mean_of(deviation: Deviation, pixels: np.ndarray, *, spread: float = 1.0) -> Mean | None:
+def mean_of(deviation: HeightMap, pixels: np.ndarray, *, spread: float = 1.0) -> Mean | None:
     """Return the weighted mean over pixels, [rows, cols] bool, whose noise is `spread` times what is stated; None where none is known."""
-    used = pixels & deviation.known
+    used = pixels & deviation.measured
     count = int(used.sum())
     if count == 0:
         return None
@@ -83,7 +82,7 @@ def mean_of(deviation: Deviation, pixels: np.ndarray, *, spread: float = 1.0) ->
     return Mean(float((weight * deviation.height[used]).sum()) / total, float(np.sqrt(square)) / total, count)
 
 
-def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
+def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
     """Look for significant windows over a whole board; pixels of significant windows do not count in larger ones.
 
     Args:
@@ -91,9 +90,9 @@ def scan_windows(deviation: Deviation, *, tolerance_m: float | np.ndarray, false
         false_alarm: the probability of any false alarm on a board without defects.
         smallest_px: side of the smallest window.
     """
-    shape = deviation.known.shape
+    shape = deviation.measured.shape
     tolerance = np.broadcast_to(np.asarray(tolerance_m, dtype=np.float64), shape)
-    known = deviation.known
+    known = deviation.measured
     sides = tuple(side for side in (smallest_px << k for k in range(DOUBLINGS)) if side <= min(shape))
     tests = sum(int((_sums(known, side) >= LEAST_MEASURED * side * side).sum()) for side in sides)
     limit = threshold(false_alarm, tests)
@@ -139,7 +138,7 @@ def _scatter(values: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple
     return float(np.median(taken)), max(robust_sigma(taken), 1.0)
 
 
-def region_of(deviation: Deviation, scan: Scan, part: np.ndarray) -> np.ndarray:
+def region_of(deviation: HeightMap, scan: Scan, part: np.ndarray) -> np.ndarray:
     """Return the whole connected area, [rows, cols] bool, that deviates by at least half as much as a significant part of it does at most.
 
     Deviations count as their means over the smallest significant window about each pixel, weighted by their variance and not clipped.
@@ -147,13 +146,13 @@ def region_of(deviation: Deviation, scan: Scan, part: np.ndarray) -> np.ndarray:
     sign = 1 if scan.side[part].sum() > 0 else -1
     side = int(np.abs(scan.side[part]).min())
     with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(deviation.known, 1 / (deviation.variance + deviation.systematic**2), 0)
-        mean = sign * _around(weight * np.where(deviation.known, deviation.height, 0), side) / _around(weight, side)
-    seed = part & deviation.known
+        weight = np.where(deviation.measured, 1 / (deviation.variance + deviation.systematic**2), 0)
+        mean = sign * _around(weight * np.where(deviation.measured, deviation.height, 0), side) / _around(weight, side)
+    seed = part & deviation.measured
     values = mean[seed][np.isfinite(mean[seed])]
     if values.size == 0 or values.max() <= 0:
         return seed
-    high = deviation.known & (np.nan_to_num(mean) >= values.max() / 2)
+    high = deviation.measured & (np.nan_to_num(mean) >= values.max() / 2)
     labels, _ = label(high)
     own = np.unique(labels[seed & high])
     return np.asarray(np.isin(labels, own[own > 0]))

@@ -39,7 +39,8 @@ class PixelSolution:
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
         """Return how many pixels of the mask have each status, by name."""
-        return status_counts(self.status, mask)
+        numbers = np.bincount(self.status[mask], minlength=max(Status) + 1)
+        return {code.name.lower(): int(numbers[code]) for code in Status}
 
 
 @dataclass(kw_only=True)
@@ -84,12 +85,6 @@ class DepthSolution(PixelSolution):
             camera=camera, mask=self.solved, estimated=self.estimated, depth=self.depth, range=self.range_m,
             projector_u=self.projector_u, projector_v=self.projector_v, amplitude=self.amplitude, sigma=self.sigma,
             sigma_u=self.sigma_u, sigma_v=self.sigma_v, confidence=self.confidence_map(), status=self.status, provenance=provenance)
-
-
-def status_counts(status: np.ndarray, mask: np.ndarray) -> dict[str, int]:
-    """Return how many pixels of the mask have each status, by name."""
-    numbers = np.bincount(status[mask], minlength=max(Status) + 1)
-    return {code.name.lower(): int(numbers[code]) for code in Status}
 
 
 def statistics(values: np.ndarray) -> dict[str, float]:

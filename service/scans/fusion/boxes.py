@@ -102,7 +102,7 @@ def _window(scan: PreparedScan, low: np.ndarray, high: np.ndarray) -> tuple[int,
         if len(there) == 0:
             return None
     x, y = scan.camera.plane_at(*_border(0.0, cols, 0.0, rows))
-    seen = _projected(there, scan.image.orthographic)
+    seen = there[:, :2] if scan.image.orthographic else there[:, :2] / -there[:, 2:]
     first, last = np.maximum(seen.min(axis=0), (x.min(), y.min())), np.minimum(seen.max(axis=0), (x.max(), y.max()))
     if (first > last).any():
         return None
@@ -123,11 +123,6 @@ def _in_front(corners: np.ndarray) -> np.ndarray:
             share = (-NEAREST_M - corners[one, 2]) / (corners[other, 2] - corners[one, 2])
             found.append((corners[one] + share * (corners[other] - corners[one]))[None])
     return np.concatenate(found)
-
-
-def _projected(points: np.ndarray, orthographic: bool) -> np.ndarray:
-    """Return the coordinates [n, 2] of camera-frame points on the plane at a depth of 1, or across parallel lines of sight."""
-    return points[:, :2] if orthographic else points[:, :2] / -points[:, 2:]
 
 
 def _border(left: float, right: float, top: float, bottom: float) -> tuple[np.ndarray, np.ndarray]:

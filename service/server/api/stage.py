@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 from fastapi import APIRouter, Depends, Request, Response
-from pydantic import BaseModel, ConfigDict
 
 from service.server.api.context import require_admin
 from service.server.api.problems import ApiError
-from stage.model import Line
+from stage.model import Line, Strict
 
 
 class Stage(Protocol):
@@ -50,10 +49,8 @@ class Stage(Protocol):
         """Write the picture of a shot."""
 
 
-class Run(BaseModel):
+class Run(Strict):
     """A capture that is to be started."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     plan: str
@@ -61,26 +58,20 @@ class Run(BaseModel):
     retake: tuple[Line, ...] = ()
 
 
-class Named(BaseModel):
+class Named(Strict):
     """A capture that is to be shown."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
 
 
-class Step(BaseModel):
+class Step(Strict):
     """What a capture is to be calibrated by: ball or chart."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     step: str
 
 
-class Live(BaseModel):
+class Live(Strict):
     """Whether the live view is to be seen."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     on: bool
 

@@ -1,6 +1,5 @@
 """Find the files that a job reads and writes: captures, environments and results of other jobs, as folders of this machine."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -43,7 +42,8 @@ class StepFiles(NamedTuple):
         for name in type(job).model_fields:
             if name in model.model_fields and name not in JobRequest.model_fields and name not in values:
                 value = getattr(job, name)
-                values[name] = files_within(values["capture"], value, name) if name in NAMES else self._place(value)
+                values[name] = (tuple(file_within(values["capture"], each, name) for each in value) if name in NAMES
+                                else self._place(value))
         capture = next(iter(getattr(job, "captures", ())), getattr(job, "capture", None))
         ours = {"device": self.device, "cache": None if capture is None else self.cache(capture)}
         return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
@@ -113,11 +113,6 @@ def file_within(capture: Path, name: str, field: str) -> Path:
     if not place.is_file():
         raise RequestError(f"{field}: {name!r} is no file of the capture")
     return capture / name
-
-
-def files_within(capture: Path, names: Iterable[str], field: str) -> tuple[Path, ...]:
-    """Return the paths of several files, as `file_within` does."""
-    return tuple(file_within(capture, name, field) for name in names)
 
 
 def without_places(text: str, job: str, context: WorkerContext) -> str:

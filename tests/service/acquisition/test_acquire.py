@@ -107,7 +107,7 @@ def controller(folder: Path, stage: Stage) -> Iterator[tuple[Path, str]]:
             """Say nothing."""
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         url = f"http://127.0.0.1:{server.server_port}"
         try:
             requests = {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}

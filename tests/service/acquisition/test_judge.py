@@ -6,7 +6,7 @@ import pytest
 from service.acquisition.checks.fault import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from stage.transforms import fibonacci_sphere
-from tests.scenes.captures import make_scene
+from tests.scenes.captures import make_scene, render
 from tests.service.acquisition.scenes import NoisyCamera, Scene, owl, relief, rig_of, shots_on
 
 KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
@@ -67,6 +67,15 @@ def test_the_highlight_of_a_glossy_ball_has_not_moved():
     gloss = 5 * np.maximum(np.einsum("lc,rkc->lrk", half, normal), 0) ** 120 * (lit > 0)
     scene = Scene(np.repeat((0.15 * (lit + gloss))[..., None], 3, axis=-1).astype(np.float32), directions)
     assert named(scene, 1, ()) == ({}, {})
+
+
+def test_lamps_in_front_of_a_matte_cap_without_texture_are_no_ambient_light():
+    """All of it faces all lamps, so that the usual picture looks like any; a mean of those around is darker by the cosine to them."""
+    cap, directions = make_scene(size=48), fibonacci_sphere(192)
+    directions = directions[directions[:, 2] > 0.1]
+    pictures = render(cap.normal, cap.albedo, directions, np.ones((len(directions), 3)))
+    scene = Scene((pictures / pictures.sum(axis=0).max()).astype(np.float32) * 6, directions)
+    assert named(scene, 0, ())[1] == {}
 
 
 def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():

@@ -239,6 +239,7 @@ def test_charts_with_other_gaps_are_found(gap, tmp_path):
     assert np.abs(found.corners - shown.corners).max() < 0.5 and np.nanmean(found.kinds[0].colors.after) < 1
 
 
+@pytest.mark.long
 def test_a_chart_of_140_patches(relit, tmp_path):
     colours = seen(reflectance=reflectances(140))
     shown = picture(colours, Pose(12, -9, 4, distance=560), grid=(14, 10), pitch=24, patch=20, size=(960, 720))

@@ -16,11 +16,8 @@ def degrees_between(a, b):
     return np.degrees(np.arccos(np.clip(np.sum(a * b, axis=-1), -1, 1)))
 
 
-@pytest.mark.parametrize(("axes", "vectors", "to_table"), [
-    ("right,up,towards", "to-light", np.diag([1, 1, 1])), ("right,down,away", "from-light", -np.diag([1, -1, -1])),
-    ("down,right,towards", "to-light", np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])),
-])
-def test_a_table_of_lights_in_any_axes_gives_the_true_normals(relit, tmp_path, axes, vectors, to_table):
+def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path):
+    axes, vectors, to_table = "down,right,away", "from-light", np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     scene = make_scene(24, 8)
     folder = tmp_path / "statue"
     for number, image in enumerate(scene.images):

@@ -70,6 +70,19 @@ def test_a_mirror_is_not_explained_by_its_lights():
     assert explain(given._replace(radiance=(shine[..., None] * given.irradiance[:, None, :]))) is None
 
 
+def test_false_directions_are_seen_beside_a_background_that_few_lights_reach():
+    """As in JPEG files, where a dark background reads 0 under most lights and a code or two under some."""
+    count = 80
+    given = sample(count)
+    background = np.zeros((count, 30, 3))
+    background[:7] = 1e-3 * given.radiance.max()
+    radiance = np.concatenate([given.radiance, background], axis=1)
+    wrong = given._replace(radiance=radiance, usable=np.ones(radiance.shape[:2], bool),
+                           directions=given.directions[np.random.default_rng(3).permutation(count)])
+    found = explain(wrong)
+    assert found is not None and found.cause is Cause.DIRECTIONS
+
+
 def test_dark_and_unusable_pixels_leave_no_misfit():
     given = sample()
     dark = given._replace(radiance=np.zeros_like(given.radiance))

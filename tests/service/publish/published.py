@@ -2,11 +2,75 @@
 
 import json
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
+
+from tests.reference.light_basis import srgb
+from tests.scenes.captures import make_scene, render, write_capture
+
+SIZE = 300
+"""Rows and columns of the dome: more than a tile, and no power of two."""
+
+
+class Files(SimpleHTTPRequestHandler):
+    """Serves files, and counts their bytes."""
+
+    sent = 0
+
+    def copyfile(self, source, outputfile):
+        content = source.read()
+        Files.sent += len(content)
+        outputfile.write(content)
+
+    def log_message(self, *_):
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a plain server of the files in a folder, while it runs."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+def spiral(count):
+    """[count, 3] directions of lights, evenly over the hemisphere down to 17 degrees above its edge."""
+    z = np.linspace(1, 0.3, count)
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+
+
+def dome(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Write a capture of a cap under 32 white lights over the hemisphere.
+
+    Returns:
+        Directions of the lights [32, 3], and [32, rows, cols, 3] what 27 components have of its pictures, before bytes and JPEG files.
+    """
+    scene, lights = make_scene(size=SIZE), spiral(32)
+    white = np.ones_like(lights)
+    scene = scene._replace(directions=lights, irradiance=white, images=render(scene.normal, scene.albedo, lights, white))
+    write_capture(folder, scene)
+    exposure = np.quantile(scene.images[:, scene.mask], 0.999)
+    values = srgb(np.clip(scene.images / exposure, 0, 1))[:, scene.mask].swapaxes(1, 2).reshape(32 * 3, -1)
+    best = np.linalg.eigh(values @ values.T).eigenvectors[:, -27:]
+    pictures = np.zeros((32, SIZE, SIZE, 3))
+    pictures[:, scene.mask] = np.clip(best @ (best.T @ values), 0, 1).reshape(32, 3, -1).swapaxes(1, 2)
+    return lights, pictures
+
+
+def levels_rms(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """[n] how far pictures [n, rows, cols, 3] are from others, root mean square, in steps of an 8-bit display."""
+    return 255 * np.sqrt(np.mean(np.square(found - wanted), axis=(1, 2, 3)))
 
 
 def image(path: Path) -> np.ndarray:

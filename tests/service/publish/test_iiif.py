@@ -5,6 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from service import __version__
+from stage.colour.configuration import current
 from tests.reference.light_basis import srgb
 from tests.scenes.captures import make_scene, write_capture
 from tests.service.publish.published import image
@@ -12,6 +14,7 @@ from tests.service.publish.published import image
 URL = "https://museum.org/cap"
 SIZE = 1100
 """More than what is there whole."""
+PIXEL_M = 25e-6
 NOTES = {"type": "AnnotationPage", "items": [
     {"type": "Annotation", "body": {"type": "TextualBody", "value": "a crack"},
      "target": {"selector": {"type": "FragmentSelector", "value": "xywh=10,20,30,40"}}},
@@ -22,7 +25,8 @@ NOTES = {"type": "AnnotationPage", "items": [
 @pytest.fixture
 def published(relit, tmp_path):
     """A cap with maps and notes, published."""
-    write_capture(tmp_path / "cap", make_scene(size=SIZE, lights=5))
+    camera = {"projection": "orthographic", "resolution": [SIZE, SIZE], "pixel_size_m": PIXEL_M}
+    write_capture(tmp_path / "cap", make_scene(size=SIZE, lights=5), camera=camera)
     relit.done("solve", tmp_path / "cap", "--out", tmp_path / "maps", "--method", "lambert")
     (tmp_path / "notes.json").write_text(json.dumps(NOTES))
     relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "iiif", "--url", f"{URL}/", "--maps", tmp_path / "maps",
@@ -46,8 +50,13 @@ def test_the_manifest_names_pictures_that_are_there(published):
     assert manifest["id"] == f"{URL}/manifest.json" and manifest["label"] == {"none": ["Cap"]}
     assert manifest["rights"] == "http://creativecommons.org/licenses/by/4.0/"
     assert manifest["requiredStatement"]["value"] == {"none": ["A museum"]}
+    facts = {entry["label"]["en"][0]: entry["value"]["none"][0] for entry in manifest["metadata"]}
+    assert facts == {"Capture": "cap", "Lights": "5", "Version": __version__, "Inputs": facts["Inputs"],
+                     "Colour configuration": current().label}
     identifiers, labels = [manifest["id"]], []
     for canvas in manifest["items"]:
+        [size] = canvas["service"]
+        assert (size["physicalScale"], size["physicalUnits"]) == (1000 * PIXEL_M, "mm")
         [painting] = canvas["items"][0]["items"]
         assert (canvas["width"], canvas["height"], painting["target"]) == (SIZE, SIZE, canvas["id"])
         identifiers += [canvas["id"], canvas["items"][0]["id"], painting["id"]]

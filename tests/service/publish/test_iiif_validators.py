@@ -40,7 +40,7 @@ def test_the_image_validator_finds_nothing(relit, tmp_path):
     squares = linear.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1)
     write_capture(tmp_path / "squares", scene._replace(mask=np.ones_like(scene.mask), irradiance=white, images=np.stack(3 * [squares])))
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         where = f"127.0.0.1:{server.server_port}"
         relit.done("publish", tmp_path / "squares", "--to", tmp_path / "out", "--as", "iiif", "--url", f"http://{where}/out",
                    "--photographs", "1")

@@ -7,17 +7,7 @@ import numpy as np
 
 from tests.reference.light_basis import srgb
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture
-from tests.service.publish.published import image, shown, tiles_joined
-
-SIZE = 300
-"""More than a tile, and no power of two."""
-
-
-def spiral(count):
-    """[count, 3] directions of lights, evenly over the hemisphere down to 17 degrees above its edge."""
-    z = np.linspace(1, 0.3, count)
-    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
-    return np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+from tests.service.publish.published import SIZE, dome, image, levels_rms, shown, tiles_joined
 
 
 def capture(folder, lights=7):
@@ -47,20 +37,10 @@ def test_captured_lights_show_the_captured_images(relit, tmp_path):
 
 def test_a_hemisphere_of_lights_is_shown_as_the_basis_has_it(relit, tmp_path):
     """32 lights, of which OpenLIME shows a picture each: within 2 levels of the components before they are bytes and JPEG files."""
-    scene = make_scene(size=SIZE)
-    lights = spiral(32)
-    white = np.ones_like(lights)
-    scene = scene._replace(directions=lights, irradiance=white, images=render(scene.normal, scene.albedo, lights, white))
-    write_capture(tmp_path / "dome", scene)
+    lights, truth = dome(tmp_path / "dome")
     relit.done("publish", tmp_path / "dome", "--to", tmp_path / "out", "--as", "openlime")
-    exposure = np.quantile(scene.images[:, scene.mask], 0.999)
-    values = srgb(np.clip(scene.images / exposure, 0, 1))[:, scene.mask].swapaxes(1, 2).reshape(32 * 3, -1)
-    best = np.linalg.eigh(values @ values.T).eigenvectors[:, -27:]
-    truth = np.zeros((32, SIZE, SIZE, 3))
-    truth[:, scene.mask] = np.clip(best @ (best.T @ values), 0, 1).reshape(32, 3, -1).swapaxes(1, 2)
     for tiles in (False, True):
-        rms = 255 * np.sqrt(np.mean(np.square(shown(tmp_path / "out", lights, tiles=tiles) - truth), axis=(1, 2, 3)))
-        assert rms.max() < 2
+        assert levels_rms(shown(tmp_path / "out", lights, tiles=tiles), truth).max() < 2
 
 
 def test_lights_close_to_one_another_show_their_own_images(relit, tmp_path):

@@ -66,6 +66,7 @@ def test_what_is_at_rest_is_joined_over_all_steps(moving):
         assert np.median(albedo[0]) < 1.25 * np.median(albedo[1]) / np.sqrt(step + 1)
 
 
+@pytest.mark.long
 def test_normals_and_height_flicker_less(moving):
     """A mean of k steps changes by 1/k of what a step changes: medians of the last steps, of 5, 6 and 7."""
     out, _, rest, _ = moving
@@ -79,6 +80,7 @@ def test_normals_and_height_flicker_less(moving):
         assert np.mean(joined) < 2 * np.mean(alone) / (STEPS - 1), name
 
 
+@pytest.mark.long
 def test_what_moves_is_what_the_step_alone_found(moving):
     out, moments, _, _ = moving
     for step in range(1, STEPS):
@@ -91,6 +93,7 @@ def test_what_moves_is_what_the_step_alone_found(moving):
         assert error[0] <= 1.02 * error[1]
 
 
+@pytest.mark.long
 def test_the_reports_say_what_was_joined(moving):
     out, _, _, result = moving
     report = json.loads((out / "report.json").read_text())

@@ -33,6 +33,7 @@ def test_the_brightest_pixels_are_as_bright_as_paint_whatever_the_unit_of_the_li
     assert np.allclose(kept.diffuse_albedo[SCENE.mask], SCENE.albedo[SCENE.mask] / 2, rtol=4e-3)
 
 
+@pytest.mark.long
 def test_near_lights_in_large_units_are_relit_and_exported(relit, tmp_path):
     """As near_ps has them: without the distance of the surface, which the solve finds and relight takes from the maps."""
     scene = near_lights.dome(24, perspective=True)

@@ -1,10 +1,10 @@
-"""PTM and RTI files: byte for byte as described, back as written, and refused with a reason."""
+"""PTM and RTI files: byte for byte as described, and shown by a viewer as meant."""
 
 import numpy as np
 import pytest
 
-from stage.errors import ImageError, StorageError
-from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, quantize, read_hsh, read_ptm, write_hsh, write_ptm
+from stage.errors import StorageError
+from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, quantize, write_hsh, write_ptm
 from tests.reference.light_basis import harmonics, polynomial, render_ptm, render_rti
 from tests.scenes.captures import files_in
 
@@ -55,26 +55,6 @@ def test_harmonics_byte_for_byte(tmp_path):
 
 
 @pytest.mark.parametrize("channels", [3, 1])
-def test_a_ptm_comes_back(tmp_path, channels):
-    made = make_ptm(channels)
-    write_ptm(tmp_path / "a.ptm", made)
-    back = read_ptm(tmp_path / "a.ptm")
-    assert np.array_equal(back.stored, made.stored)
-    assert np.array_equal(back.quantization.step, made.quantization.step) and np.array_equal(back.quantization.zero, made.quantization.zero)
-    assert (back.colour is None) == (made.colour is None)
-    assert back.colour is None or np.array_equal(back.colour, made.colour)
-
-
-@pytest.mark.parametrize("terms", [4, 9, 16])
-def test_harmonics_come_back(tmp_path, terms):
-    made = make_hsh(terms)
-    write_hsh(tmp_path / "a.rti", made)
-    back = read_hsh(tmp_path / "a.rti")
-    assert np.array_equal(back.stored, made.stored) and np.array_equal(back.quantization.zero, made.quantization.zero)
-    assert np.allclose(back.quantization.step, made.quantization.step, rtol=1e-6)  # a float times 255 and back
-
-
-@pytest.mark.parametrize("channels", [3, 1])
 def test_a_viewer_shows_a_ptm_as_meant(tmp_path, channels):
     made = make_ptm(channels)
     write_ptm(tmp_path / "a.ptm", made)
@@ -93,56 +73,11 @@ def test_a_viewer_shows_harmonics_as_meant(tmp_path):
     assert np.allclose(render_rti((tmp_path / "a.rti").read_bytes(), LIGHTS), np.clip(wanted, 0, 1), atol=1e-5)
 
 
-def test_a_header_as_the_specification_also_allows_it(tmp_path):
-    """Comments in an RTI file, and line feeds alone."""
-    made = make_hsh(4)
-    write_hsh(tmp_path / "a.rti", made)
-    data = (tmp_path / "a.rti").read_bytes()
-    end = data.index(b"4 2 1\r\n") + 7
-    (tmp_path / "b.rti").write_bytes(b"#HSH1.2\n# by hand\n" + data[9:end].replace(b"\r", b"") + data[end:])
-    assert np.array_equal(read_hsh(tmp_path / "b.rti").stored, made.stored)
-
-
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda data: b"", "is not a PTM file"),
-    (lambda data: data.replace(b"PTM_1.2", b"PTM_1.1"), "is not a PTM file of version 1.2"),
-    (lambda data: data.replace(b"FORMAT_RGB", b"FORMAT_JPEG_RGB"), "is PTM_FORMAT_JPEG_RGB: relit reads"),
-    (lambda data: data.replace(b"RGB\n4\n3\n", b"RGB\n4 3\n\n"), "damaged header: lines 3 to 6"),
-    (lambda data: data.replace(b"RGB\n4\n3\n", b"RGB\n0\n3\n"), "damaged header"),
-    (lambda data: data[:-1], "holds 215 bytes of pixels, 4x3 take 216"),
-    (lambda data: data + b" ", "holds 217 bytes"),
-])
-def test_what_is_no_ptm_is_refused(tmp_path, change, words):
-    write_ptm(tmp_path / "a.ptm", make_ptm(3))
-    (tmp_path / "b.ptm").write_bytes(change((tmp_path / "a.ptm").read_bytes()))
-    with pytest.raises(ImageError, match=words):
-        read_ptm(tmp_path / "b.ptm")
-
-
-@pytest.mark.parametrize(("change", "words"), [
-    (lambda data: b"", "is not an RTI file"),
-    (lambda data: b"PTM" + data, "is not an RTI file"),
-    (lambda data: data.replace(b"\r\n3\r\n", b"\r\n1\r\n"), "is of file type 1"),
-    (lambda data: data.replace(b"9 2 1", b"9 1 1"), "basis type 1"),
-    (lambda data: data.replace(b"9 2 1", b"10 2 1"), "10 terms"),
-    (lambda data: data.replace(b"4 3 3", b"4 x 3"), "damaged header"),
-    (lambda data: data[:-1], "bytes after its header, 4x3 with 9 terms take 396"),
-])
-def test_what_is_no_rti_file_is_refused(tmp_path, change, words):
-    write_hsh(tmp_path / "a.rti", make_hsh(9))
-    (tmp_path / "b.rti").write_bytes(change((tmp_path / "a.rti").read_bytes()))
-    with pytest.raises(ImageError, match=words):
-        read_hsh(tmp_path / "b.rti")
-
-
-def test_a_folder_that_is_none_and_a_file_that_is_not_there(tmp_path):
+def test_a_folder_that_is_none(tmp_path):
     (tmp_path / "file").write_text("x")
     for write, made in ((write_ptm, make_ptm(3)), (write_hsh, make_hsh(4))):
         with pytest.raises(StorageError, match="cannot write"):
             write(tmp_path / "file" / "a", made)
-    for read in (read_ptm, read_hsh):
-        with pytest.raises(StorageError, match="cannot read"):
-            read(tmp_path / "nothing")
     assert files_in(tmp_path) == {"file"}
 
 

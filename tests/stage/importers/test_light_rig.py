@@ -140,7 +140,6 @@ HUGE = "1" + "0" * 400
                                      '{"S": [[1e999,0,0]], "images": []}', f'{{"S": [[{HUGE},0,0]]}}', "3", '"S"', "[[]]", "{}"])
 def test_numbers_that_are_none_are_one_sentence(folder, content):
 
-
     (folder / "light.json").write_text(content)
     for read in (lambda: lights_of(folder), lambda: olat.import_folder(folder, folder, axes=("right", "up", "towards"), to_light=True)):
         with pytest.raises(ManifestError, match=r"light\.json") as caught:

@@ -44,7 +44,6 @@ def solve(radiance, normal, device):
     return single, pairs, *mix_materials(samples, normal, single, pairs, shape=LAMBERT)
 
 
-
 @pytest.mark.parametrize(("metal_rough", "noise"), [(0.3, 0.0), (0.5, 0.0), (0.3, 0.02)])
 def test_gold_on_paint(device, metal_rough, noise):
     """The share of gold is found where both materials are seen; one lobe misses that of most of these pixels by far. Tolerances: the shared

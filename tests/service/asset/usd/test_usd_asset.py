@@ -33,7 +33,8 @@ SURFACES = {
     "bow tie": make_sheet(np.array([[1, 0, 0], [1, 1, 1], [0, 0, 1]], dtype=bool)),
     "2x2": make_sheet(np.ones((2, 2), dtype=bool), diffuse_albedo=np.full((2, 2, 3), 0.5, dtype=np.float32)),
 }
-every_surface = pytest.mark.parametrize("maps", SURFACES.values(), ids=SURFACES)
+KINDS = [("everything", suffix) for suffix in SUFFIXES] + [(name, ".usdz") for name in SURFACES if name != "everything"]
+every_kind = pytest.mark.parametrize(("surface", "suffix"), KINDS)
 
 
 def listing(folder: Path) -> dict[str, bytes]:
@@ -52,10 +53,9 @@ def shader(usd_stage, name):
     return UsdShade.Shader(usd_stage.GetPrimAtPath(f"/Ball/Looks/Material/{name}"))
 
 
-@every_suffix
-@every_surface
-def test_usd_validators_find_nothing(maps, suffix, tmp_path):
-    write_asset(maps, tmp_path / f"ball{suffix}", name="Ball")
+@every_kind
+def test_usd_validators_find_nothing(surface, suffix, tmp_path):
+    write_asset(SURFACES[surface], tmp_path / f"ball{suffix}", name="Ball")
     usd_stage = Usd.Stage.Open(str(tmp_path / f"ball{suffix}"))
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) >= 30
@@ -64,11 +64,10 @@ def test_usd_validators_find_nothing(maps, suffix, tmp_path):
 
 
 @pytest.mark.long
-@every_suffix
-@every_surface
-def test_nvidia_validator_finds_no_failure(maps, suffix, tmp_path):
+@every_kind
+def test_nvidia_validator_finds_no_failure(surface, suffix, tmp_path):
     nvidia = pytest.importorskip("usd_validation_nvidia", reason="usd-validation-nvidia is not installed")
-    write_asset(maps, tmp_path / f"ball{suffix}", name="Ball")
+    write_asset(SURFACES[surface], tmp_path / f"ball{suffix}", name="Ball")
     issues = nvidia.ValidationEngine().validate(str(tmp_path / f"ball{suffix}")).issues()
     found = [(i.severity.name, i.rule.__name__ if i.rule else "", i.message) for i in issues]
     assert found == []
@@ -170,12 +169,10 @@ def test_export_over_an_older_asset(ball, suffix, tmp_path):
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
-@every_suffix
-@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
-def test_full_disk_in_a_texture_leaves_no_trace(ball, suffix, older, tmp_path, monkeypatch):
+@pytest.mark.parametrize("suffix", [".usda", ".usdz"])
+def test_full_disk_in_a_texture_leaves_the_older_asset(ball, suffix, tmp_path, monkeypatch):
     target = tmp_path / f"ball{suffix}"
-    if older:
-        write_asset(SURFACES["diffuse only"], target, name="Ball")
+    write_asset(SURFACES["diffuse only"], target, name="Ball")
     before = listing(tmp_path)
     written = textures.write_png
 
@@ -191,10 +188,8 @@ def test_full_disk_in_a_texture_leaves_no_trace(ball, suffix, older, tmp_path, m
     assert listing(tmp_path) == before and all(not p.name.startswith(".") for p in tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("older", [False, True], ids=["nothing before", "older asset"])
-def test_failure_of_the_last_rename_brings_the_older_textures_back(ball, older, tmp_path, monkeypatch):
-    if older:
-        write_asset(SURFACES["diffuse only"], tmp_path / "ball.usda", name="Ball")
+def test_failure_of_the_last_rename_brings_the_older_textures_back(ball, tmp_path, monkeypatch):
+    write_asset(SURFACES["diffuse only"], tmp_path / "ball.usda", name="Ball")
     before = listing(tmp_path)
 
     def fail(source, destination):

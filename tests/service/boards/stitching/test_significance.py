@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.boards.stitching.comparison import Deviation, bow_and_twist, compare, fit_form
+from service.boards.stitching.comparison import bow_and_twist, compare, fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict, check_regions
 from service.boards.stitching.significance import mean_of, scan_windows, threshold
@@ -13,9 +13,9 @@ GRID = BoardGrid(1e-5, 0.0, 1e-3, 100, 120)
 SIGMA = 1e-6
 
 
-def noise(seed: int = 0, *, shared: float = 0.0, sigma: float = SIGMA) -> Deviation:
+def noise(seed: int = 0, *, shared: float = 0.0, sigma: float = SIGMA) -> HeightMap:
     shape = (GRID.rows, GRID.cols)
-    return Deviation(GRID, sigma * np.random.default_rng(seed).standard_normal(shape), np.full(shape, SIGMA**2), np.full(shape, shared))
+    return HeightMap(GRID, sigma * np.random.default_rng(seed).standard_normal(shape), np.full(shape, SIGMA**2), np.full(shape, shared))
 
 
 def test_thresholds_are_those_of_the_normal_distribution():

@@ -75,7 +75,7 @@ def test_a_sweep_of_stripes(relit, tmp_path, upright):
     assert 0.5 < np.median(np.abs(ratio)) / 0.6745 < 2
 
 
-@pytest.mark.parametrize(("upright", "step"), [(True, 0.004), (False, 0.005)])
+@pytest.mark.parametrize(("upright", "step"), [(True, 0.004), pytest.param(False, 0.005, marks=pytest.mark.long)])
 def test_planes_in_reverse_order_are_refused(relit, tmp_path, upright, step):
     """A sphere before a plane is seen with a relief of 0.2 m; the sweep in its own order is not refused."""
     planes = [plane(step * (number - 6), upright=upright) for number in range(13)]

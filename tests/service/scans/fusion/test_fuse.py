@@ -48,6 +48,7 @@ def test_the_fused_statue_is_better_than_its_scans(fused):
     assert fused.facts["holes"]["edges_of_more_than_two_faces"] == 0
 
 
+@pytest.mark.long
 def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
     ply = read_ply_points(fused.mesh_path)
     assert ply.colours is not None and ply.normals is not None
@@ -57,6 +58,7 @@ def test_vertices_have_the_colours_of_the_places_that_they_show(fused):
     assert np.median((ply.normals * true).sum(axis=1)) > np.cos(np.radians(5))  # 25 pixels with .25 mm of noise give 1°, bends more
 
 
+@pytest.mark.long
 def test_the_report_lists_the_holes_and_what_was_seen(fused):
     facts = json.loads(fused.report_path.read_text())
     holes = facts["holes"]

@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from service.server.api.app import create_app
 from service.server.base.settings import Settings
 from service.server.database.engine import connect
-from service.server.jobs.queue import prepare
+from tests.service.server.prepared import prepare
 
 
 class Call:

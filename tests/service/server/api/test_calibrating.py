@@ -235,6 +235,7 @@ def test_the_brightness_of_lights(server, client, dome):
     assert measured["options"]["capture"] == measured["capture"] == dome
 
 
+@pytest.mark.long
 def test_the_lamps_of_a_rig_are_measured_by_a_job(server, client, relit, tmp_path):
     stage = lamps.make_stage(1, 8)
     rig = lamps.nominal(tmp_path, stage)

@@ -1,12 +1,17 @@
-"""Limits, on a server where they are small: what is too much is refused by name, and the next who asks is served."""
+"""Limits, in a service where they are small: what is too much is refused by name, and the next who asks is served."""
 
 import asyncio
 from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
 
 import httpx2
 import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
 
 from service.requests.base.identifiers import CAPTURE, new_id
+from service.requests.keys import NewKey, Scope
 from service.server.api import context, limits
 from service.server.api.app import create_app
 from service.server.api.limits import CREATION_COST, RateLimiter
@@ -14,30 +19,43 @@ from service.server.api.problems import ApiError
 from service.server.base.settings import Settings
 from service.server.database import intakes, keys
 from service.server.database.engine import Database
-from tests.service.server.api.asgi import Call, asynchronous
+from tests.service.server.api.asgi import Call, app_of, asynchronous
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
-from tests.service.server_process import Server, serving
+from tests.service.server_process import serving
 
 BURST, QUEUED, FRAMES, FILES, BYTES = 30, 2, 10, 2, 1000
 PER_SECOND = 0.01
 """So slow that no test gains a token."""
 
 
+class Site(NamedTuple):
+    """A service in this process."""
+
+    app: FastAPI
+    data: Path
+    database: Database
+
+    def key(self) -> str:
+        return keys.create(self.database, NewKey(project="larch", name="test", scope=Scope.ADMIN))
+
+    def client(self, key: str) -> TestClient:
+        return TestClient(self.app, headers={"Authorization": f"Bearer {key}"})
+
+
 @pytest.fixture(scope="module")
-def small(tmp_path_factory) -> Iterator[tuple[Server, Database]]:
-    with serving(tmp_path_factory.mktemp("limits"), "--device", "none", roots=str(SAMPLES), requests_per_second=str(PER_SECOND),
-                 request_burst=str(BURST), max_queued=str(QUEUED), max_frames=str(FRAMES), max_capture_files=str(FILES),
-                 max_upload_bytes=str(BYTES)) as server, server.database() as database:
-        yield server, database
+def small(tmp_path_factory) -> Iterator[tuple[Site, Database]]:
+    settings = Settings(data=tmp_path_factory.mktemp("limits"), roots=str(SAMPLES), requests_per_second=PER_SECOND, request_burst=BURST,
+                        max_queued=QUEUED, max_frames=FRAMES, max_capture_files=FILES, max_upload_bytes=BYTES, min_free_bytes=0)
+    with app_of(settings) as app:
+        yield Site(app, settings.data, app.state.service.database), app.state.service.database
 
 
 @pytest.fixture
-def client(small) -> Iterator[httpx2.Client]:
+def client(small) -> TestClient:
     """With a key, and so with limits, of its own."""
     server, _ = small
-    with server.client(server.key()) as made:
-        yield made
+    return server.client(server.key())
 
 
 @pytest.fixture
@@ -63,8 +81,7 @@ def test_a_key_that_asks_too_often_waits_and_others_do_not(small, client):
     assert int(response.headers["Retry-After"]) <= 1 / PER_SECOND
     refused(client.post("/v1/captures", json={"name": "x"}), 429, "more than", later=True)
     assert client.get("/healthz").status_code == 200
-    with server.client(server.key()) as other:
-        assert other.get("/v1/jobs").status_code == 200
+    assert server.client(server.key()).get("/v1/jobs").status_code == 200
 
 
 def test_a_key_that_asks_too_often_is_not_even_looked_up(small, monkeypatch):
@@ -154,8 +171,7 @@ def test_a_key_has_no_more_jobs_in_the_queue_than_it_may(small, client, capture)
     made = [client.post("/v1/jobs", json=job).raise_for_status().json()["id"] for _ in range(QUEUED)]
     refused(client.post("/v1/jobs", json=job), 429, f"{QUEUED} jobs of this key have not begun", later=True)
     assert len(client.get("/v1/jobs", params={"state": "queued"}).json()["jobs"]) == QUEUED  # nothing of it is left
-    with server.client(server.key()) as other:
-        assert other.post("/v1/jobs", json=job).status_code == 202
+    assert server.client(server.key()).post("/v1/jobs", json=job).status_code == 202
     client.post(f"/v1/jobs/{made[0]}/cancel").raise_for_status()
     assert client.post("/v1/jobs", json=job).status_code == 202
     refused(client.post(f"/v1/jobs/{made[0]}/resume"), 429, "have not begun", later=True)

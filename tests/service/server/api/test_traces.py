@@ -42,7 +42,7 @@ class Collector(BaseHTTPRequestHandler):
 def collector() -> Iterator[tuple[str, list]]:
     spans: list = []
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Collecting", (Collector,), {"spans": spans}))
-    thread = threading.Thread(target=server.serve_forever)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}", spans
     server.shutdown()

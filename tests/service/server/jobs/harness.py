@@ -20,8 +20,9 @@ from service.requests.relight import RelightOptions
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, workers
 from service.server.database.engine import connect
-from service.server.jobs.queue import JobQueue, prepare, workflow_id
+from service.server.jobs.queue import JobQueue, workflow_id
 from service.server.storage import layout
+from tests.service.server.prepared import prepare
 from tests.service.server_process import JsonLog, environment_with
 from tests.service.waiting import until
 

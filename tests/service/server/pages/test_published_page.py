@@ -1,9 +1,6 @@
 """The page of relit publish --as web in a browser, from a server of files that knows nothing of Relit."""
 
 import re
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import cv2
@@ -12,7 +9,7 @@ import pytest
 
 from service.publish.publish import publish
 from service.requests.publish import PublishRequest
-from tests.service.publish.published import shown
+from tests.service.publish.published import Files, served, shown
 from tests.service.server.pages.axe import violations
 from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
 
@@ -20,20 +17,6 @@ MOST_BYTES = 2_000_000
 """What the page may weigh until its first picture, tiles included."""
 NOTES = ('[{"body": "The beak", "target": "#xywh=145,70,30,50"},'
          ' {"body": "An eye", "target": {"selector": {"type": "PointSelector", "x": 128, "y": 80}}}]')
-
-
-class Files(SimpleHTTPRequestHandler):
-    """Serves files, and counts their bytes."""
-
-    sent = 0
-
-    def copyfile(self, source, outputfile):
-        content = source.read()
-        Files.sent += len(content)
-        outputfile.write(content)
-
-    def log_message(self, *_):
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +27,8 @@ def owl(tmp_path_factory):
     common = {"capture": SAMPLES / "owl", "cache": folder / "cache"}
     publish(PublishRequest(out=folder / "planes", kind="openlime", **common))
     publish(PublishRequest(out=folder / "page", kind="web", annotations=folder / "notes.json", attribution="Relit's sample", **common))
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Files, directory=folder / "page")) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield folder / "planes", f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    with served(folder / "page") as address:
+        yield folder / "planes", address
 
 
 @pytest.fixture(params=[False])
@@ -128,6 +109,42 @@ def test_the_page_can_be_used_by_everybody(owl, page, viewport):
     picture(page)
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl, page):
+    page.goto(owl[1])
+    picture(page)
+    page.locator("#embed summary").click()
+    code = page.locator("#embed textarea").input_value()
+    bar = page.locator("#scale")
+    length = {"4 cm": 40, "5 cm": 50, "2 cm": 20, "1 cm": 10}[bar.inner_text()]
+    zoom = page.evaluate("document.getElementById('stage').getBoundingClientRect().height") / 320  # the whole height is shown
+    assert bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
+    page.locator("#full").click()
+    page.wait_for_function("document.fullscreenElement?.id === 'stage'")
+    page.keyboard.press("Escape")
+    page.route(f"{owl[1]}museum.html", lambda route: route.fulfill(body=code, content_type="text/html"))
+    page.goto(f"{owl[1]}museum.html")
+    frame = page.frame_locator("iframe")
+    frame.locator("#picture[data-ready='whole']").wait_for()
+    assert frame.locator("h1").count() == 0 or not frame.locator("h1").is_visible()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("page", [True], indirect=True)
+def test_two_fingers_zoom(owl, page):
+    page.goto(owl[1])
+    picture(page)
+    box, fingers = page.locator("#picture").bounding_box(), page.context.new_cdp_session(page)
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 80), ("touchEnd", None)):
+        points = [] if apart is None else [{"x": middle[0] + side * apart, "y": middle[1], "id": number}
+                                           for number, side in enumerate((-1, 1))]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    page.wait_for_function("location.hash.includes('zoom=')")
+    assert float(re.search(r"zoom=([\d.]+)", page.evaluate("location.hash"))[1]) == pytest.approx(2, rel=0.02)  # from 80 to 160 pixels
 
 
 def test_a_folder_that_lacks_its_tiles_says_so(owl, browser):

@@ -10,10 +10,11 @@ from service.requests.jobs import SolveJob
 from service.server.base.settings import Settings
 from service.server.database import intakes, jobs, tables
 from service.server.database.engine import connect
-from service.server.jobs.queue import JobQueue, prepare
+from service.server.jobs.queue import JobQueue
 from service.server.process.housekeeping import Housekeeper
 from service.server.storage import layout
 from service.server.storage.objects import open_storage
+from tests.service.server.prepared import prepare
 
 DAYS = 30.0
 PROJECT = "larch"

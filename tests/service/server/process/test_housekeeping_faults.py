@@ -1,7 +1,6 @@
 """What the service clears away when a piece of the work fails, and when its clock is set."""
 
 
-
 from service.requests.base.identifiers import CAPTURE, new_id
 from service.server.database import jobs
 from service.server.process import housekeeping

@@ -76,7 +76,7 @@ def test_the_warnings_tell_shadows_that_contradict_each_other_from_none():
     assert parts[1].facts()["contradiction"] == 0.5 and "contradiction" not in parts[2].facts()
 
 
-@pytest.mark.parametrize("radius", [0.08, 0.11])
+@pytest.mark.parametrize("radius", [0.08, pytest.param(0.11, marks=pytest.mark.long)])
 def test_a_thin_rod_is_a_part_though_its_normals_turn_everywhere(radius, tmp_path):
     """Three pixels in radius, so that normals turn by 20 to 30° from pixel to pixel. Cut at all of these turns, nothing of it was a part.
 

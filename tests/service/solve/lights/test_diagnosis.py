@@ -141,8 +141,7 @@ def test_mirrored_axes_of_a_relief_that_fills_the_image_leave_two_choices(tmp_pa
 def test_a_perspective_camera_sees_wrong_axes_too(tmp_path):
     scene, camera = seen_from_near(size=112)
     assert alarms(solved(tmp_path / "right", scene, camera=camera)) == []
-    for name, matrix, words in (("y", [1, -1, 1], "with y negated"), ("both", [-1, -1, 1], "with x and y negated"),
-                                ("behind", [1, 1, -1], "with z negated")):
+    for name, matrix, words in (("both", [-1, -1, 1], "with x and y negated"), ("behind", [1, 1, -1], "with z negated")):
         result = solved(tmp_path / name, scene._replace(directions=scene.directions * matrix), camera=camera)
         assert words in alarms(result)[0]
 

@@ -54,6 +54,7 @@ def test_a_gross_error_still_alarms(wrong):
     assert report["suspect_lights"][0]["image"] == f"{GROSS:03d}.exr"
 
 
+@pytest.mark.long
 def test_what_the_first_estimate_leaves_is_refined_with_lobes(tmp_path, monkeypatch):
     """The first estimate is held to a gain that nothing has, so that the refinement of `svbrdf` has the errors to itself."""
     monkeypatch.setattr("service.solve.lights.intensities.LEAST_GAIN", 2.0)
@@ -90,6 +91,7 @@ def test_undeclared_intensities_do_no_harm_to_robust_normals(tmp_path, lights):
     assert "light_intensities" not in report["found"]
 
 
+@pytest.mark.long
 def test_declared_intensities_are_not_refined_by_lobes_either(tmp_path):
     _, report = solved(tmp_path, np.exp(np.random.default_rng(2).normal(0, 0.06, LIGHTS)), intensities="declared")
     assert "light_factors" not in report["found"]

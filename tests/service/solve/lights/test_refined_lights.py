@@ -30,7 +30,8 @@ def solved(tmp_path, scene, directions, lights="refined", **options):
     return result, json.loads((tmp_path / lights / "report.json").read_text()), error
 
 
-@pytest.mark.parametrize(("count", "part"), [(LIGHTS, 0.5), (12, 0.7)])  # √(9/2n) of independent errors is left: 0.39 and 0.61
+# √(9/2n) of independent errors is left: 0.39 and 0.61
+@pytest.mark.parametrize(("count", "part"), [(LIGHTS, 0.5), pytest.param(12, 0.7, marks=pytest.mark.long)])
 def test_errors_of_five_degrees_are_refined(tmp_path, count, part):
     scene = ellipsoid(count=count)
     rough = turned(scene.directions, 5)

@@ -1,0 +1,105 @@
+"""A dome of 96 lamps over sACN and a camera at a USB port, both the twin's: the lamps light, and libgphoto2's virtual camera takes what is
+on its card.
+
+The card is full after 26 pictures, so the capture goes on several times.
+"""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from stage.formats import images
+from stage.transforms import fibonacci_sphere
+from tests.scenes.captures import make_scene, render, write_capture
+from tests.scenes.patched_rigs import loopback
+from tests.scenes.rigs import write_rig
+from tests.service.acquisition.test_cameras import virtual_camera
+
+LAMPS = 96
+RUNS = 6
+"""More than cards are filled: of the 26 pictures on a card one is taken to see that nothing has moved."""
+SIZE = 48
+CAPTURE = """
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from service.acquisition.acquire import acquire, refuse_to_ask
+from service.acquisition.lights.dmx import DmxSwitch
+from service.errors import RequestError
+from service.requests.acquire import AcquireRequest
+from service.requests.play import PictureFormat, TwinRequest
+from service.twin.camera import TwinCamera, card_kept
+from service.twin.listener import Listener
+from service.twin.twin import open_twin
+from stage.rig.patch import levels_of_universes
+
+folder, host = Path(sys.argv[1]), sys.argv[2]
+request = TwinRequest(rig=folder / "rig.json", capture=folder / "scene", interface=host, pictures=folder / "card",
+                      picture_format=PictureFormat.CARD)
+twin = open_twin(request)
+with Listener(twin.universes, host, keep=False) as listener:
+    camera = TwinCamera(twin.rig, twin.picture, listener, request.pictures, request)
+    send = DmxSwitch.set
+
+    def send_and_settle(switch, levels):  # no time is long enough on every machine
+        send(switch, levels)
+        while True:
+            frame = listener.last
+            if np.array_equal(levels_of_universes(twin.rig, dict(frame.values)), levels) and camera.on_card >= frame.number:
+                return
+            time.sleep(0.001)
+
+    DmxSwitch.set = send_and_settle
+    with card_kept(camera):
+        try:
+            result = acquire(AcquireRequest(plan=str(folder / "plan.json"), rig=folder / "rig.json", camera="gphoto2",
+                                            out=folder / "capture"), refuse_to_ask)
+        except RequestError as error:
+            sys.exit(str(error))
+print([fault.sentence for fault in result.faults])
+"""
+
+
+@pytest.mark.long
+def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
+    """Each picture is that of its lamp, and what is solved of them is what is solved of the same files when they are imported."""
+    scene = make_scene(size=SIZE)
+    directions, light = fibonacci_sphere(220)[:LAMPS], np.ones((LAMPS, 3))  # none below 7 degrees, where the cap is nearly dark
+    scene = scene._replace(directions=directions, irradiance=light, images=render(scene.normal, scene.albedo, directions, light))
+    write_capture(tmp_path / "scene", scene)
+    write_rig(tmp_path / "rig.json", directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()))
+    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat"}]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "card").mkdir()
+    environment, full = virtual_camera(tmp_path / "card"), 0
+    for _ in range(RUNS):
+        done = subprocess.run([sys.executable, "-c", CAPTURE, str(tmp_path), host], env=environment, capture_output=True, text=True,
+                              timeout=300)
+        full += "the card of the camera is full" in done.stderr
+        if done.returncode == 0:
+            break
+        assert "the card of the camera is full" in done.stderr, done.stderr
+    assert full >= 2 and done.stdout.splitlines()[-1] == "[]", done.stderr
+    capture, imported = tmp_path / "capture", tmp_path / "imported"
+    frames = json.loads((capture / "capture.json").read_text())["frames"]
+    towards = np.array([frame["light"]["direction"] for frame in frames])
+    assert np.array_equal((towards @ directions.T).argmax(axis=1), np.arange(LAMPS))
+    codes = np.array([images.read_pixels(capture / frame["image"]) for frame in frames], dtype=np.float64)
+    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    assert np.array_equal([np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen], np.arange(LAMPS))
+    rows = [" ".join([frame["image"], *map(repr, frame["light"]["direction"])]) for frame in frames]
+    (capture / "dome.lp").write_text("\n".join([str(LAMPS), *rows]))
+    relit.done("import", "lp", capture / "dome.lp", imported, "--color-space", "srgb_texture")
+    for folder in (capture, imported):
+        relit.done("solve", folder, "--method", "lambert", "--out", folder / "maps")
+    maps = [OpenEXR.File(str(folder / "maps" / "maps.exr"), separate_channels=True).channels() for folder in (capture, imported)]
+    assert maps[0].keys() == maps[1].keys()
+    for name, channel in maps[0].items():
+        assert np.array_equal(channel.pixels, maps[1][name].pixels, equal_nan=True), name
