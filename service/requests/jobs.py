@@ -7,6 +7,7 @@ from pydantic import Field, TypeAdapter, ValidatorFunctionWrapHandler, WrapValid
 
 from service.requests.base.base import CAPTURE, JobRequest, Role, SequenceOptions, Spelling
 from service.requests.base.identifiers import JOB, CaptureId, EnvironmentId, JobId, pattern
+from service.requests.base.import_choices import ImportChoices
 from service.requests.basis import BasisOptions
 from service.requests.calibration_jobs import AnyCalibration
 from service.requests.captures import ViewOptions
@@ -31,10 +32,15 @@ MOST_SCANS = 500
 
 
 class CheckJob(JobRequest):
-    """Check that a capture or environment can be used: manifest, headers and the size of images. The service makes this job on its own."""
+    """Check that a capture or environment can be used: manifest, headers and the size of images; before that, import files without a
+    manifest, or only look what they are. The service makes this job on its own."""
 
     kind: Literal["check"]
     intake: Line
+    guess: bool = False
+    """Whether to look what the files are, and to propose an import, in place of a check."""
+    importing: ImportChoices | None = None
+    """The import of the files that is done before the check; None: they have a manifest."""
 
 
 class SolveJob(JobRequest):

@@ -93,9 +93,10 @@ def gray(folder: Folder, shown: Pictures) -> Guess | None:
     chosen = [] if len(shown.others) == 0 else ["--images", spelling(shown.names[0])]
     if stripes.sequence == plain and stripes.inverses == "pairs" and not stripes.fine_first and not chosen and sure:
         return made("a Gray code in OpenCV's order", reason, ["opencv-gray", folder.path, *words], folder.path, solve=False, sure=True,
-                    assumed=assumed)
+                    assumed=assumed, summary=f"{len(shown.names)} images of a Gray code in OpenCV's order")
     order = ["--sequence", ",".join(stripes.sequence), "--inverses", stripes.inverses, *(["--fine-first"] if stripes.fine_first else [])]
-    return made("a Gray code", reason, ["gray", folder.path, *words, *order, *chosen], folder.path, solve=False, sure=sure, assumed=assumed)
+    return made("a Gray code", reason, ["gray", folder.path, *words, *order, *chosen], folder.path, solve=False, sure=sure, assumed=assumed,
+                summary=f"{len(shown.names)} images of a Gray code")
 
 
 def _half_lit(folder: Folder, shown: Pictures) -> Guess | None:
@@ -146,7 +147,8 @@ def phase(folder: Folder, shown: Pictures) -> Guess | None:
             periods = ",".join(numbers if told else [f"P{n + 1}" for n in range(len(groups))])
             return made("phase shifts", f"the sums of each {steps} images are alike", [
                 "phase", folder.path, "--projector", "WIDTHxHEIGHT", "--periods", periods, "--steps", steps,
-                *(["--axis", axis] if axis == "row" else [])], folder.path, solve=False, assumed=(
+                *(["--axis", axis] if axis == "row" else [])], folder.path, solve=False,
+                summary=f"{count} images of phase shifts: {len(groups)} waves in {steps} steps", assumed=(
                     "WIDTHxHEIGHT is the projector in pixels" + ("" if told else ", P1 and so on are the periods in its pixels"),
                     *((f"the names of the images have the periods, {periods} pixels of the projector",) if told else ()),
                     f"the {axis}s are coded, and waves move to larger ones: else --axis and --shift"))
@@ -180,7 +182,8 @@ def photos(folder: Folder, shown: Pictures) -> Guess | None:
         f"three of them explain the others to {100 * left_over:.0f} %, as those of one object under far lights" if smooth else
         f"three of them leave {100 * left_over:.0f} % of the others unexplained, which is much for one object under far lights"),
         ["photos", folder.path, *(["--images", spelling(shown.names[0])] if shown.others else [])], folder.path, solve=True,
-        sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1, assumed=(
+        sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1,
+        summary=f"{len(shown.names)} photographs under lights of which nothing says where they were", assumed=(
             "each image has one far light of its own, and the camera stood still", *_left_out(shown), *encoding(folder)))
     return found._replace(then=found.then + " --lights unknown")
 

@@ -10,10 +10,13 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from service.requests.base.base import Choice, Commas, JobRequest, Role
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
+from service.requests.base.import_choices import Layout
 from service.requests.base.options import Option, help_text, is_document, places_of, typed
+from service.requests.imports.layouts import LAYOUTS, options_of_layout
 from service.requests.jobs import JOBS
 
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
@@ -65,7 +68,7 @@ class Field(NamedTuple):
     off: str
     is_argument: bool
     choices: tuple[tuple[str, str], ...]
-    """Values and their words, of a select."""
+    """Values and their words, of a select; examples of a text."""
     default: str
     required: bool
     low: str
@@ -95,6 +98,11 @@ def form_of(kind: str, model: type[JobRequest]) -> Form:
     main = [field for is_input, field in fields if is_input] + [field for is_input, field in fields if field.required and not is_input]
     return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(main),
                 tuple(field for _, field in fields if field not in main))
+
+
+def import_fields(layout: Layout) -> list[Field]:
+    """Return the controls of the options of an import, by the names that the API has."""
+    return [_field(LAYOUTS[layout], (name,), option) for name, option in options_of_layout(layout).items()]
 
 
 def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Field:
@@ -130,7 +138,13 @@ def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:
         return "number", "integer", ()
     if kind is float:
         return "number", "number", ()
-    return "text", "string", ()
+    return "text", "string", tuple((str(each), "") for each in _examples(option))
+
+
+def _examples(option: Option) -> list[Any]:
+    """Return the examples that a field, or the type of its values, declares."""
+    kinds = [option.field, *map(FieldInfo.from_annotation, get_args(option.field.annotation))]
+    return next((kind.examples for kind in kinds if kind.examples), [])
 
 
 def _bare(kind: Any) -> Any:

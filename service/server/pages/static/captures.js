@@ -1,9 +1,10 @@
 /** The page of captures and environments: lists them, and uploads new ones. */
 
-import { attempt, listing, Refusal } from "./api.js";
-import { bytes, byId, element, time } from "./element.js";
-import { chosenFolder, droppedFiles, faultOfCapture, isEnvironment } from "./local_files.js";
-import { Stopped, upload } from "./upload.js";
+import { attempt, listing, post, Refusal } from "./api.js";
+import { bytes, byId, element, rate, time } from "./element.js";
+import { chosenFolder, droppedFiles, isCapture, isEnvironment } from "./local_files.js";
+import { proposalOf } from "./proposal.js";
+import { settled, Stopped, upload } from "./upload.js";
 
 async function list(what) {
   const body = byId(what).tBodies[0];
@@ -12,38 +13,58 @@ async function list(what) {
     const name = what === "captures" ? element("a", { href: `/captures/${item.id}` }, item.name) : item.name;
     rows.push(element("tr", {}, element("td", {}, name, " ", element("small", {}, item.id)),
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
-      element("td", {}, item.problem ?? content(item.facts)), element("td", {}, time(item.created_at))));
+      element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
   }
   body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
 }
 
+/** Return the button that asks how files are imported that were looked at, perhaps in another tab; null where there is nothing to ask. */
+function question(item) {
+  if (item.facts?.proposal === undefined || item.state === "checking") return null;
+  const ask = () => {
+    const status = element("span", { role: "status" });
+    const line = element("li", {}, element("strong", {}, item.name), " ", status);
+    byId("uploads").append(line);
+    line.scrollIntoView({ block: "nearest" });
+    return attempt(() => end("captures", { ...item, state: "receiving" }, line, status, { signal: new AbortController().signal, lost: () => {} }));
+  };
+  return element("button", { type: "button", class: "quiet", onclick: ask }, "Choose and import");
+}
+
 function content(facts) {
   if (facts === null) return "";
+  if (facts.proposal !== undefined) return facts.proposal.summary;
   const parts = [];
   if (facts.frames !== undefined) parts.push(`${facts.frames} frames`);
   if (facts.resolution !== undefined) parts.push(facts.resolution.join(" × "));
   return parts.join(", ");
 }
 
-async function begin(what, name, files) {
+async function begin(what, name, files, then = "validate") {
   const stop = new AbortController();
-  const status = element("span", {}, "beginning");
+  const status = element("span", { role: "status" }, "beginning");
   const bar = element("progress", { "aria-label": `Upload of ${name}` });
   const button = element("button", { type: "button", class: "quiet", onclick: () => stop.abort() }, "Stop");
   const line = element("li", {}, element("strong", {}, name), " ", bar, " ", button, " ", status); // a text that grows moves no button
   byId("uploads").append(line);
   const leaving = (event) => event.preventDefault();
   addEventListener("beforeunload", leaving);
+  let told = "";
+  const link = { signal: stop.signal, lost: (isLost) => {
+    status.textContent = isLost ? "The server cannot be reached. The upload waits, and goes on by itself." : told;
+  } };
+  let begun;
   try {
     const found = await upload(what, name, files, (sent, total, doing) => {
+      begun ??= { sent, at: performance.now() }; // what the server has already is no rate
       bar.max = Math.max(total, 1);
       bar.value = sent;
-      status.textContent = doing === "checking" ? "complete, being checked" : `${bytes(sent)} of ${bytes(total)}`;
-    }, stop.signal);
+      told = doing === "checking" ? (then === "guess" ? "complete, being looked at" : "complete, being checked") :
+        `${bytes(sent)} of ${bytes(total)}${rate(sent - begun.sent, total - begun.sent, (performance.now() - begun.at) / 1000)}`;
+      status.textContent = told;
+    }, link, then);
     bar.remove();
-    status.className = found.state === "refused" ? "fault" : "";
-    status.textContent = found.state === "refused" ? found.problem : "ready";
-    if (what === "captures") status.append(" ", element("a", { href: `/captures/${found.id}` }, "Look at it"));
+    await end(what, found, line, status, link);
   } catch (error) {
     if (!(error instanceof Refusal || error instanceof Stopped || error.name === "AbortError")) throw error;
     bar.remove();
@@ -56,13 +77,50 @@ async function begin(what, name, files) {
   }
 }
 
-function take(found) {
+/** Show how an upload ended: ready, refused, or with the question what the files are. */
+async function end(what, found, line, status, link) {
+  status.className = found.state === "refused" ? "fault" : "";
+  status.textContent = found.problem ?? (found.state === "ready" ? "ready" : "");
+  if (what !== "captures") return;
+  if (found.state !== "receiving") {
+    status.append(" ", element("a", { href: `/captures/${found.id}` }, "Look at it"));
+    return;
+  }
+  line.append(await proposalOf(found, async (importing) => {
+    status.textContent = "being imported";
+    const imported = await settled(importing, "captures", link);
+    if (imported.state === "ready") await end(what, imported, line, status, link);
+    else status.textContent = "";
+    await list(what);
+    return imported;
+  }));
+}
+
+async function take(found) {
   const single = found.files.length === 1 && !found.files[0].path.includes("/") ? found.files[0] : null;
   if (single !== null && isEnvironment(found.name)) return begin("environments", found.name.replace(/\.\w+$/, ""), [single]);
-  const fault = faultOfCapture(found);
-  if (fault === null) return begin("captures", found.name, found.files);
-  byId("uploads").append(element("li", { class: "fault" }, fault));
-  return Promise.resolve();
+  if (isCapture(found)) return begin("captures", found.name, found.files);
+  try {
+    const local = new Map(found.files.map(({ path, file }) => [path, file]));
+    const { captures } = await post("/v1/needed-files",
+      { files: found.files.map(({ path, file }) => ({ path, length: file.size })) });
+    leftOut(found, captures.flatMap(({ files }) => files));
+    return Promise.all(captures.map(({ folder, files }) => begin("captures", folder === "" ? found.name : `${found.name}/${folder}`,
+      files.map(({ path, name }) => ({ path: name, file: local.get(path) })), "guess")));
+  } catch (error) {
+    if (!(error instanceof Refusal)) throw error;
+    byId("uploads").append(element("li", { class: "fault" }, `${found.name}: ${error.message}`));
+    return undefined;
+  }
+}
+
+/** Say what of a folder is not sent. */
+function leftOut({ name, files }, needed) {
+  const left = files.filter(({ path }) => !needed.some((each) => each.path === path));
+  if (left.length === 0) return;
+  const size = left.reduce((sum, { file }) => sum + file.size, 0);
+  byId("uploads").append(element("li", { class: "left-out" }, `${name}: ${left.length} ${left.length === 1 ? "file" : "files"} of ${bytes(size)} ` +
+    `that no import needs ${left.length === 1 ? "stays" : "stay"} on this machine`));
 }
 
 const drop = byId("drop");
