@@ -1,10 +1,12 @@
 /** Requests to the API of this server, with the key of the person who looks. */
 
-import { byId, element, tell } from "./element.js";
+import { byId, element, show, tell } from "./element.js";
+import { showFaultPage } from "./fault_page.js";
 
 const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
 let asking = null;
+let loading = 0; // actions under way
 
 /** A request that the server refused, with its sentence. */
 export class Refusal extends Error {
@@ -36,6 +38,7 @@ export function hasKey() {
  * @returns {Promise<Response>} The answer, whose status is below 400.
  */
 export async function send(path, options = {}) {
+  const key = sessionStorage.getItem(KEY);
   let answer;
   try {
     answer = await fetch(path, { ...options, headers: { ...credentials(), ...options.headers }, redirect: "error" });
@@ -44,8 +47,11 @@ export async function send(path, options = {}) {
     throw new Refusal(0, UNREACHABLE);
   }
   if (answer.ok) return answer;
-  if (answer.status === 401 && (await askForKey())) return send(path, options);
-  throw await refusal(answer);
+  const refused = await refusal(answer);
+  if (refused.status !== 401) throw refused;
+  const isNew = sessionStorage.getItem(KEY) !== key; // another request has asked for it meanwhile
+  if (isNew || (await askForKey(key === null ? "" : refused.message))) return send(path, options);
+  throw refused;
 }
 
 /** Return the refusal of an answer, with the sentence of its problem document. */
@@ -123,23 +129,37 @@ export async function* listing(path, field, cursor = "before") {
   } while (next !== null);
 }
 
-/** Run what a page does, and tell the person why where it fails. */
+/** Run what a page does, and tell the person why where it fails, with a button that tries again where that may help. */
 export async function attempt(action) {
+  loading += 1;
   try {
     return await action();
   } catch (error) {
     if (!(error instanceof Refusal)) console.error(error);
-    tell(error instanceof Refusal ? error.message : `This page failed: ${error.message}`);
+    const passes = error instanceof Refusal && (error.status === 0 || error.status === 429 || error.status >= 500);
+    if (isAboutThePage(error)) showFaultPage(error.message);
+    else tell(error instanceof Refusal ? error.message : `This page failed: ${error.message}`, "fault", passes ? () => attempt(action) : null);
     return undefined;
+  } finally {
+    loading -= 1;
+    if (loading === 0) byId("main").removeAttribute("aria-busy");
   }
 }
 
-/** Show the dialog for a key, once however many requests wait for it; return whether one was given. */
-function askForKey() {
+/** Return whether an error says that the capture or job that the page shows does not exist. */
+function isAboutThePage(error) {
+  const { identifier } = byId("main").dataset;
+  return identifier !== undefined && error instanceof Refusal && error.status === 404 && error.message.includes(identifier);
+}
+
+/** Show the dialog for a key, once however many requests wait for it; return whether one was given. `fault` says what is wrong with the last. */
+function askForKey(fault = "") {
   asking ??= new Promise((resolve) => {
     const dialog = byId("key-dialog");
     const value = byId("key-value");
     value.value = "";
+    byId("key-fault").textContent = fault;
+    show(byId("key-fault"), fault !== "");
     dialog.addEventListener("close", () => {
       asking = null;
       const given = dialog.returnValue === "save" && value.value.trim() !== "";
