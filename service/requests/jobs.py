@@ -146,7 +146,7 @@ class FuseJob(JobRequest):
 
 
 class ViewJob(JobRequest):
-    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg and the pictures of the card."""
+    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, and small pictures."""
 
     kind: Literal["view"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]

@@ -28,7 +28,7 @@ FIRST_LIGHT = (0.45, 0.5, 0.74)
 """Direction of the light of the picture: above right of the camera, as on the page that relights."""
 WHITE_PERCENTILE = 99.0
 MAT = 0x2B / 255
-"""Display value of the neutral grey behind the object; `--mat` in static/tokens.css of the pages is the same."""
+"""Display value of the neutral grey behind the object; `--mat` in static/look/tokens.css of the pages is the same."""
 QUALITY = 85
 
 
