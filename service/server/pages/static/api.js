@@ -1,9 +1,12 @@
 /** Requests to the API of this server, with the key of the person who looks. */
 
 import { byId, element, tell } from "./element.js";
+import { answers, reloadWhenBack, repeated } from "./repeat.js";
 
 const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
+const LOADING = "Loading …"; // of the templates
+const PASSING = [0, 429, 502, 503, 504]; // statuses of what may succeed soon
 let asking = null;
 
 /** A request that the server refused, with its sentence. */
@@ -60,9 +63,30 @@ export async function refusal(answer) {
   return new Refusal(answer.status, sentence);
 }
 
+/**
+ * Ask for something until all of it is here: a lost connection, a server that is restarted and an answer that breaks off are tried again.
+ * @param {string} path Of this server.
+ * @param {function(Response): Promise<any>} take Reads the body, and throws where it is not whole.
+ * @param {Object<string, string>} [headers] Of the request.
+ */
+export function fetched(path, take, headers = {}) {
+  return repeated(async (failed) => {
+    const answer = await send(path, { headers, cache: failed === 0 ? "no-cache" : "no-store" }); // what a browser has kept may be the fault
+    try {
+      return await take(answer);
+    } catch (error) {
+      throw new Refusal(0, `${path} broke off: ${error.message}`);
+    }
+  }, mayPass);
+}
+
+function mayPass(error) {
+  return error instanceof Refusal && PASSING.includes(error.status);
+}
+
 /** Return the JSON that a path gives. */
-export async function read(path) {
-  return (await send(path)).json();
+export function read(path) {
+  return fetched(path, (answer) => answer.json());
 }
 
 /** Send JSON and return the JSON of the answer; null where it has none. */
@@ -75,6 +99,12 @@ export async function post(path, body = undefined, headers = {}) {
 /** Return an Idempotency-Key: a request that is sent again with it creates nothing again. */
 export function newToken() {
   return crypto.getRandomValues(new Uint32Array(4)).join("-");
+}
+
+/** Submit a job, once however often its request has to be sent, and return it. */
+export function submitJob(request) {
+  const headers = { "Idempotency-Key": newToken() };
+  return repeated(() => post("/v1/jobs", request, headers), mayPass);
 }
 
 /** Delete what is at a path. */
@@ -94,14 +124,18 @@ export function resultsOf(job) {
     bytes: async (name, offset = undefined, length = undefined) => {
       if (length === 0) return new ArrayBuffer(0);
       const headers = offset === undefined ? {} : { Range: `bytes=${offset}-${offset + length - 1}` };
-      return (await send(at(name), { headers })).arrayBuffer();
+      return fetched(at(name), async (answer) => {
+        const found = await answer.arrayBuffer(); // going Back, Chromium gives parts from its cache that have their length in the header and no bytes
+        if (length !== undefined && found.byteLength !== length) throw new Error(`${found.byteLength} of ${length} bytes came`);
+        return found;
+      }, headers);
     },
   };
 }
 
 /** Save a file of this server with the key of this tab, which a plain link would not send. */
 export async function save(path) {
-  const address = URL.createObjectURL(await (await send(path)).blob());
+  const address = URL.createObjectURL(await fetched(path, (answer) => answer.blob()));
   element("a", { href: address, download: path.split("/").at(-1) }).click();
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
@@ -134,6 +168,40 @@ export async function attempt(action) {
   }
 }
 
+/**
+ * Load what a page shows. What fails because the server is away loads the page again when it is back; else a button does what helps.
+ * @param {function(): Promise<void>} action
+ */
+export async function load(action) {
+  try {
+    await action();
+  } catch (error) {
+    const isAway = error.status === 0 || /import/i.test(error.message); // a module that could not be fetched is not asked for again by this page
+    if (!(error instanceof Refusal || isAway)) console.error(error);
+    tell(error instanceof Refusal ? error.message : isAway ? UNREACHABLE : `This page failed: ${error.message}`, "fault", remedy(error.status));
+    if (isAway) reloadWhenBack();
+  } finally {
+    const state = document.getElementById("state");
+    if (state?.textContent === LOADING) state.textContent = "";
+  }
+}
+
+/** Return what a person can do about a status, as a button or link. */
+function remedy(status) {
+  const button = (text, onclick) => element("button", { type: "button", onclick }, text);
+  if (status === 401 || status === 403) return button("Use another key", changeKey);
+  if (status === 404) return element("a", { class: "button", href: "/captures" }, "See the captures");
+  const again = button("Load again", async () => {
+    if (await answers()) location.reload();
+    else again.textContent = "Still away. Load again";
+  });
+  return again;
+}
+
+async function changeKey() {
+  if (await askForKey()) location.reload();
+}
+
 /** Show the dialog for a key, once however many requests wait for it; return whether one was given. */
 function askForKey() {
   asking ??= new Promise((resolve) => {
@@ -153,6 +221,5 @@ function askForKey() {
   return asking;
 }
 
-byId("key").addEventListener("click", async () => {
-  if (await askForKey()) location.reload();
-});
+byId("key").addEventListener("click", changeKey);
+byId("stuck").remove(); // all modules of the page are here

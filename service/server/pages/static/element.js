@@ -67,9 +67,9 @@ export function factText(name, value) {
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
-/** Tell the person something, below the page and to screen readers. */
-export function tell(sentence, kind = "fault") {
-  const line = element("p", { class: kind }, sentence);
+/** Tell the person something, below the page and to screen readers, with a button or link that does something about it. */
+export function tell(sentence, kind = "fault", remedy = null) {
+  const line = element("p", { class: kind }, sentence, remedy);
   line.append(element("button", { type: "button", class: "quiet", "aria-label": "Dismiss", onclick: () => line.remove() }, "×"));
   byId("message").replaceChildren(line);
 }
