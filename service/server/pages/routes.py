@@ -33,12 +33,16 @@ HEADERS = {
 }
 """Headers of every page. Loaders of three.js read textures through blob: addresses, which they make themselves."""
 
+NAVIGATION = [("/", "Home"), ("/captures", "Captures"), ("/jobs", "Jobs"), ("/machines", "Machines")]
+"""Addresses and names of the pages in the header."""
+
 router = APIRouter(include_in_schema=False)
 set_router = APIRouter(include_in_schema=False)
 """The page of the stage at this machine, where there is one."""
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
-templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP)
+templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, navigation=NAVIGATION)
+templates.globals.update({name: getattr(templates.get_template("parts.html").module, name) for name in ("icon", "skeleton")})
 
 
 class StaticModules(StaticFiles):
@@ -68,6 +72,12 @@ async def home(request: Request) -> Response:
 async def captures(request: Request) -> Response:
     """Show the captures and environments, and take new ones."""
     return _page(request, "captures.html")
+
+
+@router.get("/machines")
+async def machines(request: Request) -> Response:
+    """Show an operator the workers, what waits for them, the space left, and who did what."""
+    return _page(request, "machines.html")
 
 
 @router.get("/captures/{capture}")
@@ -125,5 +135,5 @@ async def icon(request: Request) -> Response:
 
 
 def _page(request: Request, template: str, **values: Any) -> Response:
-    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), **values)
+    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), here=request.url.path, **values)
     return Response(text, media_type="text/html", headers=HEADERS)

@@ -1,13 +1,14 @@
 /** Requests to the API of this server, with the key of the person who looks. */
 
-import { byId, element, tell } from "./element.js";
-import { answers, reloadWhenBack, repeated } from "./repeat.js";
+import { byId, element, show, tell } from "./element.js";
+import { showFaultPage } from "./fault_page.js";
+import { reloadWhenBack, repeated } from "./repeat.js";
 
 const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
-const LOADING = "Loading …"; // of the templates
 const PASSING = [0, 429, 502, 503, 504]; // statuses of what may succeed soon
 let asking = null;
+let loading = 0; // actions under way
 
 /** A request that the server refused, with its sentence. */
 export class Refusal extends Error {
@@ -39,6 +40,7 @@ export function hasKey() {
  * @returns {Promise<Response>} The answer, whose status is below 400.
  */
 export async function send(path, options = {}) {
+  const key = sessionStorage.getItem(KEY);
   let answer;
   try {
     answer = await fetch(path, { ...options, headers: { ...credentials(), ...options.headers }, redirect: "error" });
@@ -47,8 +49,11 @@ export async function send(path, options = {}) {
     throw new Refusal(0, UNREACHABLE);
   }
   if (answer.ok) return answer;
-  if (answer.status === 401 && (await askForKey())) return send(path, options);
-  throw await refusal(answer);
+  const refused = await refusal(answer);
+  if (refused.status !== 401) throw refused;
+  const isNew = sessionStorage.getItem(KEY) !== key; // another request has asked for it meanwhile
+  if (isNew || (await askForKey(key === null ? "" : refused.message))) return send(path, options);
+  throw refused;
 }
 
 /** Return the refusal of an answer, with the sentence of its problem document. */
@@ -157,57 +162,51 @@ export async function* listing(path, field, cursor = "before") {
   } while (next !== null);
 }
 
-/** Run what a page does, and tell the person why where it fails. */
-export async function attempt(action) {
+/**
+ * Run what a page does, and tell the person why where it fails, with a button that tries again where that may help.
+ * @param {function(): Promise<any>} action
+ * @param {{again?: function(): void, onaway?: function(): void}} [options] What the button does; `onaway` is called where the server is away.
+ */
+export async function attempt(action, { again = () => attempt(action), onaway = () => {} } = {}) {
+  loading += 1;
   try {
     return await action();
   } catch (error) {
-    if (!(error instanceof Refusal)) console.error(error);
-    tell(error instanceof Refusal ? error.message : `This page failed: ${error.message}`);
+    const isAway = error.status === 0 || /import/i.test(error.message); // a page does not ask again for a module that was lost
+    const passes = isAway || error.status === 429 || error.status >= 500;
+    if (!(error instanceof Refusal || isAway)) console.error(error);
+    if (isAboutThePage(error)) showFaultPage(error.message);
+    else tell(error instanceof Refusal ? error.message : isAway ? UNREACHABLE : `This page failed: ${error.message}`, "fault", passes ? again : null);
+    if (isAway) onaway();
     return undefined;
+  } finally {
+    loading -= 1;
+    if (loading === 0) byId("main").removeAttribute("aria-busy");
   }
 }
 
 /**
- * Load what a page shows. What fails because the server is away loads the page again when it is back; else a button does what helps.
+ * Load what a page shows: where the server is away for long, the page is loaded again when it is back.
  * @param {function(): Promise<void>} action
  */
-export async function load(action) {
-  try {
-    await action();
-  } catch (error) {
-    const isAway = error.status === 0 || /import/i.test(error.message); // a module that could not be fetched is not asked for again by this page
-    if (!(error instanceof Refusal || isAway)) console.error(error);
-    tell(error instanceof Refusal ? error.message : isAway ? UNREACHABLE : `This page failed: ${error.message}`, "fault", remedy(error.status));
-    if (isAway) reloadWhenBack();
-  } finally {
-    const state = document.getElementById("state");
-    if (state?.textContent === LOADING) state.textContent = "";
-  }
+export function load(action) {
+  return attempt(action, { again: reloadWhenBack, onaway: reloadWhenBack });
 }
 
-/** Return what a person can do about a status, as a button or link. */
-function remedy(status) {
-  const button = (text, onclick) => element("button", { type: "button", onclick }, text);
-  if (status === 401 || status === 403) return button("Use another key", changeKey);
-  if (status === 404) return element("a", { class: "button", href: "/captures" }, "See the captures");
-  const again = button("Load again", async () => {
-    if (await answers()) location.reload();
-    else again.textContent = "Still away. Load again";
-  });
-  return again;
+/** Return whether an error says that the capture or job that the page shows does not exist. */
+function isAboutThePage(error) {
+  const { identifier } = byId("main").dataset;
+  return identifier !== undefined && error instanceof Refusal && error.status === 404 && error.message.includes(identifier);
 }
 
-async function changeKey() {
-  if (await askForKey()) location.reload();
-}
-
-/** Show the dialog for a key, once however many requests wait for it; return whether one was given. */
-function askForKey() {
+/** Show the dialog for a key, once however many requests wait for it; return whether one was given. `fault` says what is wrong with the last. */
+function askForKey(fault = "") {
   asking ??= new Promise((resolve) => {
     const dialog = byId("key-dialog");
     const value = byId("key-value");
     value.value = "";
+    byId("key-fault").textContent = fault;
+    show(byId("key-fault"), fault !== "");
     dialog.addEventListener("close", () => {
       asking = null;
       const given = dialog.returnValue === "save" && value.value.trim() !== "";
@@ -221,5 +220,7 @@ function askForKey() {
   return asking;
 }
 
-byId("key").addEventListener("click", changeKey);
+byId("key").addEventListener("click", async () => {
+  if (await askForKey()) location.reload();
+});
 byId("stuck").remove(); // all modules of the page are here

@@ -56,7 +56,7 @@ export async function repeated(action, passes) {
 }
 
 /** Return whether the server answers. */
-export async function answers() {
+async function answers() {
   try {
     return (await fetch("/healthz", { cache: "no-store" })).ok;
   } catch {
@@ -66,6 +66,10 @@ export async function answers() {
 
 /** Load the page again when the server answers; its address says what it shows. */
 export async function reloadWhenBack() {
-  for (let wait = 1; !(await answers()); wait = Math.min(2 * wait, LONGEST_WAIT_S)) await pause(wait);
+  const who = {};
+  for (let wait = 1; !(await answers()); wait = Math.min(2 * wait, LONGEST_WAIT_S)) {
+    say(who, lost(wait));
+    await pause(wait);
+  }
   location.reload();
 }

@@ -189,8 +189,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     change();
   }
 
-  drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault",
-    element("button", { type: "button", onclick: () => location.reload() }, "Load again")));
+  drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
   if (!embedded) addEventListener("hashchange", () => location.reload()); // another link to this page was followed
   for (const each of [control.lit, control.brightness, control.colour, control.size, control.environmentStops, control.turn, control.exposure, control.wipe, control.compare]) {
     each.addEventListener("input", change);

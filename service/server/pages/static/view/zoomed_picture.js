@@ -47,7 +47,7 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
       drag.setAttribute("aria-pressed", String(moves));
       canvas.classList.toggle("moves", moves);
     }, { "aria-pressed": "false" });
-    stage.append(element("p", { class: "actions tools" }, drag, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)),
+    stage.append(element("p", { class: "actions view-tools" }, drag, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)),
       button("Show all", () => changed({ zoom: 1, centre: [state.width / 2, state.height / 2] })),
       button("Full screen", () => (document.fullscreenElement === null ? stage.requestFullscreen() : document.exitFullscreen()))));
   }
