@@ -58,6 +58,7 @@ class StaticModules(StaticFiles):
 def install(app: FastAPI) -> None:
     """Add the pages and their files to the app."""
     app.include_router(router)
+    app.mount(f"{STATIC}/publish", StaticModules(packages=[("service.publish", "static")]), name="modules shared with published pages")
     app.mount(STATIC, StaticModules(directory=HOME / "static"), name="static")
 
 

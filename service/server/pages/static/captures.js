@@ -1,6 +1,6 @@
 /** The page of captures and environments: lists them, and uploads new ones. */
 
-import { attempt, listing, Refusal } from "./api.js";
+import { attempt, listing, load, Refusal } from "./api.js";
 import { bytes, byId, element, time } from "./element.js";
 import { chosenFolder, droppedFiles, faultOfCapture, isEnvironment } from "./local_files.js";
 import { Stopped, upload } from "./upload.js";
@@ -83,4 +83,4 @@ byId("file").addEventListener("change", (event) => {
   event.target.value = "";
   if (file !== undefined) attempt(() => take({ name: file.name, files: [{ path: file.name, file }] }));
 });
-await attempt(() => Promise.all([list("captures"), list("environments")]));
+await load(() => Promise.all([list("captures"), list("environments")]));
