@@ -104,7 +104,7 @@ class IntakeView(View):
     """True if it lies in a folder of the server, and was not uploaded."""
     problem: str | None
     facts: dict[str, Any] | None
-    """The findings of the check: captures, frames, resolution …"""
+    """The findings of the check: captures, frames, resolution …; before an import `proposal`, what the files seem to be."""
     view: JobId | None = None
     """The newest job of the kind view that has prepared the capture, whose results have its pictures; null: none has."""
     created_at: Time
@@ -138,6 +138,30 @@ class FilePage(View):
     files: list[FileView]
     next: str | None
     """Give it as `after` for the page after this one; null: this is the last page."""
+
+
+class NeededFile(View):
+    """A file of a folder that is needed for a capture."""
+
+    path: str
+    """Below the folder that was listed."""
+    name: str
+    """Its path in the capture."""
+    length: int
+
+
+class CaptureFiles(View):
+    """The files of one capture."""
+
+    folder: str
+    """The folder of the capture below the one that was listed; empty: that folder."""
+    files: list[NeededFile]
+
+
+class NeededFiles(View):
+    """The captures that a folder may hold."""
+
+    captures: list[CaptureFiles]
 
 
 class DeliveryView(View):

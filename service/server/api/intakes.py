@@ -63,6 +63,29 @@ def _view(service: Service, caller: Caller, identifier: str) -> IntakeView:
     return intake_views(service.database, [row_of(service, caller, identifier)])[0]
 
 
+def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) -> IntakeView:
+    """Let a capture or environment take no more files while a job looks at it, or refuse the request.
+
+    Args:
+        action: as the audit log names it.
+    """
+    intake = job.intake
+    before = row_of(service, caller, intake)
+
+    def work(connection: sa.Connection) -> bool:
+        if not intakes.begin_check(connection, intake):
+            return False
+        if (file := uploads.unfinished(connection, intake)) is not None:
+            raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
+        submit(service, caller, job, connection, [intake])
+        audit.record(connection, caller, action, intake)
+        return True
+
+    if not service.database.transact(work):
+        raise ApiError("conflict", f"{intake} is {before['state']} already")
+    return _view(service, caller, intake)
+
+
 def _routes(kind: str, a: str, prefix: str) -> APIRouter:
     """Return the routes that captures and environments have alike; `kind` is their word, `a` the same with its article."""
     router = APIRouter(prefix=f"/v1/{kind}s", tags=[f"{kind}s"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
@@ -88,20 +111,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
                  responses=responses(404, 409, 507), description="Accept no more files, and check names, headers and, of a capture, the "
                  f"manifest; jobs may use the {kind} when it is ready.")
     def validate_intake(service: ServiceDep, caller: Writer, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> IntakeView:
-        before = row_of(service, caller, intake)
-
-        def work(connection: sa.Connection) -> bool:
-            if not intakes.begin_check(connection, intake):
-                return False
-            if (file := uploads.unfinished(connection, intake)) is not None:
-                raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
-            submit(service, caller, CheckJob(kind="check", intake=intake), connection, [intake])
-            audit.record(connection, caller, "intake.validate", intake)
-            return True
-
-        if not service.database.transact(work):
-            raise ApiError("conflict", f"{intake} is {before['state']} already")
-        return _view(service, caller, intake)
+        return begin_check(service, caller, CheckJob(kind="check", intake=intake), "intake.validate")
 
     @router.delete(one, name=f"delete_{kind}", status_code=204, summary=f"Delete {a}", responses=responses(404, 409),
                    description=f"Delete {a} that no queued or running job reads; what was registered stays where it lies.")
