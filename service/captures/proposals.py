@@ -56,7 +56,10 @@ def still_assumed(proposal: Mapping[str, Any], choices: ImportChoices) -> tuple[
     """Return the assumptions of a proposal that hold for what was chosen: none where another import was, or another value than proposed,
     and not those about an option that was chosen beside it."""
     options = choices.options
-    if choices.layout != proposal["layout"] or any(options.get(name) != value for name, value in proposal["options"].items()):
+    if choices.layout != proposal["layout"]:
+        return ()
+    chosen, as_proposed = (request_of(choices.layout, Path(), None, values) for values in (options, {**options, **proposal["options"]}))
+    if chosen != as_proposed:
         return ()
     known = options_of_layout(choices.layout)
     flags = [known[name].flag for name in options if name in known and name not in proposal["options"]]

@@ -16,7 +16,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
-from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of
+from service.requests.imports.layouts import Layout
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
@@ -84,6 +85,12 @@ async def machines(request: Request) -> Response:
 async def capture(request: Request, capture: CaptureId) -> Response:
     """Show a capture and its lights, and the forms of the jobs that begin with it."""
     return _page(request, "capture.html", identifier=capture, forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+
+
+@router.get("/import-form/{layout}")
+async def import_form(request: Request, layout: Layout) -> Response:
+    """Return the controls of an import, which the page of captures shows beside what files seem to be."""
+    return _page(request, "import_form.html", fields=import_fields(layout))
 
 
 @router.get("/jobs")

@@ -41,6 +41,12 @@ export function bytes(count) {
   return `${at === 0 ? count : count.toFixed(count < 10 ? 1 : 0)} ${units[at]}`;
 }
 
+/** Return how fast bytes are sent, and how long the rest takes, as a person reads it; empty where nothing can be said yet. */
+export function rate(sent, total, seconds) {
+  if (seconds < 1 || sent === 0) return "";
+  return `, ${bytes(sent / seconds)}/s, ${duration((total - sent) * seconds / sent)} left`;
+}
+
 /** Return a duration as a person reads it. */
 export function duration(seconds) {
   if (seconds < 60) return `${seconds.toFixed(seconds < 10 ? 1 : 0)} s`;
