@@ -135,6 +135,19 @@ async def stage(request: Request) -> Response:
     return _page(request, "set.html")
 
 
+def wants_page(request: Request) -> bool:
+    """Return whether a browser goes to an address, and so is answered with a page; a program names no HTML among what it accepts."""
+    return request.method in ("GET", "HEAD") and "text/html" in request.headers.get("Accept", "")
+
+
+def fault_page(request: Request, status: int, title: str, detail: str) -> Response:
+    """Return a page that says in one sentence why there is nothing else to show."""
+    sentence = f"{detail[:1].upper()}{detail[1:]}".rstrip(".") + "."
+    page = _page(request, "fault.html", title=title, sentence=sentence, status=status, request_id=getattr(request.state, "request_id", ""))
+    page.status_code = status
+    return page
+
+
 @router.get("/favicon.ico")
 async def icon(request: Request) -> Response:
     """Return the icon, which browsers ask for at this place."""
