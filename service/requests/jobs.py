@@ -152,7 +152,7 @@ class FuseJob(JobRequest):
 
 
 class ViewJob(JobRequest):
-    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
+    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, and small pictures."""
 
     kind: Literal["view"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]

@@ -34,12 +34,16 @@ HEADERS = {
 }
 """Headers of every page. Loaders of three.js read textures through blob: addresses, which they make themselves."""
 
+NAVIGATION = [("/", "Home"), ("/captures", "Captures"), ("/jobs", "Jobs"), ("/machines", "Machines")]
+"""Addresses and names of the pages in the header."""
+
 router = APIRouter(include_in_schema=False)
 set_router = APIRouter(include_in_schema=False)
 """The page of the stage at this machine, where there is one."""
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
-templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP)
+templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, navigation=NAVIGATION)
+templates.globals.update({name: getattr(templates.get_template("parts.html").module, name) for name in ("icon", "skeleton")})
 
 
 class StaticModules(StaticFiles):
@@ -55,12 +59,13 @@ class StaticModules(StaticFiles):
 def install(app: FastAPI) -> None:
     """Add the pages and their files to the app."""
     app.include_router(router)
+    app.mount(f"{STATIC}/publish", StaticModules(packages=[("service.publish", "static")]), name="modules shared with published pages")
     app.mount(STATIC, StaticModules(directory=HOME / "static"), name="static")
 
 
 @router.get("/")
 async def home(request: Request) -> Response:
-    """Show the object that was prepared last, to be lit; without one, the captures."""
+    """Show captures, assets and environments as cards, and the jobs above them."""
     return _page(request, "home.html")
 
 
@@ -68,6 +73,12 @@ async def home(request: Request) -> Response:
 async def captures(request: Request) -> Response:
     """Show the captures and environments, and take new ones."""
     return _page(request, "captures.html")
+
+
+@router.get("/machines")
+async def machines(request: Request) -> Response:
+    """Show an operator the workers, what waits for them, the space left, and who did what."""
+    return _page(request, "machines.html")
 
 
 @router.get("/captures/{capture}")
@@ -124,6 +135,19 @@ async def stage(request: Request) -> Response:
     return _page(request, "set.html")
 
 
+def wants_page(request: Request) -> bool:
+    """Return whether a browser goes to an address, and so is answered with a page; a program names no HTML among what it accepts."""
+    return request.method in ("GET", "HEAD") and "text/html" in request.headers.get("Accept", "")
+
+
+def fault_page(request: Request, status: int, title: str, detail: str) -> Response:
+    """Return a page that says in one sentence why there is nothing else to show."""
+    sentence = f"{detail[:1].upper()}{detail[1:]}".rstrip(".") + "."
+    page = _page(request, "fault.html", title=title, sentence=sentence, status=status, request_id=getattr(request.state, "request_id", ""))
+    page.status_code = status
+    return page
+
+
 @router.get("/favicon.ico")
 async def icon(request: Request) -> Response:
     """Return the icon, which browsers ask for at this place."""
@@ -131,5 +155,5 @@ async def icon(request: Request) -> Response:
 
 
 def _page(request: Request, template: str, **values: Any) -> Response:
-    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), **values)
+    text = templates.get_template(template).render(has_stage=hasattr(request.app.state, "stage"), here=request.url.path, **values)
     return Response(text, media_type="text/html", headers=HEADERS)

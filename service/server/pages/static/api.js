@@ -1,10 +1,14 @@
 /** Requests to the API of this server, with the key of the person who looks. */
 
-import { byId, element, tell } from "./element.js";
+import { byId, element, show, tell } from "./element.js";
+import { showFaultPage } from "./fault_page.js";
+import { reloadWhenBack, repeated } from "./repeat.js";
 
 const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
+const PASSING = [0, 429, 502, 503, 504]; // statuses of what may succeed soon
 let asking = null;
+let loading = 0; // actions under way
 
 /** A request that the server refused, with its sentence. */
 export class Refusal extends Error {
@@ -36,6 +40,7 @@ export function hasKey() {
  * @returns {Promise<Response>} The answer, whose status is below 400.
  */
 export async function send(path, options = {}) {
+  const key = sessionStorage.getItem(KEY);
   let answer;
   try {
     answer = await fetch(path, { ...options, headers: { ...credentials(), ...options.headers }, redirect: "error" });
@@ -44,8 +49,11 @@ export async function send(path, options = {}) {
     throw new Refusal(0, UNREACHABLE);
   }
   if (answer.ok) return answer;
-  if (answer.status === 401 && (await askForKey())) return send(path, options);
-  throw await refusal(answer);
+  const refused = await refusal(answer);
+  if (refused.status !== 401) throw refused;
+  const isNew = sessionStorage.getItem(KEY) !== key; // another request has asked for it meanwhile
+  if (isNew || (await askForKey(key === null ? "" : refused.message))) return send(path, options);
+  throw refused;
 }
 
 /** Return the refusal of an answer, with the sentence of its problem document. */
@@ -60,9 +68,30 @@ export async function refusal(answer) {
   return new Refusal(answer.status, sentence);
 }
 
+/**
+ * Ask for something until all of it is here: a lost connection, a server that is restarted and an answer that breaks off are tried again.
+ * @param {string} path Of this server.
+ * @param {function(Response): Promise<any>} take Reads the body, and throws where it is not whole.
+ * @param {Object<string, string>} [headers] Of the request.
+ */
+export function fetched(path, take, headers = {}) {
+  return repeated(async (failed) => {
+    const answer = await send(path, { headers, cache: failed === 0 ? "no-cache" : "no-store" }); // what a browser has kept may be the fault
+    try {
+      return await take(answer);
+    } catch (error) {
+      throw new Refusal(0, `${path} broke off: ${error.message}`);
+    }
+  }, mayPass);
+}
+
+function mayPass(error) {
+  return error instanceof Refusal && PASSING.includes(error.status);
+}
+
 /** Return the JSON that a path gives. */
-export async function read(path) {
-  return (await send(path)).json();
+export function read(path) {
+  return fetched(path, (answer) => answer.json());
 }
 
 /** Send JSON and return the JSON of the answer; null where it has none. */
@@ -75,6 +104,12 @@ export async function post(path, body = undefined, headers = {}) {
 /** Return an Idempotency-Key: a request that is sent again with it creates nothing again. */
 export function newToken() {
   return crypto.getRandomValues(new Uint32Array(4)).join("-");
+}
+
+/** Submit a job, once however often its request has to be sent, and return it. */
+export function submitJob(request) {
+  const headers = { "Idempotency-Key": newToken() };
+  return repeated(() => post("/v1/jobs", request, headers), mayPass);
 }
 
 /** Delete what is at a path. */
@@ -94,14 +129,18 @@ export function resultsOf(job) {
     bytes: async (name, offset = undefined, length = undefined) => {
       if (length === 0) return new ArrayBuffer(0);
       const headers = offset === undefined ? {} : { Range: `bytes=${offset}-${offset + length - 1}` };
-      return (await send(at(name), { headers })).arrayBuffer();
+      return fetched(at(name), async (answer) => {
+        const found = await answer.arrayBuffer(); // going Back, Chromium gives parts from its cache that have their length in the header and no bytes
+        if (length !== undefined && found.byteLength !== length) throw new Error(`${found.byteLength} of ${length} bytes came`);
+        return found;
+      }, headers);
     },
   };
 }
 
 /** Save a file of this server with the key of this tab, which a plain link would not send. */
 export async function save(path) {
-  const address = URL.createObjectURL(await (await send(path)).blob());
+  const address = URL.createObjectURL(await fetched(path, (answer) => answer.blob()));
   element("a", { href: address, download: path.split("/").at(-1) }).click();
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }
@@ -123,23 +162,51 @@ export async function* listing(path, field, cursor = "before") {
   } while (next !== null);
 }
 
-/** Run what a page does, and tell the person why where it fails. */
-export async function attempt(action) {
+/**
+ * Run what a page does, and tell the person why where it fails, with a button that tries again where that may help.
+ * @param {function(): Promise<any>} action
+ * @param {{again?: function(): void, onaway?: function(): void}} [options] What the button does; `onaway` is called where the server is away.
+ */
+export async function attempt(action, { again = () => attempt(action), onaway = () => {} } = {}) {
+  loading += 1;
   try {
     return await action();
   } catch (error) {
-    if (!(error instanceof Refusal)) console.error(error);
-    tell(error instanceof Refusal ? error.message : `This page failed: ${error.message}`);
+    const isAway = error.status === 0 || /import/i.test(error.message); // a page does not ask again for a module that was lost
+    const passes = isAway || error.status === 429 || error.status >= 500;
+    if (!(error instanceof Refusal || isAway)) console.error(error);
+    if (isAboutThePage(error)) showFaultPage(error.message);
+    else tell(error instanceof Refusal ? error.message : isAway ? UNREACHABLE : `This page failed: ${error.message}`, "fault", passes ? again : null);
+    if (isAway) onaway();
     return undefined;
+  } finally {
+    loading -= 1;
+    if (loading === 0) byId("main").removeAttribute("aria-busy");
   }
 }
 
-/** Show the dialog for a key, once however many requests wait for it; return whether one was given. */
-function askForKey() {
+/**
+ * Load what a page shows: where the server is away for long, the page is loaded again when it is back.
+ * @param {function(): Promise<void>} action
+ */
+export function load(action) {
+  return attempt(action, { again: reloadWhenBack, onaway: reloadWhenBack });
+}
+
+/** Return whether an error says that the capture or job that the page shows does not exist. */
+function isAboutThePage(error) {
+  const { identifier } = byId("main").dataset;
+  return identifier !== undefined && error instanceof Refusal && error.status === 404 && error.message.includes(identifier);
+}
+
+/** Show the dialog for a key, once however many requests wait for it; return whether one was given. `fault` says what is wrong with the last. */
+function askForKey(fault = "") {
   asking ??= new Promise((resolve) => {
     const dialog = byId("key-dialog");
     const value = byId("key-value");
     value.value = "";
+    byId("key-fault").textContent = fault;
+    show(byId("key-fault"), fault !== "");
     dialog.addEventListener("close", () => {
       asking = null;
       const given = dialog.returnValue === "save" && value.value.trim() !== "";
@@ -156,3 +223,4 @@ function askForKey() {
 byId("key").addEventListener("click", async () => {
   if (await askForKey()) location.reload();
 });
+byId("stuck").remove(); // all modules of the page are here

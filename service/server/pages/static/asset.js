@@ -1,6 +1,6 @@
 /** The page of an exported asset. */
 
-import { attempt, listing, read, resultsOf, send } from "./api.js";
+import { attempt, fetched, listing, load, read, resultsOf } from "./api.js";
 import { byId, bytes, element, tell } from "./element.js";
 import { loadEnvironment, readyEnvironments } from "./environments.js";
 import { canRender } from "./view/basis_renderer.js";
@@ -24,7 +24,7 @@ async function findAsset() {
 
 async function show(job, result) {
   byId("state").textContent = `Loading ${bytes(result.size)} …`;
-  const [{ mount }, data, environments, rig] = await Promise.all([import("./view/asset_viewer.js"), send(result.url).then((answer) => answer.arrayBuffer()),
+  const [{ mount }, data, environments, rig] = await Promise.all([import("./view/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
     readyEnvironments(), rigOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; })]);
   name(job.request.name || rig?.name || identifier);
   globalThis.asset = await mount(byId("view"), { name: result.name.split("/").at(-1), data }, { rig, environments, load: loadEnvironment });
@@ -36,7 +36,7 @@ function name(text) {
   document.title = `Asset of ${text} · Relit`;
 }
 
-await attempt(async () => {
+await load(async () => {
   byId("job").href = `/jobs/${identifier}`;
   const job = await read(`/v1/jobs/${identifier}`);
   name(job.request.name || identifier);

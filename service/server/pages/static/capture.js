@@ -1,6 +1,6 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, read, remove } from "./api.js";
+import { attempt, listing, load, read, remove } from "./api.js";
 import { byId, element, factText, show, words } from "./element.js";
 import { mountDome } from "./dome.js";
 import { watch } from "./events.js";
@@ -23,7 +23,7 @@ async function open() {
   if (capture.state !== "ready") return;
   show(byId("work"), true);
   enableForms(byId("work"), identifier);
-  if ((capture.facts?.frames ?? 0) > 0) await attempt(look);
+  if ((capture.facts?.frames ?? 0) > 0) await load(look);
 }
 
 function present(capture) {
@@ -69,6 +69,6 @@ byId("delete").addEventListener("click", () => attempt(async () => {
   await remove(`/v1/captures/${identifier}`);
   location.assign("/captures");
 }));
-await attempt(open);
-await attempt(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
+await load(open);
+await load(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

@@ -1,6 +1,6 @@
 /** The page of a drive: the levels of the lamps, frame by frame, and the light that they give. */
 
-import { attempt, listing, read, resultsOf, save, send } from "./api.js";
+import { attempt, fetched, listing, load, read, resultsOf, save } from "./api.js";
 import { mountLamps } from "./dome.js";
 import { mountBalls, mountEnvironment, mountObject } from "./drive_preview.js";
 import { byId, element, show } from "./element.js";
@@ -64,7 +64,7 @@ async function offerObjects(chosen, use) {
   }
 }
 
-await attempt(async () => {
+await load(async () => {
   const job = await read(`/v1/jobs/${identifier}`);
   if (job.request.kind !== "drive" || job.state !== "succeeded") {
     byId("state").textContent = job.request.kind === "drive" ? `The job is ${job.state}: there are no cues yet.` : "This job drives no rig.";
@@ -72,7 +72,7 @@ await attempt(async () => {
   }
   const results = resultsOf(identifier);
   const [rig, cues, picture] = await Promise.all([results.json("rig.json"), results.json("cues.json"),
-    send(`/v1/jobs/${identifier}/results/preview.png`).then((answer) => answer.blob())]);
+    fetched(`/v1/jobs/${identifier}/results/preview.png`, (answer) => answer.blob())]);
   byId("name").textContent = `Drive of ${rig.name}`;
   document.title = `Drive of ${rig.name} · Relit`;
   byId("picture").src = URL.createObjectURL(picture);

@@ -73,9 +73,21 @@ export function factText(name, value) {
   return typeof value === "object" ? JSON.stringify(value) : String(value);
 }
 
-/** Tell the person something, below the page and to screen readers. */
-export function tell(sentence, kind = "fault") {
-  const line = element("p", { class: kind }, sentence);
-  line.append(element("button", { type: "button", class: "quiet", "aria-label": "Dismiss", onclick: () => line.remove() }, "×"));
+/** Return a drawing of icons.svg. */
+export function icon(name) {
+  const [drawing, use] = ["svg", "use"].map((tag) => document.createElementNS("http://www.w3.org/2000/svg", tag));
+  drawing.setAttribute("class", "icon");
+  drawing.setAttribute("aria-hidden", "true");
+  use.setAttribute("href", `/static/look/icons.svg#${name}`);
+  drawing.append(use);
+  return drawing;
+}
+
+/** Tell the person something, below the page and to screen readers; `again` is done when the person asks to try again. */
+export function tell(sentence, kind = "fault", again = null) {
+  const line = element("p", { class: kind }, element("span", {}, sentence));
+  const dismiss = element("button", { type: "button", class: "bare", "aria-label": "Dismiss", onclick: () => line.remove() }, icon("close"));
+  const repeat = element("button", { type: "button", onclick: () => { line.remove(); again(); } }, icon("again"), "Try again");
+  line.append(element("span", { class: "actions" }, again === null ? null : repeat, dismiss));
   byId("message").replaceChildren(line);
 }

@@ -1,6 +1,6 @@
 /** The environment maps of the server. */
 
-import { listing, send } from "./api.js";
+import { fetched, listing } from "./api.js";
 
 /** Return the environments that jobs can take. */
 export async function readyEnvironments() {
@@ -14,8 +14,9 @@ export async function readyEnvironments() {
  * @param {string} id Identifier.
  * @returns {Promise<{name: string, data: ArrayBuffer}>}
  */
-export async function loadEnvironment(id) {
-  const answer = await send(`/v1/environments/${id}/file`);
-  const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? id;
-  return { name, data: await answer.arrayBuffer() };
+export function loadEnvironment(id) {
+  return fetched(`/v1/environments/${id}/file`, async (answer) => {
+    const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? id;
+    return { name, data: await answer.arrayBuffer() };
+  });
 }

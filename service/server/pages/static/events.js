@@ -5,7 +5,7 @@
  */
 
 import { credentials, refusal } from "./api.js";
-import { byId } from "./element.js";
+import { lost, pause, say } from "./repeat.js";
 
 const SILENCE_MS = 40_000; // the server says something every 15 s: after this the connection counts as broken
 const LONGEST_WAIT_S = 15;
@@ -19,16 +19,23 @@ const LONGEST_WAIT_S = 15;
 export async function watch(path, handlers, { onopen = () => {}, signal = undefined } = {}) {
   let last = null;
   let wait = 1;
+  const who = {};
   for (;;) {
     try {
-      const ended = await once(path, handlers, () => last, (id) => { last = id; }, () => { wait = 1; say(""); onopen(); }, signal);
+      const ended = await once(path, handlers, () => last, (id) => { last = id; }, () => { wait = 1; say(who, ""); onopen(); }, signal);
       if (ended) return;
     } catch (error) {
-      if (signal?.aborted) return;
-      if (error.final) throw error;
+      if (signal?.aborted) {
+        say(who, "");
+        return;
+      }
+      if (error.final) {
+        say(who, "");
+        throw error;
+      }
     }
-    say(`The connection is lost. Trying again in ${wait} s …`);
-    await new Promise((resolve) => { setTimeout(resolve, wait * 1000); });
+    say(who, lost(wait));
+    await pause(wait);
     wait = Math.min(2 * wait, LONGEST_WAIT_S);
   }
 }
@@ -92,10 +99,4 @@ export class EventParser {
     }
     return found;
   }
-}
-
-function say(sentence) {
-  const place = byId("connection");
-  place.textContent = sentence;
-  place.hidden = sentence === "";
 }

@@ -1,6 +1,6 @@
 /** Forms of jobs: what was entered, as JSON of the API, as a command of relit and as a request of curl. */
 
-import { attempt, hasKey, listing, newToken, post, Refusal } from "./api.js";
+import { attempt, hasKey, listing, Refusal, submitJob } from "./api.js";
 import { element } from "./element.js";
 
 /**
@@ -74,7 +74,7 @@ async function submit(form) {
   fault.hidden = true;
   try {
     const { request } = entered(form);
-    const job = await post("/v1/jobs", request, { "Idempotency-Key": newToken() });
+    const job = await submitJob(request);
     location.assign(`/jobs/${job.id}`);
   } catch (error) {
     if (!(error instanceof Refusal)) throw error;

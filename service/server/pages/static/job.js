@@ -1,6 +1,6 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, post, read, remove, resultsOf, save } from "./api.js";
+import { attempt, listing, load, post, read, remove, resultsOf, save } from "./api.js";
 import { byId, bytes, duration, element, factText, show, time, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
@@ -130,4 +130,4 @@ byId("delete").addEventListener("click", () => attempt(async () => {
   await remove(`/v1/jobs/${identifier}`);
   location.assign("/jobs");
 }));
-await attempt(follow);
+await load(follow);

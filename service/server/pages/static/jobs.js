@@ -1,6 +1,6 @@
 /** The page of all jobs, with the forms of those that begin with neither a capture nor maps. */
 
-import { attempt, read } from "./api.js";
+import { attempt, load, read } from "./api.js";
 import { byId, show } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
@@ -18,5 +18,5 @@ async function more() {
 
 enableForms(byId("work"), "");
 byId("more").addEventListener("click", () => attempt(more));
-await attempt(more);
+await load(more);
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

@@ -1,6 +1,6 @@
 /** The page that lights a capture live, and sends what it shows to the batch. */
 
-import { attempt, newToken, post } from "./api.js";
+import { attempt, load, submitJob } from "./api.js";
 import { byId, element } from "./element.js";
 import { loadEnvironment, readyEnvironments } from "./environments.js";
 import { commandOf, curlOf } from "./form.js";
@@ -62,7 +62,7 @@ async function submit(event) {
   event.preventDefault();
   present();
   if (!batch.fault.hidden) return;
-  const job = await post("/v1/jobs", request(), { "Idempotency-Key": newToken() });
+  const job = await submitJob(request());
   location.assign(`/jobs/${job.id}`);
 }
 
@@ -76,7 +76,7 @@ function batchForm() {
         element("p", {}, "With curl:"), batch.curl)));
 }
 
-await attempt(async () => {
+await load(async () => {
   const { files } = await openView(identifier, null);
   const view = await ViewFile.open(files);
   byId("name").textContent = view.info.name;

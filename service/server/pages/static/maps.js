@@ -1,6 +1,6 @@
 /** The page of the maps of a job: their layers, and the readings behind each pixel. */
 
-import { attempt, read, Refusal, resultsOf } from "./api.js";
+import { attempt, load, read, Refusal, resultsOf } from "./api.js";
 import { byId, element } from "./element.js";
 import { mount as mountMaps } from "./view/map_viewer.js";
 import { mount as mountPlot } from "./view/pixel_plot.js";
@@ -20,7 +20,7 @@ async function stepNames() {
   }
 }
 
-await attempt(async () => {
+await load(async () => {
   const job = await read(`/v1/jobs/${identifier}`);
   const capture = await captureOf(job);
   const { files } = await openView(capture, identifier, await chosenStep(capture, await stepNames()));

@@ -1,6 +1,6 @@
 /** Views, which jobs of the kind `view` prepare: of a capture, or of the maps that a job has made. */
 
-import { listing, post, read, resultsOf } from "./api.js";
+import { listing, read, resultsOf, submitJob } from "./api.js";
 import { byId, show } from "./element.js";
 import { watch } from "./events.js";
 
@@ -35,7 +35,7 @@ export async function captureOf(job) {
  */
 export async function openView(capture, maps, step = null) {
   const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }) };
-  let job = (await findView({ capture, maps, step })) ?? (await post("/v1/jobs", body));
+  let job = (await findView({ capture, maps, step })) ?? (await submitJob(body));
   if (job.state !== "succeeded") {
     byId("state").textContent = "This is looked at for the first time: its view is being prepared.";
     show(byId("progress"), true);

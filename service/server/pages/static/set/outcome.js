@@ -1,6 +1,6 @@
 /** What is made of a capture that is whole: one of the service's captures, a picture whose light moves, maps and an asset. */
 
-import { attempt, listing, newToken, post, read, Refusal } from "../api.js";
+import { attempt, listing, newToken, post, read, Refusal, submitJob } from "../api.js";
 import { byId, show, tell } from "../element.js";
 import { watch } from "../events.js";
 import { progressOf } from "../jobs_table.js";
@@ -112,7 +112,7 @@ export function mountOutcome(patterns, changed) {
     }
   }
 
-  const submit = (request) => post("/v1/jobs", request, { "Idempotency-Key": newToken() }).then(finish);
+  const submit = (request) => submitJob(request).then(finish);
   const solve = async () => solved ?? submit({ kind, capture: capture.id });
   byId("solve").addEventListener("click", () => work(solve));
   byId("export").addEventListener("click", () => work(async () => {

@@ -27,7 +27,7 @@ function towards(x, y) {
 export async function mountTurning(parent, files) {
   const view = await ViewFile.open(files);
   if (view.info.relight === null) return null;
-  const viewer = await mount(parent, view, { environments: [], load: () => tell("none"), onchange: () => {} });
+  const viewer = await mount(parent, view, { environments: [], load: () => tell("none"), onchange: () => {}, embedded: true });
   const canvas = parent.querySelector("canvas.picture");
   if (canvas === null) return null; // without WebGL the viewer says so
   canvas.setAttribute("aria-label", "The object under a light that follows the pointer. Arrow keys move the light.");
@@ -58,7 +58,12 @@ export async function mountTurning(parent, files) {
   const rest = () => { resting = performance.now() + REST_MS; };
   const toggle = () => { turns = !turns; say(); };
   const calm = () => { turns = turns && !still.matches; say(); };
-  canvas.addEventListener("pointermove", (event) => { rest(); viewer.point(event); });
+  canvas.addEventListener("pointermove", (event) => {
+    rest();
+    const box = canvas.getBoundingClientRect();
+    const half = Math.min(box.width, box.height) / 2;
+    viewer.set(towards((event.clientX - box.left - box.width / 2) / half, (box.top + box.height / 2 - event.clientY) / half));
+  });
   canvas.addEventListener("keydown", (event) => {
     const moved = KEYS[event.key];
     if (moved === undefined) return;

@@ -1,17 +1,21 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
 import { element, tell } from "../element.js";
+import { ViewState } from "../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
+import { ControlAddress } from "./control_address.js";
 import { VIEW_TRANSFORM } from "./display.js";
 import { mountDomeControl } from "./dome_control.js";
 import { previewOf, readEnvironment } from "./environment_map.js";
 import { EnvironmentProfile, LightModel, unit } from "./light_model.js";
 import { floats } from "./view_file.js";
+import { mountZoomed } from "./zoomed_picture.js";
 
 const BEYOND_SHARE = 0.05; // from which the commands warn too
 const SPIN_DEGREES_PER_S = 30;
 const FIRST_LIGHT = [0.45, 0.5, 0.74]; // above right of the camera
+const BACKDROP = 0.2; // encoded grey around the object, the same in light and dark, since colours are judged before it
 const WHITE_PERCENTILE = 0.99;
 const SAMPLES = 2000; // pixels that the first exposure is taken from
 const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The frames can still be made by a job, and the captured images looked at.";
@@ -21,18 +25,19 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  * @param {HTMLElement} parent Takes it.
  * @param {import("./view_file.js").ViewFile} view With `relight`.
  * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
- *          onchange: function(any): void}} options Environments of the server and how their files are read; `onchange` is told the light.
- * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void, point: function(PointerEvent): void}>}
+ *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
+ *     light; `embedded`: the page moves the light, and the address is its own.
+ * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void}>}
  */
-export async function mount(parent, view, { environments, load, onchange }) {
+export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, point: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
-  const canvas = element("canvas", { class: "picture", width: relight.cols, height: relight.rows, tabindex: 0, role: "img",
-    "aria-label": "The object under the chosen light. Drag to move the light." });
+  const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
+  const drawn = element("canvas", { width: relight.cols, height: relight.rows });
   const warning = element("p", { class: "beyond", role: "status", hidden: true });
   const dome = element("div");
   const preview = element("div");
@@ -62,26 +67,47 @@ export async function mount(parent, view, { environments, load, onchange }) {
       element("button", { type: "button", class: "quiet", onclick: () => { expose(); change(); } }, "Expose for this light"), row("Compare with the photograph", control.compare), wipeRow,
       element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`)),
     element("fieldset", { class: "figures" }, element("legend", {}, "How exact, how fast"), element("p", { class: "help" }, errorOf(relight)), speed));
-  parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, warning), panel));
+  const stage = element("div", { class: "stage" });
+  parent.replaceChildren(element("div", { class: "viewer" }, stage, panel));
+  const pixelSize = view.info.camera.pixel_size_m ? view.info.camera.pixel_size_m * relight.step : null;
+  const zoomed = mountZoomed(stage, drawn, place, { changed: onGesture, pixelSize, still: embedded });
+  const { canvas } = zoomed;
+  stage.append(warning);
 
   const { quadrature } = relight;
   const [inverse, beyond, outside, captured, index] = await Promise.all([quadrature.inverse, quadrature.beyond, quadrature.outside, relight.captured, relight.tiles.index].map((block) => view.block(block)));
   const model = new LightModel(relight, { inverse: new Float64Array(inverse), beyond: new Float32Array(beyond), outside: new Float32Array(outside), captured: floats(captured, "float16") }, lights);
   const tiles = new Uint16Array(index);
-  const renderer = new BasisRenderer(canvas, relight, view.info.color_space, tiles);
+  const renderer = new BasisRenderer(drawn, relight, view.info.color_space, tiles);
   const matte = new Uint8Array(await view.block(relight.matte));
   renderer.setMatte(matte);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
   const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
-  const light = { direction: unit(FIRST_LIGHT) };
   let map = null; // { id, name, profile }
   let asked = false;
   const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
 
+  const address = embedded ? null : new ControlAddress({ on: control.lit, brightness: control.brightness, colour: control.colour, size: control.size,
+    environment: control.environment, "environment-stops": control.environmentStops, turn: control.turn, stops: control.exposure,
+    compare: control.compare, wipe: control.wipe });
+  const given = address?.read() ?? [];
+
   function move(direction) {
-    light.direction = unit(direction);
+    place.set({ light: direction });
     control.lit.checked = true;
     change();
+  }
+
+  /** Do what a gesture on the picture asks for: a place of the unit disc is a direction towards the camera. */
+  function onGesture(changes) {
+    if (changes.light === undefined) {
+      place.set(changes);
+      zoomed.draw();
+      return;
+    }
+    const across = Math.hypot(...changes.light);
+    const [x, y] = changes.light.map((each) => each / Math.max(across, 1));
+    move([x, y, Math.sqrt(Math.max(0, 1 - x * x - y * y))]);
   }
 
   /** Return the light as the batch takes it. */
@@ -89,14 +115,15 @@ export async function mount(parent, view, { environments, load, onchange }) {
     const linear = [1, 3, 5].map((at) => decoded(parseInt(control.colour.value.slice(at, at + 2), 16) / 255));
     const gain = unitIrradiance * 2 ** Number(control.brightness.value);
     return {
-      light: control.lit.checked ? { direction: light.direction, irradiance: linear.map((each) => gain * each), angle_degrees: Number(control.size.value) } : null,
+      light: control.lit.checked ? { direction: place.light, irradiance: linear.map((each) => gain * each), angle_degrees: Number(control.size.value) } : null,
       environment: map === null ? null : { id: map.id, name: map.name, turn_degrees: Number(control.turn.value), exposure: Number(control.environmentStops.value) },
       exposure: Number(control.exposure.value),
     };
   }
 
   function change() {
-    domeControl.set(control.lit.checked ? light.direction : null);
+    domeControl.set(control.lit.checked ? place.light : null);
+    address?.write();
     wipeRow.hidden = control.compare.value === "";
     onchange(state());
     if (asked) return;
@@ -113,8 +140,8 @@ export async function mount(parent, view, { environments, load, onchange }) {
     const shown = model.coefficients(sum);
     const chosen = control.compare.value;
     const compared = chosen === "" ? null : model.capturedImage(Number(chosen));
-    const dark = globalThis.matchMedia("(prefers-color-scheme: dark)").matches;
-    renderer.draw({ shown, compared, border: Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: dark ? [0.09, 0.09, 0.1] : [0.2, 0.2, 0.2] });
+    renderer.draw({ shown, compared, border: Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: [BACKDROP, BACKDROP, BACKDROP] });
+    zoomed.draw(`rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`);
     const { framesPerSecond, gpuMs } = renderer.timer.figures();
     if (framesPerSecond !== null) speed.textContent = `${sizeOf(relight)}: ${framesPerSecond.toFixed(0)} pictures a second${gpuMs === null ? "" : `, ${gpuMs.toPrecision(2)} ms each on the graphics processor`}.`;
     const share = model.shareBeyond(sum);
@@ -146,26 +173,24 @@ export async function mount(parent, view, { environments, load, onchange }) {
     change();
   }
 
+  /** Show an environment alone at first, exposed for it; the key light comes back when it is moved or switched on. */
+  async function chooseEnvironment(id, name, data) {
+    const isFirst = map === null;
+    await useEnvironment(id, name, data);
+    if (isFirst) control.lit.checked = false;
+    expose();
+    change();
+  }
+
   function dropEnvironment() {
+    control.lit.checked = true;
     map = null;
     preview.replaceChildren();
     change();
   }
 
-  function onPicture(event) {
-    const box = canvas.getBoundingClientRect();
-    const half = Math.min(box.width, box.height) / 2;
-    const [x, y] = [(event.clientX - box.left - box.width / 2) / half, (box.top + box.height / 2 - event.clientY) / half];
-    const across = Math.min(Math.hypot(x, y), 1);
-    const scale = across / (Math.hypot(x, y) || 1);
-    move([x * scale, y * scale, Math.sqrt(1 - across * across)]);
-  }
-
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    onPicture(event);
-  });
-  canvas.addEventListener("pointermove", (event) => event.buttons !== 0 && onPicture(event));
+  drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
+  if (!embedded) addEventListener("hashchange", () => location.reload()); // another link to this page was followed
   for (const each of [control.lit, control.brightness, control.colour, control.size, control.environmentStops, control.turn, control.exposure, control.wipe, control.compare]) {
     each.addEventListener("input", change);
   }
@@ -174,14 +199,14 @@ export async function mount(parent, view, { environments, load, onchange }) {
     if (id === "") dropEnvironment();
     else {
       const { name, data } = await load(id);
-      await useEnvironment(id, name, data);
+      await chooseEnvironment(id, name, data);
     }
   }));
   control.file.addEventListener("change", () => attemptHere(async () => {
     const [file] = control.file.files;
     if (file === undefined) return;
     control.environment.value = "";
-    await useEnvironment(null, file.name, await file.arrayBuffer());
+    await chooseEnvironment(null, file.name, await file.arrayBuffer());
   }));
   let spinning = null;
   play.addEventListener("click", () => {
@@ -207,16 +232,23 @@ export async function mount(parent, view, { environments, load, onchange }) {
     renderer.setTerm(term, new Uint16Array(planes));
     return at(floats(planes, "float16"), covered);
   }));
-  expose();
+  if (given.includes("environment") && control.environment.value === "") tell("The environment of this address is not on this server. Choose another.");
+  if (control.environment.value !== "") {
+    const { name, data } = await load(control.environment.value);
+    await useEnvironment(control.environment.value, name, data);
+  }
+  if (!given.includes("stops")) expose();
   change();
   canvas.dataset.ready = "";
   return {
-    destroy: () => spinning !== null && cancelAnimationFrame(spinning),
+    destroy: () => {
+      cancelAnimationFrame(spinning);
+      zoomed.destroy();
+    },
     state,
     pixels: () => { draw(); return renderer.pixels(); },
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
-    point: onPicture,
   };
 }
 

@@ -1,0 +1,25 @@
+/* Light or dark, as the person chose in this browser; without a choice, as the system is. No module: it runs before anything is drawn. */
+(() => {
+  const KEPT = "relit-theme";
+  const root = document.documentElement;
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  const kept = () => { try { return localStorage.getItem(KEPT); } catch { return null; } }; // a browser may forbid to keep anything
+  const isDark = () => (root.dataset.theme ?? (system.matches ? "dark" : "light")) === "dark";
+  if (["light", "dark"].includes(kept())) root.dataset.theme = kept();
+
+  document.addEventListener("DOMContentLoaded", () => {
+    const button = document.getElementById("theme");
+    const present = () => {
+      button.setAttribute("aria-label", isDark() ? "Show in light" : "Show in dark");
+      button.title = button.getAttribute("aria-label");
+      button.querySelector("use").setAttribute("href", `/static/look/icons.svg#${isDark() ? "sun" : "moon"}`);
+    };
+    button.addEventListener("click", () => {
+      root.dataset.theme = isDark() ? "light" : "dark";
+      try { localStorage.setItem(KEPT, root.dataset.theme); } catch { /* this page alone, then */ }
+      present();
+    });
+    system.addEventListener("change", present);
+    present();
+  });
+})();

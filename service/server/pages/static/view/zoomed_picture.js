@@ -1,0 +1,57 @@
+/** A picture that is zoomed, moved, lit by dragging and shown on the full screen, with a scale bar where the size of its pixels is known. */
+
+import { element } from "../element.js";
+import { listen } from "../publish/gestures.js";
+import { showScale } from "../publish/overlay.js";
+
+const ZOOM = 1.5;
+const LABEL = "The object under the chosen light. Drag or use the arrow keys to move the light, with Shift to move the picture; plus and minus zoom, 0 shows all.";
+
+/**
+ * Show a canvas.
+ * @param {HTMLElement} stage Takes the picture, and becomes the full screen.
+ * @param {HTMLCanvasElement} source What is shown.
+ * @param {import("../publish/view_state.js").ViewState} state Of the picture.
+ * @param {{changed: function(object): void, pixelSize: number|null, still: boolean}} options `changed` is given what gestures change of the state; `pixelSize` of
+ *   the source in metres; `still`: without gestures and buttons.
+ * @returns {{canvas: HTMLCanvasElement, draw: function(string): void, destroy: function(): void}} `draw` is given the colour around the picture.
+ */
+export function mountZoomed(stage, source, state, { changed, pixelSize, still }) {
+  const canvas = element("canvas", { class: "picture", tabindex: 0, role: "img", "aria-label": LABEL });
+  const context = canvas.getContext("2d");
+  const bar = element("p", { class: "scale-bar", hidden: true }, element("span"));
+  let around = "";
+  let moves = false;
+
+  function draw(colour = around) {
+    around = colour;
+    const { clientWidth: width, clientHeight: height } = canvas;
+    if (width === 0 || height === 0) return;
+    const ratio = globalThis.devicePixelRatio ?? 1;
+    const size = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+    const scale = state.scale(width, height) * ratio;
+    context.fillStyle = around;
+    context.fillRect(0, 0, ...size);
+    context.imageSmoothingQuality = "high";
+    context.drawImage(source, size[0] / 2 - state.centre[0] * scale, size[1] / 2 - state.centre[1] * scale, source.width * scale, source.height * scale);
+    if (pixelSize !== null) showScale(bar, (1000 * pixelSize * ratio) / scale);
+  }
+
+  stage.append(element("div", { class: "framed" }, canvas, bar));
+  if (!still) {
+    const { zoom } = listen(canvas, state, { moves: () => moves, changed });
+    const button = (text, onclick, more = {}) => element("button", { type: "button", class: "quiet", onclick, ...more }, text);
+    const drag = button("Drag the picture", () => {
+      moves = !moves;
+      drag.setAttribute("aria-pressed", String(moves));
+      canvas.classList.toggle("moves", moves);
+    }, { "aria-pressed": "false" });
+    stage.append(element("p", { class: "actions view-tools" }, drag, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)),
+      button("Show all", () => changed({ zoom: 1, centre: [state.width / 2, state.height / 2] })),
+      button("Full screen", () => (document.fullscreenElement === null ? stage.requestFullscreen() : document.exitFullscreen()))));
+  }
+  const resized = new ResizeObserver(() => draw());
+  resized.observe(canvas);
+  return { canvas, draw, destroy: () => resized.disconnect() };
+}
