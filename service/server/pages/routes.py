@@ -104,6 +104,12 @@ async def light(request: Request, capture: CaptureId) -> Response:
     return _page(request, "light.html", identifier=capture)
 
 
+@router.get("/object/{capture}")
+async def object_page(request: Request, capture: CaptureId) -> Response:
+    """Show what was captured and what was made of it, as modes of one view."""
+    return _page(request, "object.html", identifier=capture)
+
+
 @router.get("/maps/{job}")
 async def maps(request: Request, job: JobId) -> Response:
     """Show the maps that a job has solved or decoded."""

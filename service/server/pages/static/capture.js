@@ -2,11 +2,12 @@
 
 import { attempt, listing, load, read, remove } from "./api.js";
 import { byId, element, factText, show, words } from "./element.js";
-import { mountDome } from "./dome.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
+import { mountPhotographs } from "./object/photographs.js";
 import { chosenStep } from "./time_steps.js";
+import { ViewFile } from "./view/view_file.js";
 import { openView } from "./view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
@@ -38,30 +39,12 @@ function present(capture) {
 async function look() {
   const step = await chosenStep(identifier);
   const { files } = await openView(identifier, null, step);
-  const view = await files.json("view.json");
-  show(byId("relight"), view.relight !== null && step === null);
-  byId("findings").replaceChildren(...view.findings.map((finding) => element("li", {}, finding)));
-  if (view.frames.length === 0) return;
+  const view = await ViewFile.open(files);
+  show(byId("relight"), view.info.relight !== null && step === null);
+  byId("findings").replaceChildren(...view.info.findings.map((finding) => element("li", {}, finding)));
+  if (view.info.frames.length === 0) return;
   show(byId("lights"), true);
-  const atlas = await createImageBitmap(new Blob([await files.bytes("thumbnails.jpg")], { type: "image/jpeg" }));
-  const figures = view.frames.map((frame, index) => figure(frame, index, atlas));
-  byId("frames").replaceChildren(...figures);
-  let mark = () => {};
-  const choose = (index) => {
-    figures.forEach((each, at) => each.classList.toggle("chosen", at === index));
-    figures[index].scrollIntoView({ block: "nearest", inline: "nearest" });
-    mark(index);
-  };
-  if (view.frames.some((frame) => frame.direction !== null)) mark = mountDome(byId("dome"), view.frames, choose);
-}
-
-function figure(frame, index, atlas) {
-  const [x, y, width, height] = frame.thumbnail ?? [0, 0, 96, 96];
-  const canvas = element("canvas", { width, height, role: "img", "aria-label": `Frame ${index + 1}: ${frame.image}` });
-  if (frame.thumbnail !== null) canvas.getContext("2d").drawImage(atlas, x, y, width, height, 0, 0, width, height);
-  const clipped = frame.saturated === null ? "cannot be read" : frame.saturated > 0.0005 ? `${(100 * frame.saturated).toFixed(1)} % clipped` : null;
-  return element("figure", { class: frame.suspect === null ? "" : "suspect" }, canvas,
-    element("figcaption", {}, frame.image, element("small", {}, [frame.label, clipped, frame.suspect].filter(Boolean).join(" · "))));
+  await mountPhotographs(byId("frames"), byId("dome"), view);
 }
 
 byId("delete").addEventListener("click", () => attempt(async () => {
