@@ -1,15 +1,17 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read, remove } from "./api.js";
+import { attempt, listing, load, read, submitJob } from "./api.js";
 import { byId, element, factText, show, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
 import { mountPhotographs } from "./object/photographs.js";
+import { removeLater } from "./object/removal.js";
 import { chosenStep } from "./time_steps.js";
 import { ViewFile } from "./view/view_file.js";
 import { openView } from "./view_jobs.js";
 
+const MOST_STEPS = 2; // beside lighting it
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
 
@@ -22,7 +24,7 @@ async function open() {
     present(capture);
   }
   if (capture.state !== "ready") return;
-  show(byId("work"), true);
+  offer(capture.facts ?? {});
   enableForms(byId("work"), identifier);
   if ((capture.facts?.frames ?? 0) > 0) await load(look);
 }
@@ -36,6 +38,25 @@ function present(capture) {
   byId("facts").replaceChildren(...facts.flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
 }
 
+/** Show what can be done with a capture that holds this: what it is made for as buttons, the same with options, and the rest behind More. */
+function offer(facts) {
+  const holds = facts.lit_by ?? ["shots", "tiles"].filter((name) => name in facts);
+  const first = [...byId("next").querySelectorAll("[data-kind]")].filter(({ dataset }) => holds.includes(dataset.holds)).slice(0, MOST_STEPS);
+  for (const button of first) {
+    show(button, true);
+    button.addEventListener("click", () => attempt(async () => {
+      button.disabled = true;
+      const job = await submitJob({ kind: button.dataset.kind, capture: identifier }).finally(() => { button.disabled = false; });
+      location.assign(`/jobs/${job.id}`);
+    }));
+  }
+  for (const box of byId("more").querySelectorAll(".job-form")) {
+    if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
+    else if (first.some(({ dataset }) => dataset.kind === box.querySelector("form").dataset.kind)) byId("first").append(box);
+  }
+  show(byId("work"), true);
+}
+
 async function look() {
   const step = await chosenStep(identifier);
   const { files } = await openView(identifier, null, step);
@@ -47,11 +68,7 @@ async function look() {
   await mountPhotographs(byId("frames"), byId("dome"), view);
 }
 
-byId("delete").addEventListener("click", () => attempt(async () => {
-  if (!confirm("Delete this capture from the service? A registered folder stays where it lies.")) return;
-  await remove(`/v1/captures/${identifier}`);
-  location.assign("/captures");
-}));
+byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, byId("name").textContent, "/captures"));
 await load(open);
 await load(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));
