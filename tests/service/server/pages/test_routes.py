@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import pytest
 
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
-PAGES = ["/", "/captures", f"/captures/{CAPTURE}", "/jobs", f"/jobs/{JOB}", f"/light/{CAPTURE}", f"/maps/{JOB}", f"/asset/{JOB}",
+PAGES = ["/", "/captures", f"/captures/{CAPTURE}", "/jobs", f"/jobs/{JOB}", f"/light/{CAPTURE}", f"/object/{CAPTURE}", f"/maps/{JOB}", f"/asset/{JOB}",
          f"/drive/{JOB}"]
 
 
