@@ -49,9 +49,9 @@ BEGIN_WITH: dict[str, tuple[str, ...]] = {
     "depth": ("pattern", "laser", "tof", "stereo"), "separate": ("pattern",), "scan": ("shots",), "inspect-board": ("tiles",),
     "calibrate-mirror-ball": ("light",), "calibrate-light-positions": ("light",), "calibrate-grey-ball": ("light",),
     "calibrate-intensity": ("light",), "calibrate-rig": ("light",), "calibrate-dark": LIT_BY, "calibrate-flat-field": LIT_BY,
-    "calibrate-saturation": LIT_BY, "calibrate-white-balance": ("light", "pattern", "stereo"), "calibrate-chart": ("light", "pattern", "stereo"),
-    "calibrate-procam": ("pattern",), "calibrate-stereo": ("pattern", "stereo"), "calibrate-response": ("pattern",),
-    "calibrate-tof": ("tof",), "calibrate-laser-planes": ("laser",),
+    "calibrate-saturation": LIT_BY, "calibrate-white-balance": ("light", "pattern", "stereo"),
+    "calibrate-chart": ("light", "pattern", "stereo"), "calibrate-procam": ("pattern",), "calibrate-stereo": ("stereo",),
+    "calibrate-response": ("pattern",), "calibrate-tof": ("tof",), "calibrate-laser-planes": ("laser",),
     "export": ("maps.exr", "depth.exr", "sequence.json"), "shade": ("maps.exr",), "join": ("maps.exr",), "register": ("depth.exr",),
     "fuse": ("scan-set.json",)}
 """What there must be one of for a job to begin with something, by kind: in a capture what lit its frames (`lit_by` of its facts), the shots

@@ -103,7 +103,7 @@ async def job(request: Request, job: JobId) -> Response:
 
 @router.get("/forms/{kind}")
 async def form_words(kind: JobKind) -> list[dict[str, Any]]:
-    """Return how the form of a kind of job names its fields, for pages that show a request: places in the JSON, label, and default as typed."""
+    """Return how the form of a kind of job names its fields, for pages that show a request: places in the JSON, label, default as typed."""
     form = form_of(kind, JOBS[kind])
     return [{"paths": field.paths, "label": field.label, "default": field.default} for field in (*form.main, *form.more)]
 

@@ -56,7 +56,9 @@ def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made)
         return np.array(page.locator("canvas.map").evaluate("""(canvas) => {
           const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
           const sums = [0, 0];
-          for (let at = 0; at < data.length; at += 4) sums[(at / 4) % canvas.width < canvas.width / 2 ? 0 : 1] += data[at] + data[at + 1] + data[at + 2];
+          for (let at = 0; at < data.length; at += 4) {
+            sums[(at / 4) % canvas.width < canvas.width / 2 ? 0 : 1] += data[at] + data[at + 1] + data[at + 2];
+          }
           return sums;
         }""")) / 1e3
 
@@ -106,8 +108,9 @@ def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, 
 def test_a_zoomed_picture_is_smooth_has_a_scale_bar_and_fills_the_screen(page, made):
     page.goto(f"{made.pages['light']}#zoom=4")
     made.wait_for_content(page, "light")
-    rows = page.locator("canvas.picture").evaluate("""(canvas) => Array.from(canvas.getContext("2d").getImageData(0, canvas.height / 2, canvas.width, 1).data)""")
-    row = np.array(rows, float).reshape(-1, 4)[:, 1]
+    values = page.locator("canvas.picture").evaluate("""(canvas) => Array.from(
+      canvas.getContext("2d").getImageData(0, canvas.height / 2, canvas.width, 1).data)""")
+    row = np.array(values, float).reshape(-1, 4)[:, 1]
     steps = np.abs(np.diff(row))
     assert np.count_nonzero(steps) > len(row) / 4  # blocks of a pixel's colour would change at every tenth place alone
     assert page.locator(".scale-bar").inner_text().split()[1] in ("mm", "cm", "µm")
@@ -124,8 +127,8 @@ def test_two_fingers_zoom_the_picture(browser, server, made):
     page.locator("canvas.picture").evaluate("""(canvas) => {
       const { left, top, width, height } = canvas.getBoundingClientRect();
       canvas.setPointerCapture = () => {};
-      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, { pointerId: id, pointerType: "touch", buttons: 1, bubbles: true,
-        clientX: left + width / 2 + x, clientY: top + height / 2 }));
+      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
+        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
       send("pointerdown", 11, -20); send("pointerdown", 12, 20);
       send("pointermove", 11, -40); send("pointermove", 12, 40);
     }""")
