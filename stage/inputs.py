@@ -37,6 +37,7 @@ class Confined:
 
 
 _folders: list[Confined] = []
+_enclosed = False
 _lock = threading.Lock()
 
 
@@ -107,6 +108,17 @@ def confined(folder: Path, root: Path, *, max_pixels: int | None = None) -> Iter
         os.close(top)
 
 
+def enclose() -> None:
+    """Open files in confined folders alone, from now on: what was uploaded names files, and this process reads for whoever did."""
+    global _enclosed
+    _enclosed = True
+
+
+def is_allowed(path: Path) -> bool:
+    """Return whether this process opens files at a path, which need not exist."""
+    return not _enclosed or _folder_of(path) is not None
+
+
 @contextmanager
 def opened(path: str | Path) -> Iterator[Source]:
     """Open a file for reading.
@@ -116,6 +128,8 @@ def opened(path: str | Path) -> Iterator[Source]:
     """
     given = Path(path)
     folder = _folder_of(given)
+    if folder is None and _enclosed:
+        raise ManifestError(f"{given}: leads out of the folder")
     with storage("read", given):
         if folder is None:
             file: BinaryIO = open(given, "rb")  # noqa: SIM115 - it is closed below

@@ -1,7 +1,8 @@
-"""A process that checks one capture or environment: the files are untrusted, and their decoders may crash, hang or ask for memory.
+"""A process that checks one capture or environment, or looks what other files are and imports them: the files are untrusted, and their
+decoders may crash, hang or ask for memory.
 
-`check_in_process` starts it with an environment of its own, without the settings of the service (the database's password among them). It
-has limits of memory, processor time and the size of files. What becomes of it concerns only the check that it does.
+`check_in_process` and the functions beside it start it with an environment of its own, without the settings of the service (the database's
+password among them). It has limits of memory, processor time and the size of files. What becomes of it concerns only that check.
 
 It reads one line of JSON from its standard input, and answers with lines of JSON: {"stage": …, "total": …} and {"done": …} as it goes on,
 and at last {"facts": …}, {"error": sentence} or {"fault": traceback}.
@@ -24,13 +25,14 @@ from typing import Any
 from service.captures.processes import bare_environment, limit
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.reporting.progress import Progress
+from service.requests.imports.layouts import ImportChoices
 
 MEMORY_BYTES = 2 << 30
 """Bytes of data that a check may have; the largest capture.json takes a third."""
 CPU_S = 300
 """Seconds of processor time of a check: headers of 20 000 images take 20."""
-FILE_BYTES = 1 << 16
-"""Bytes of a file that a check may write: Python tries out its folder for temporary files."""
+FILE_BYTES, IMPORTED_BYTES = 1 << 16, 4 << 30
+"""Bytes of a file that a check may write, as Python tries out its folder for temporary files; and an import, which may write arrays."""
 WALL_S = 1800.0
 """Seconds after which a check is ended, whatever it waits for."""
 ANSWER_BYTES = 1 << 20
@@ -59,7 +61,24 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
         RequestError: the files cannot be used; the sentence names them below the folder.
         RuntimeError: an error of relit itself; the message is its traceback.
     """
-    asked = {"folder": str(folder), "environment": environment, "root": None if root is None else str(root), "max_pixels": max_pixels}
+    return _ask({"do": "check", "folder": str(folder), "environment": environment, "root": None if root is None else str(root),
+                 "max_pixels": max_pixels}, progress)
+
+
+def propose_in_process(folder: Path, *, max_pixels: int, progress: Progress) -> dict[str, Any]:
+    """Return what `service.captures.proposals.propose` returns for a folder; errors are those of `check_in_process`."""
+    return _ask({"do": "propose", "folder": str(folder), "max_pixels": max_pixels}, progress)
+
+
+def import_in_process(folder: Path, choices: ImportChoices, assumed: tuple[str, ...], name: str, *, max_pixels: int,
+                      progress: Progress) -> None:
+    """Do `service.captures.proposals.import_chosen` in a process of its own; errors are those of `check_in_process`."""
+    _ask({"do": "import", "folder": str(folder), "choices": choices.model_dump(mode="json"), "assumed": assumed, "name": name,
+          "max_pixels": max_pixels}, progress)
+
+
+def _ask(asked: dict[str, Any], progress: Progress) -> dict[str, Any]:
+    """Start the process, and return what it answers."""
     with ExitStack() as ended:
         errors = ended.enter_context(tempfile.TemporaryFile())
         process = ended.enter_context(subprocess.Popen(COMMAND, env=bare_environment(), cwd=os.sep, stdin=subprocess.PIPE,
@@ -148,30 +167,45 @@ def _end_with_parent() -> None:
     os._exit(3)
 
 
-def main() -> None:
-    """Do the check that the first line of the standard input names."""
-    global _answers
-    _answers = os.dup(sys.stdout.fileno())
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # libraries print there what they find wrong
-    limit(DATA=MEMORY_BYTES, CPU=CPU_S, FSIZE=FILE_BYTES)
-    asked = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    folder = Path(asked["folder"])
-    try:
+def _done(folder: Path, asked: dict[str, Any]) -> dict[str, Any]:
+    """Do what is asked, and return the facts that were found."""
+    from stage import inputs
+
+    if asked["do"] == "check":
         from service.captures.admit import admit_capture, admit_environment
-        from stage import inputs
 
         with ExitStack() as held:
             if asked["root"] is not None:
                 top = folder.parent if asked["environment"] else folder
                 held.enter_context(inputs.confined(top, Path(asked["root"]), max_pixels=asked["max_pixels"]))
-            facts = (admit_environment(folder, max_pixels=asked["max_pixels"]) if asked["environment"] else
-                     admit_capture(folder, max_pixels=asked["max_pixels"], progress=_Lines()))
+            return (admit_environment(folder, max_pixels=asked["max_pixels"]) if asked["environment"] else
+                    admit_capture(folder, max_pixels=asked["max_pixels"], progress=_Lines()))
+    from service.captures.proposals import import_chosen, propose
+
+    inputs.enclose()
+    with inputs.confined(folder, folder, max_pixels=asked["max_pixels"]):
+        if asked["do"] == "propose":
+            return propose(folder)
+        import_chosen(folder, ImportChoices.model_validate(asked["choices"]), tuple(asked["assumed"]), asked["name"])
+        return {}
+
+
+def main() -> None:
+    """Do the check that the first line of the standard input names."""
+    global _answers
+    _answers = os.dup(sys.stdout.fileno())
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # libraries print there what they find wrong
+    asked = json.loads(sys.stdin.buffer.readline())
+    limit(DATA=MEMORY_BYTES, CPU=CPU_S, FSIZE=IMPORTED_BYTES if asked["do"] == "import" else FILE_BYTES)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    folder = Path(asked["folder"])
+    try:
+        facts = _done(folder, asked)
         _write({"facts": facts})
     except MemoryError:
         _write({"error": f"the files take more than {MEMORY_BYTES >> 30} GiB of memory to be checked"})
     except USER_ERRORS as error:  # the user knows the files by the names given, not by their place on the server
-        _write({"error": sentence(error).replace(f"{folder}/", "")})
+        _write({"error": sentence(error).replace(f"{folder}/", "").replace(str(folder), "the folder")})
     except Exception:
         _write({"fault": traceback.format_exc()[-100_000:]})
     os._exit(0)

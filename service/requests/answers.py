@@ -104,7 +104,9 @@ class IntakeView(View):
     """True if it lies in a folder of the server, and was not uploaded."""
     problem: str | None
     facts: dict[str, Any] | None
-    """The findings of the check: captures, frames, resolution …"""
+    """The findings of the check: captures, frames, resolution …; before an import `proposal`, what the files seem to be."""
+    view: JobId | None = None
+    """The newest job of the kind view that has prepared the capture, whose results have its pictures; null: none has."""
     created_at: Time
 
 
@@ -136,6 +138,30 @@ class FilePage(View):
     files: list[FileView]
     next: str | None
     """Give it as `after` for the page after this one; null: this is the last page."""
+
+
+class NeededFile(View):
+    """A file of a folder that is needed for a capture."""
+
+    path: str
+    """Below the folder that was listed."""
+    name: str
+    """Its path in the capture."""
+    length: int
+
+
+class CaptureFiles(View):
+    """The files of one capture."""
+
+    folder: str
+    """The folder of the capture below the one that was listed; empty: that folder."""
+    files: list[NeededFile]
+
+
+class NeededFiles(View):
+    """The captures that a folder may hold."""
+
+    captures: list[CaptureFiles]
 
 
 class DeliveryView(View):
@@ -180,3 +206,68 @@ class HookList(View):
     """The hooks of a project, the oldest first."""
 
     hooks: list[HookView]
+
+
+class WorkerView(View):
+    """A worker that was seen lately."""
+
+    id: str
+    host: str
+    pid: int
+    device: str
+    """cpu, cuda:0 …"""
+    state: Literal["ready", "draining"]
+    """draining: it finishes what it has, and takes no more."""
+    started_at: Time
+    seen_at: Time
+    busy: bool
+    """True if it does a job or helps with one, of whatever project."""
+    job: JobView | None
+    """The job that it does or helps with; null: it has none, or one of another project."""
+
+
+class DiskView(View):
+    """The file system of the data folder."""
+
+    free: int
+    """Bytes."""
+    total: int
+    """Bytes."""
+    least_free: int
+    """Bytes below which the service takes neither uploads nor jobs."""
+
+
+class MachinesView(View):
+    """Workers, the queue and the space of the service."""
+
+    workers: list[WorkerView]
+    """The oldest first."""
+    jobs: dict[JobState, int]
+    """Jobs of all projects in each state."""
+    queued_since: Time | None
+    """Time at which the job was queued that has waited longest; null: none waits."""
+    disk: DiskView
+    faults: list[str]
+    """Reasons why the service is not ready for work, as /readyz gives them."""
+
+
+class AuditEntry(View):
+    """A line of the audit log: who did what to which object."""
+
+    id: int
+    at: Time
+    actor: str
+    """Identifier of a key, a user of an identity provider, anonymous, or an operator of the server."""
+    action: str
+    """job.cancel, intake.create …"""
+    object: str
+    request: str | None
+    """The identifier of the request; null: the command line of the server."""
+
+
+class AuditPage(View):
+    """Lines of the audit log, the newest first."""
+
+    entries: list[AuditEntry]
+    next: int | None
+    """Give it as `before` for the page after this one; null: this is the last page."""

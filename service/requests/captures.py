@@ -44,4 +44,4 @@ class ViewRequest(ViewOptions, Request):
     maps: Annotated[Path | None, Role.INPUT, Spelling(metavar="DIR")] = None
     """Folder with the maps.exr or depth.exr of the capture, or the file; None: the capture alone is shown."""
     out: Annotated[Path, Role.OUTPUT]
-    """Folder for view.json, view.bin and thumbnails.jpg."""
+    """Folder for view.json, view.bin, thumbnails.jpg and the pictures of the card."""

@@ -13,6 +13,7 @@ from service.requests.captures import ViewOptions
 from service.requests.depth import DepthOptions, ScanOptions, SeparateOptions
 from service.requests.drive import RIG, ChartDocument, DriveOptions, RigDocument
 from service.requests.export import AssetFormat, ExportOptions
+from service.requests.imports.layouts import ImportChoices
 from service.requests.inspect_board import InspectBoardOptions
 from service.requests.light.light_keys import LightKeys
 from service.requests.patterns import PatternsOptions
@@ -31,10 +32,15 @@ MOST_SCANS = 500
 
 
 class CheckJob(JobRequest):
-    """Check that a capture or environment can be used: manifest, headers and the size of images. The service makes this job on its own."""
+    """Check that a capture or environment can be used: manifest, headers and the size of images; before that, import files without a
+    manifest, or only look what they are. The service makes this job on its own."""
 
     kind: Literal["check"]
     intake: Line
+    guess: bool = False
+    """Whether to look what the files are, and to propose an import, in place of a check."""
+    importing: ImportChoices | None = None
+    """The import of the files that is done before the check; None: they have a manifest."""
 
 
 class SolveJob(JobRequest):
@@ -146,7 +152,7 @@ class FuseJob(JobRequest):
 
 
 class ViewJob(JobRequest):
-    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, thumbnails.jpg."""
+    """Write the files that a browser needs to show a capture and its maps: view.json, view.bin, and small pictures."""
 
     kind: Literal["view"]
     capture: Annotated[CaptureId, Role.INPUT, CAPTURE]

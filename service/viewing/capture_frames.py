@@ -11,7 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from service.reporting.progress import Timings
-from service.viewing.reduction import block_sums, step_within
+from service.viewing.reduction import block_sums, plane_means, step_within
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.lighting import lights_from_centre
@@ -101,6 +101,21 @@ def read_images(capture: Capture, mask: np.ndarray, timings: Timings) -> Capture
             images.append(None if isinstance(image, str) else image)
             timings.advance(len(images))
     return CaptureImages(images, faults, inside, measured)
+
+
+def one_frame(capture: Capture, found: CaptureImages, mask: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the radiance [rows, cols, 3] of the brightest measured frame, its longer side at most `side` pixels, and the coverage
+    [rows, cols] of the object; None: no frame can be read."""
+    means = {index: image.mean.sum() for index, (image, measured) in enumerate(zip(found.images, found.measured, strict=True))
+             if image is not None and measured}
+    if not means:
+        return None
+    frame = capture.manifest.frames[max(means, key=lambda index: float(means[index]))]
+    radiance, _ = _radiance(capture, Correction.of(capture, full_scale=True), frame)
+    step, weight = -(-max(mask.shape) // side), mask.astype(np.float32)
+    counted = block_sums(weight[..., None], step)
+    sums = block_sums(radiance, step, weight)
+    return np.divide(sums, counted, out=np.zeros_like(sums), where=counted > 0), plane_means(weight, step)
 
 
 def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[list[int] | None],
@@ -215,12 +230,12 @@ def write_thumbnails(path: Path, found: CaptureImages, space: str) -> list[list[
             continue
         row, col = divmod(sum(place is not None for place in places), across)
         places.append([col * width, row * height, width, height])
-        sheet[row * height : (row + 1) * height, col * width : (col + 1) * width] = _fit(image.preview, height, width)
+        sheet[row * height : (row + 1) * height, col * width : (col + 1) * width] = fit(image.preview, height, width)
     encoded = convert(np.clip(sheet / white, 0, 1) if white > 0 else sheet, space, "srgb_texture")
     bytes_ = np.rint(255 * np.clip(encoded, 0, 1)).astype(np.uint8)
     for quality in QUALITIES:
         with replacing(path) as temporary:
-            _write_jpeg(temporary, bytes_, quality)
+            write_jpeg(temporary, bytes_, quality)
         if path.stat().st_size <= MOST_BYTES:
             break
     return places
@@ -234,13 +249,14 @@ def _white(found: CaptureImages) -> float:
     return float(np.median(lit)) if lit else 0.0
 
 
-def _fit(preview: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return a preview [rows, cols, 3] with another size."""
+def fit(preview: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return a picture [rows, cols, 3] with another size."""
     source = oiio.ImageBuf(np.ascontiguousarray(preview, dtype=np.float32))
     return pixels_of(oiio.ImageBufAlgo.resize(source, "triangle", roi=oiio.ROI(0, width, 0, height, 0, 1, 0, 3)))
 
 
-def _write_jpeg(path: Path, pixels: np.ndarray, quality: int) -> None:
+def write_jpeg(path: Path, pixels: np.ndarray, quality: int) -> None:
+    """Write [rows, cols, 3] uint8 as a JPEG of a quality from 1 to 100."""
     rows, cols, _ = pixels.shape
     spec = oiio.ImageSpec(cols, rows, 3, "uint8")
     spec.attribute("Compression", f"jpeg:{quality}")

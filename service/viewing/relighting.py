@@ -5,6 +5,7 @@ captured images together do (kernels.relight.basis.basis has the method and its 
 """
 
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from service.relight.weights.quadrature import quadrature_of
 from service.relight.weights.triangulation import share_smooth
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
+from service.viewing.card import RelitCard
 from service.viewing.held_out import HeldOutLights
 from service.viewing.reduction import plane_means, step_within
 from service.viewing.tiling import Tiling, put_together, tile_rows, tiling_of
@@ -50,13 +52,15 @@ class TiledBasis(NamedTuple):
 
 
 def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: BlockFile, *, most_terms: int | None,
-                     device: str, timings: Timings) -> dict[str, Any]:
+                     device: str, timings: Timings, folder: Path, space: str) -> dict[str, Any]:
     """Write basis, matte, weights and coefficients of the captured images, and return what view.json says of them.
 
     Args:
         lights: of the images, near ones as the object's centre sees them.
         matte: of the object; the coefficient images are premultiplied by its coverage.
         most_terms: most coefficient images; None: DEFAULT_TERMS.
+        folder: gets the pictures of the card (service.viewing.card).
+        space: colour space of the captured images.
     """
     covered = np.zeros(stack.shape[2], dtype=bool)
     covered[: stack.pixel_count] = (matte.factor > 0).reshape(-1)
@@ -69,8 +73,10 @@ def write_relighting(stack: Stack, lights: DistantLights, matte: Matte, file: Bl
     tiling = tiling_of(plane_means(matte.factor, step), lights=stack.light_count, terms=most)
     basis = _basis(stack, matte, tiling, step, norm, products, most, timings)
     held_out = HeldOutLights(stack, lights, transfer, covered)
-    relative_rms = _error(stack, matte, tiling, step, basis, held_out, timings)
+    card = RelitCard(lights, *basis.images.shape[2:])
+    relative_rms = _error(stack, matte, tiling, step, basis, held_out, card, timings)
     coverage = plane_means(matte.coverage, step)
+    card.write(folder, coverage, space)
     timings.stage("blocks", 1)
     return {
         "terms": len(basis.images), "rows": coverage.shape[0], "cols": coverage.shape[1], "step": step, "scale": numbers(basis.scale),
@@ -125,9 +131,10 @@ def _basis(stack: Stack, matte: Matte, tiling: Tiling, step: int, norm: np.ndarr
     return TiledBasis(np.ascontiguousarray(matrix[:, :, :terms]), images[:terms], scale)
 
 
-def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBasis, held_out: HeldOutLights, timings: Timings) -> float:
-    """Return the root mean square of what the basis as it is stored leaves of the captured images, relative to them, and let held-out
-    lights count it."""
+def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBasis, held_out: HeldOutLights, card: RelitCard,
+           timings: Timings) -> float:
+    """Return the root mean square of what the basis as it is stored leaves of the captured images, relative to them; let held-out lights
+    count it, and the card take its pictures."""
     left, whole, side = 0.0, 0.0, tiling.side
     factor = plane_means(matte.factor, step)
     across = -(-factor.shape[1] // side) * side
@@ -138,7 +145,9 @@ def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBa
         inside[: row.rows.stop - row.rows.start, : factor.shape[1]] = factor[row.rows] > 0
         tiles = stored.reshape(*stored.shape[:2], side, -1, side).transpose(3, 1, 0, 2, 4)[row.columns]  # [tiles, 3, terms, side, side]
         matrix = basis.matrix[:, row.tiles].astype(np.float32).transpose(1, 3, 0, 2)
-        shown = np.matmul(matrix, tiles.reshape(*tiles.shape[:3], -1)) * np.float32(basis.scale)
+        images = tiles.reshape(*tiles.shape[:3], -1)
+        card.add(row, images, matrix * np.float32(basis.scale), side)
+        shown = np.matmul(matrix, images) * np.float32(basis.scale)
         left += float(((row.images - shown) ** 2).sum(dtype=np.float64))
         whole += float((row.images**2).sum(dtype=np.float64))
         held_out.compare(row.images, shown, inside.reshape(side, -1, side).swapaxes(0, 1)[row.columns].reshape(len(row.columns), -1))

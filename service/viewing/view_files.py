@@ -1,4 +1,4 @@
-"""Write what the pages of the service show of a capture and of its maps: view.json, view.bin and thumbnails.jpg (docs/view.md)."""
+"""Write what the pages of the service show of a capture and of its maps: view.json, view.bin and pictures (docs/view.md)."""
 
 import json
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from service.reporting.provenance import metadata
 from service.requests.captures import ViewRequest
 from service.viewing.block_file import BlockFile
 from service.viewing.capture_frames import describe_frames, read_images, write_thumbnails
+from service.viewing.card import PICTURE_FILE, SHEET_FILE, write_photograph
 from service.viewing.layers import status_codes, write_layers
 from service.viewing.points import write_points
 from service.viewing.relighting import LEAST_LIGHTS, write_relighting
@@ -141,6 +142,8 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
         timings.stage("write", 1)
         target.unlink(missing_ok=True)  # it would describe other blocks
     findings += clipping_sentences(capture.clipped)
+    if sections["relight"] is None:
+        _attempt(findings, lambda: write_photograph(request.out, capture, images, mask, space))
     thumbnails = write_thumbnails(request.out / THUMBNAILS_FILE, images, space)
     findings = [*findings[:MOST_FINDINGS], *([f"and {len(findings) - MOST_FINDINGS} more"] if len(findings) > MOST_FINDINGS else [])]
     contents = {} if result is None else {"maps": digest(result.path)}
@@ -181,12 +184,12 @@ def _relight(readings: Readings, request: ViewRequest, file: BlockFile, device: 
         return None
     timings.stage("matte", 1)
     return write_relighting(readings.stack, readings.lights, matte_of(readings.capture, readings.stack), file, most_terms=request.terms,
-                            device=device, timings=timings)
+                            device=device, timings=timings, folder=request.out, space=linear_space(readings.capture.manifest.color_space))
 
 
 def _check_outputs(request: ViewRequest, capture: Capture) -> None:
     """Refuse to write over an input, or into a folder that cannot be written to."""
-    outputs = [(f"--out {request.out}", request.out / name) for name in (VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE)]
+    outputs = [(f"--out {request.out}", request.out / name) for name in (VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE, PICTURE_FILE, SHEET_FILE)]
     check_outputs(outputs, [capture.file(name) for _, name in capture.files()])
 
 

@@ -34,7 +34,8 @@ class Guess(NamedTuple):
     """Whether the files say all that the arguments do, but for conventions of the layout, which `assumed` names."""
     then: str
     """The command that makes the result."""
-
+    summary: str
+    """What the folder holds, for a person who has never seen a command: `96 photographs lit from 96 directions (lights.txt)`."""
 
     @property
     def command(self) -> str:
@@ -59,17 +60,24 @@ class Folder(NamedTuple):
 
 
 def made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, sure: bool = False,
-         assumed: tuple[str, ...] = ()) -> Guess:
+         assumed: tuple[str, ...] = (), summary: str = "") -> Guess:
     """Return a guess.
 
     Args:
         words: the layout and arguments of `relit import`.
         source: the folder of the capture.
         solve: whether `relit solve` makes the result; else `relit depth`.
+        summary: what the folder holds; without it the layout and the reason say so.
     """
     program = "solve" if solve else "depth"
     return Guess(source, layout, reason, assumed, tuple(map(str, words)), sure,
-                 shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]))
+                 shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]),
+                 summary or f"{layout}: {reason}")
+
+
+def lit(count: int, lights: str, file: Path) -> str:
+    """Return the summary of photographs under as many lights, which a file names: `lights` is `from` or `by` and their kind."""
+    return f"{count} photographs lit {lights.format(count)} ({file.name})"
 
 
 def tried(read: Callable[[], T]) -> T | None:

@@ -15,9 +15,9 @@ from stage.errors import ManifestError, storage
 from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.content import Pictures
-from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, made, tried
+from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, lit, made, tried
 from stage.importers.laser import OFF_WORDS
-from stage.importers.layout import image_names, natural_order
+from stage.importers.layout import image_names, natural_order, read_lines
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
@@ -29,6 +29,10 @@ from stage.tof.raw_frames import read_array
 
 POINT_FILES = (".ply", ".xyz", ".asc", ".pts", ".ptx", ".pcd", ".las", ".laz", ".e57")
 """The endings of files of points."""
+
+LOOKED_FOR = ("photographs with a table, a list or a rig of lights; four or more photographs of one size; Gray codes, phase steps or "
+              "stripes of a laser; arrays of a time-of-flight camera or of photon counts")
+"""The layouts, in words."""
 
 PLANE_WORDS, LASER_WORDS = frozenset({"plane", "planes", "laser", "lasers"}), frozenset({"laser", "stripe", "line"})
 """Words in the names of files that hold planes, and of images of a stripe."""
@@ -53,7 +57,8 @@ def guess(source: Path) -> Guess:
             return found
     suffixes = Counter(Path(name).suffix.lower() for name in names)
     held = ", ".join(f"{count} {suffix or 'without suffix'}" for suffix, count in suffixes.items())
-    raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows: docs/importing.md shows them")
+    raise ManifestError(f"{source}: holds {held or 'no files'}, which is no layout that relit import knows (looked for: {LOOKED_FOR}): "
+                        "docs/importing.md shows them")
 
 
 def guess_each(source: Path) -> tuple[Guess, ...]:
@@ -74,7 +79,8 @@ def _diligent(folder: Folder) -> Guess | None:
     if not wanted <= set(folder.names):
         return None
     return made("an object of the DiLiGenT benchmark", "it has filenames.txt, light_directions.txt and light_intensities.txt",
-                 ["diligent", folder.path], folder.path, solve=True, sure=True)
+                 ["diligent", folder.path], folder.path, solve=True, sure=True,
+                 summary=lit(len(read_lines(folder.path / "filenames.txt")), "from {} directions", Path("light_directions.txt")))
 
 
 def _relightlab(folder: Folder) -> Guess | None:
@@ -89,8 +95,9 @@ def _lp(folder: Folder) -> Guess | None:
     files = [name for name in folder.names if name.lower().endswith(".lp")]
     if not files:
         return None
-    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", folder.path / files[0]], folder.path,
-                 solve=True, sure=True)
+    path = folder.path / files[0]
+    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True, sure=True,
+                summary=lit(max(len(read_lines(path)) - 1, 0), "from {} directions", path))
 
 
 def _kinect(folder: Folder) -> Guess | None:
@@ -167,7 +174,8 @@ def _near_lights(folder: Folder) -> Guess | None:
         words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
                  "--unit-m", "0.001", *chosen]
         return made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
-                     folder.path, solve=True, sure=True, assumed=("axes and millimetres are those of near_ps",
+                     folder.path, solve=True, sure=True, summary=lit(len(rig.positions), "by {} near lights", path),
+                     assumed=("axes and millimetres are those of near_ps",
                                           "nothing says how far the object is: relit solve estimates it; --surface-z-m gives it",
                                           *encoding(folder)))
     return None
@@ -193,7 +201,8 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
                 f"{'towards' if ahead else 'away'}")
         return made("images under one far light each with a table of the lights", reason,
                      ["olat", folder.path, "--lights", path, "--axes", axes, "--vectors", "to-light", *chosen],
-                     folder.path, solve=True, sure=mirrored or min(across, up) > -guess_images.FOLLOWED, assumed=(
+                     folder.path, solve=True, sure=mirrored or min(across, up) > -guess_images.FOLLOWED,
+                     summary=lit(len(table.vectors), "from {} directions", path), assumed=(
                          "the bright side of the object tells where x and y point, and vectors point to the light" if mirrored else
                          "x is right and y is up as seen by the camera, and vectors point to the light: the table does not say it",
                          f"z points {'towards the camera' if ahead else 'away from it'}, because then the lights are on its side",

@@ -180,7 +180,8 @@ def photos(folder: Folder, shown: Pictures) -> Guess | None:
         f"three of them explain the others to {100 * left_over:.0f} %, as those of one object under far lights" if smooth else
         f"three of them leave {100 * left_over:.0f} % of the others unexplained, which is much for one object under far lights"),
         ["photos", folder.path, *(["--images", spelling(shown.names[0])] if shown.others else [])], folder.path, solve=True,
-        sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1, assumed=(
+        sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1,
+        summary=f"{len(shown.names)} photographs under lights of which nothing says where they were", assumed=(
             "each image has one far light of its own, and the camera stood still", *_left_out(shown), *encoding(folder)))
     return found._replace(then=found.then + " --lights unknown")
 

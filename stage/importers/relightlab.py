@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stage import inputs
 from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
@@ -115,6 +116,8 @@ def _project(path: Path, data: dict[str, Any]) -> tuple[Path, list[dict[str, Any
             raise ManifestError(f"{path}: the image name {fault}")
     given = data.get("folder", "")
     folder = path.parent / given if isinstance(given, str) and name_fault(given) is None else path.parent
+    if not inputs.is_allowed(folder):
+        folder = path.parent
     first = next((entry["filename"] for entry in entries), "")
     with storage("read", folder):
         if not (folder / first).is_file() and (path.parent / first).is_file():

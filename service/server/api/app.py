@@ -7,7 +7,21 @@ from fastapi.telemetry import TelemetryConfig
 from opentelemetry.trace import TracerProvider
 
 from service import __version__
-from service.server.api import document, events, hooks, intakes, jobs, middleware, operations, problems, results, stage, tus, uploads
+from service.server.api import (
+    document,
+    events,
+    hooks,
+    importing,
+    intakes,
+    jobs,
+    middleware,
+    operations,
+    problems,
+    results,
+    stage,
+    tus,
+    uploads,
+)
 from service.server.api.context import Service
 from service.server.api.limits import AtOnce, RateLimiter
 from service.server.api.metrics import Metrics
@@ -43,8 +57,8 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)
-    for router in (intakes.captures, intakes.environments, results.environments, uploads.router, uploads.listings, uploads.options,
-                   jobs.router, events.router, results.router, hooks.router, operations.router):
+    for router in (intakes.captures, importing.router, intakes.environments, results.environments, uploads.router, uploads.listings,
+                   uploads.options, jobs.router, events.router, results.router, hooks.router, operations.router):
         app.include_router(router)
     pages.install(app)
     if set_stage is not None:

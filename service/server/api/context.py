@@ -77,17 +77,19 @@ def authenticate(request: Request) -> Caller:
         return known
     service: Service = request.app.state.service
     scheme, given = get_authorization_scheme_param(request.headers.get("Authorization"))
-    caller = None
+    caller, fault = None, "give a key that is valid as Authorization: Bearer KEY"
     if scheme.lower() == "bearer" and given:
         if service.tokens is not None and given.count(".") == 2:  # a JWT; keys have one dot
             caller = service.tokens.caller(given, request.headers.get(PROJECT_HEADER))
         else:
             caller = keys.find(service.database, given)
+            if caller is None:
+                fault = f"{keys.fault_of(service.database, given)}: give a key that is valid"
     elif service.settings.anonymous:
         require_local(request)
         caller = ANONYMOUS
     if caller is None:
-        raise ApiError("unauthenticated", "give a key that is valid as Authorization: Bearer KEY", headers={"WWW-Authenticate": "Bearer"})
+        raise ApiError("unauthenticated", fault, headers={"WWW-Authenticate": "Bearer"})
     request.state.caller = caller  # for the log, too
     service.limiter.take(caller.key)
     return caller

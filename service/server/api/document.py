@@ -37,7 +37,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "id": "cap_0123456789abcdefghjk", "name": "owl", "state": "ready", "registered": False, "problem": None,
         "facts": {"captures": 1, "frames": 96, "resolution": [320, 320], "color_space": "lin_rec709_scene", "name": "owl",
                   "lit_by": ["light"]},
-        "created_at": "2026-11-20T08:59:00Z"},
+        "view": "job_0123456789abcdefghjm", "created_at": "2026-11-20T08:59:00Z"},
     "ResultView": {
         "name": "frame.0001.exr", "size": 177062, "modified_at": "2026-11-20T09:00:02Z",
         "url": "/v1/jobs/job_0123456789abcdefghjk/results/frame.0001.exr"},

@@ -19,7 +19,7 @@ from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
-from service.server.api.views import intake_view
+from service.server.api.views import intake_views
 from service.server.base.safe_names import shown
 from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
@@ -59,6 +59,33 @@ def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
     return row
 
 
+def _view(service: Service, caller: Caller, identifier: str) -> IntakeView:
+    return intake_views(service.database, [row_of(service, caller, identifier)])[0]
+
+
+def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) -> IntakeView:
+    """Let a capture or environment take no more files while a job looks at it, or refuse the request.
+
+    Args:
+        action: as the audit log names it.
+    """
+    intake = job.intake
+    before = row_of(service, caller, intake)
+
+    def work(connection: sa.Connection) -> bool:
+        if not intakes.begin_check(connection, intake):
+            return False
+        if (file := uploads.unfinished(connection, intake)) is not None:
+            raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
+        submit(service, caller, job, connection, [intake])
+        audit.record(connection, caller, action, intake)
+        return True
+
+    if not service.database.transact(work):
+        raise ApiError("conflict", f"{intake} is {before['state']} already")
+    return _view(service, caller, intake)
+
+
 def _routes(kind: str, a: str, prefix: str) -> APIRouter:
     """Return the routes that captures and environments have alike; `kind` is their word, `a` the same with its article."""
     router = APIRouter(prefix=f"/v1/{kind}s", tags=[f"{kind}s"], responses=responses(401, 403, 422, 429, 503), route_class=JsonRoute)
@@ -73,31 +100,18 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
             row = row_of(service, caller, before)
             after = row["created_at"], row["id"]
         rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
-        return IntakePage(items=[intake_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+        return IntakePage(items=intake_views(service.database, rows[:limit]), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
     @router.get(one, name=f"get_{kind}", summary=f"Look at {a}", responses=responses(404),
                 description=f"Return the state of {a} and the facts that its check found.")
     def get_intake(service: ServiceDep, caller: Reader, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> IntakeView:
-        return intake_view(row_of(service, caller, intake))
+        return _view(service, caller, intake)
 
     @router.post(f"{one}/validate", name=f"validate_{kind}", status_code=202, summary=f"Check an uploaded {kind}",
                  responses=responses(404, 409, 507), description="Accept no more files, and check names, headers and, of a capture, the "
                  f"manifest; jobs may use the {kind} when it is ready.")
     def validate_intake(service: ServiceDep, caller: Writer, intake: Annotated[str, Path(alias=kind, pattern=is_id)]) -> IntakeView:
-        before = row_of(service, caller, intake)
-
-        def work(connection: sa.Connection) -> bool:
-            if not intakes.begin_check(connection, intake):
-                return False
-            if (file := uploads.unfinished(connection, intake)) is not None:
-                raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
-            submit(service, caller, CheckJob(kind="check", intake=intake), connection, [intake])
-            audit.record(connection, caller, "intake.validate", intake)
-            return True
-
-        if not service.database.transact(work):
-            raise ApiError("conflict", f"{intake} is {before['state']} already")
-        return intake_view(row_of(service, caller, intake))
+        return begin_check(service, caller, CheckJob(kind="check", intake=intake), "intake.validate")
 
     @router.delete(one, name=f"delete_{kind}", status_code=204, summary=f"Delete {a}", responses=responses(404, 409),
                    description=f"Delete {a} that no queued or running job reads; what was registered stays where it lies.")
@@ -177,4 +191,4 @@ def _create(service: Service, caller: Caller, prefix: str, name: str, folder: Fi
     asked = [prefix, name, None if folder is None else str(folder)]
     identifier, _ = idempotency.create_once(service.database, caller.project, token, asked, make)
     response.headers["Location"] = f"/v1/{layout.FOLDERS[prefix]}/{identifier}"
-    return intake_view(row_of(service, caller, identifier))
+    return _view(service, caller, identifier)

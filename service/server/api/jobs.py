@@ -60,6 +60,9 @@ JobName = Annotated[JobId, Path(description="Identifier of the job.")]
 Asked = Annotated[JobRequest, StrictJson(UserJob), Body(openapi_examples=EXAMPLES)]
 States = Annotated[Sequence[states.JobState], Query(description="Of these states alone; none: of all.")]
 
+Kinds = Annotated[Sequence[Annotated[str, Field(max_length=40, pattern=r"^[a-z_]+$")]],
+                  Query(description="Of these kinds alone, such as export; none: of all.", max_length=20)]
+
 
 class Priority(BaseModel):
     """The priority of a queued job."""
@@ -85,7 +88,7 @@ def create_job(service: ServiceDep, caller: Writer, response: Response, request:
 
 
 @router.get("", responses=responses(404), summary="List jobs, the newest first")
-def list_jobs(service: ServiceDep, caller: Reader, state: States = (),
+def list_jobs(service: ServiceDep, caller: Reader, state: States = (), kind: Kinds = (),
               limit: Annotated[int, Query(ge=1, le=500)] = 100,
               before: Annotated[JobId | None, Query(description="`next` of the page before.")] = None) -> JobPage:
     """List the jobs of the project, one page at a time."""
@@ -95,7 +98,7 @@ def list_jobs(service: ServiceDep, caller: Reader, state: States = (),
         if row is None:
             raise ApiError("not-found", f"before: {before} is not in this project")
         after = row["created_at"], row["id"]
-    rows = jobs.latest(service.database, caller.project, states=state, limit=limit + 1, before=after)
+    rows = jobs.latest(service.database, caller.project, states=state, kinds=kind, limit=limit + 1, before=after)
     return JobPage(jobs=[job_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 

@@ -1,19 +1,24 @@
-"""Routes for operators: health, readiness and metrics."""
+"""Routes for operators: health, readiness, metrics, the workers and what they do, and the audit log."""
 
+import shutil
 import threading
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Request, Response, Security
+from fastapi import APIRouter, Depends, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
+from service.requests.answers import AuditEntry, AuditPage, DiskView, MachinesView, WorkerView
 from service.requests.keys import Scope
-from service.server.api.context import Service, ServiceDep, authenticated, bearer, has_space, require_local
+from service.server.api.context import Admin, Service, ServiceDep, authenticated, bearer, has_space, require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
-from service.server.database import workers
+from service.server.database import audit, jobs, workers
 from service.server.database.engine import UNANSWERED
+from service.server.database.job_view import job_view
+from service.server.database.keys import Caller
+from service.server.jobs.queue import job_and_attempt
 from stage.errors import StorageError
 
 router = APIRouter(tags=["operations"])
@@ -91,3 +96,32 @@ async def operator_of(service: ServiceDep, request: Request,
 def get_metrics(request: Request) -> Response:
     """Return requests, jobs by state, workers by device and more. A service that listens beyond this machine needs a key of scope admin."""
     return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)
+
+
+@router.get("/v1/machines", responses=responses(401, 403, 422, 429, 503), summary="Look at workers, queue and space")
+def get_machines(service: ServiceDep, caller: Admin, request: Request) -> MachinesView:
+    """Return the workers and what they do, how many jobs wait, and the space left. Jobs of other projects are counted, and not shown."""
+    readiness: Readiness = request.app.state.readiness
+    disk = shutil.disk_usage(service.settings.data)
+    return MachinesView.model_validate({
+        "workers": _workers(service, caller), "jobs": jobs.counts(service.database), "queued_since": jobs.oldest_queued(service.database),
+        "disk": DiskView(free=disk.free, total=disk.total, least_free=service.settings.min_free_bytes), "faults": readiness.wrong(service)})
+
+
+@router.get("/v1/audit", responses=responses(401, 403, 422, 429, 503), summary="Read the audit log, the newest first")
+def get_audit(service: ServiceDep, caller: Admin, limit: Annotated[int, Query(ge=1, le=500)] = 100,
+              before: Annotated[int | None, Query(ge=1, le=2**63 - 1, description="`next` of the page before.")] = None) -> AuditPage:
+    """Return who did what to which object of the project, one page at a time."""
+    rows = audit.listing(service.database, project=caller.project, limit=limit + 1, before=before)
+    return AuditPage(entries=[AuditEntry.model_validate(dict(row)) for row in rows[:limit]],
+                     next=rows[limit - 1]["id"] if len(rows) > limit else None)
+
+
+def _workers(service: Service, caller: Caller) -> list[WorkerView]:
+    taken = service.queue.taken_by()
+    found = []
+    for row in workers.seen_lately(service.database):
+        workflows = taken.get(row["id"], [])
+        shown = [job for name in workflows if (job := jobs.find(service.database, job_and_attempt(name)[0], caller.project)) is not None]
+        found.append(WorkerView.model_validate({**row, "busy": bool(workflows), "job": job_view(shown[0]) if shown else None}))
+    return found

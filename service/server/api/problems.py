@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any, NamedTuple
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.encoders import jsonable_encoder
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -16,6 +16,7 @@ from service.errors import RequestError, sentence
 from service.server.base.log import logger
 from service.server.database.engine import UNANSWERED, message_of
 from service.server.database.quotas import BYTES, QuotaExceeded
+from service.server.pages import routes as pages
 from stage.errors import StorageError
 
 MEDIA_TYPE = "application/problem+json"
@@ -101,23 +102,23 @@ def install(app: FastAPI) -> None:
     """Answer the errors of the app from the table; middleware.RequestLog answers those that are unexpected."""
 
     @app.exception_handler(ApiError)
-    async def refused(request: Request, error: ApiError) -> JSONResponse:
+    async def refused(request: Request, error: ApiError) -> Response:
         return answer(request, error.kind, error.detail, headers=error.headers)
 
     @app.exception_handler(RequestValidationError)
-    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
         faults = [Fault(field=plain(".".join(map(str, fault["loc"]))), message=plain(fault["msg"].removeprefix("Value error, ")))
                   for fault in error.errors()[:MAX_FAULTS]]
         return answer(request, "invalid", "; ".join(f"{fault.field}: {fault.message}" for fault in faults), faults=faults)
 
     @app.exception_handler(RequestError)
-    async def unasked(request: Request, error: RequestError) -> JSONResponse:
+    async def unasked(request: Request, error: RequestError) -> Response:
         if isinstance(error, QuotaExceeded) and error.quota != BYTES:
             return answer(request, "too-many", str(error), headers={"Retry-After": str(QUOTA_RETRY_S)})
         return answer(request, "too-large" if isinstance(error, QuotaExceeded) else "invalid", sentence(error))
 
     @app.exception_handler(HTTPException)
-    async def routed(request: Request, error: HTTPException) -> JSONResponse:
+    async def routed(request: Request, error: HTTPException) -> Response:
         kind, headers = OF_STATUS.get(error.status_code, "bad-request"), dict(error.headers or {})
         if error.status_code == KINDS["method-not-allowed"].status:
             path = request.scope["path"]  # the router names the methods of its first route alone
@@ -126,12 +127,12 @@ def install(app: FastAPI) -> None:
         return answer(request, kind, str(error.detail or HTTPStatus(error.status_code).phrase), headers=headers)
 
     @app.exception_handler(StorageError)
-    async def full(request: Request, error: StorageError) -> JSONResponse:
+    async def full(request: Request, error: StorageError) -> Response:
         logger.error("storage refuses", error=str(error))
         return answer(request, "full", "the storage of the service cannot be written: its operator can see why in the log",
                       headers={"Retry-After": "60"})
 
-    async def unavailable(request: Request, error: Exception) -> JSONResponse:
+    async def unavailable(request: Request, error: Exception) -> Response:
         logger.error("database does not answer", error=message_of(error))
         return answer(request, "unavailable", "the database does not answer: try again", headers={"Retry-After": str(RETRY_S)})
 
@@ -145,10 +146,14 @@ def plain(text: str) -> str:
 
 
 def answer(request: Request, kind: str, detail: str, *, faults: list[Fault] | None = None,
-           headers: Mapping[str, str] | None = None) -> JSONResponse:
-    """Return the response for a kind of problem."""
+           headers: Mapping[str, str] | None = None) -> Response:
+    """Return the response for a kind of problem: a page for a browser that goes to an address, else a problem document."""
     row, detail = KINDS[kind], plain(detail)
     request.state.problem = detail  # for the log
+    if pages.wants_page(request):
+        page = pages.fault_page(request, row.status, row.title, detail)
+        page.headers.update(headers or {})
+        return page
     problem = Problem(type=f"urn:relit:problem:{kind}", title=row.title, status=row.status, detail=detail,
                       request_id=getattr(request.state, "request_id", ""), errors=faults or [])
     return JSONResponse(jsonable_encoder(problem), row.status, headers=dict(headers or {}), media_type=MEDIA_TYPE)

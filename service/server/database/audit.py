@@ -37,9 +37,11 @@ def record_operator(connection: sa.Connection, project: str, action: str, target
     _insert(connection, project, f"operator {_user()}", action, target, None)
 
 
-def listing(database: Database, *, project: str | None = None, limit: int) -> list[sa.RowMapping]:
-    """Return the last lines of a project or of all, the newest first."""
+def listing(database: Database, *, project: str | None = None, limit: int, before: int | None = None) -> list[sa.RowMapping]:
+    """Return the last lines of a project or of all, the newest first; `before` is the identifier of the last line of the page before."""
     query = sa.select(audit) if project is None else sa.select(audit).where(audit.c.project == project)
+    if before is not None:
+        query = query.where(audit.c.id < before)
     return database.rows(query.order_by(audit.c.id.desc()).limit(limit))
 
 

@@ -14,6 +14,9 @@ from service.server.database.engine import Database, storable
 from service.server.database.jobs import PATIENCE_S
 from service.server.database.tables import intakes, job_inputs, jobs, newest_first, uploads
 
+PROPOSAL = "proposal"
+"""The fact of a capture that has no manifest: how its files can be imported."""
+
 
 def insert(connection: sa.Connection, *, identifier: str, project: str, kind: str, name: str, folder: str | None) -> None:
     """Insert an intake: receiving an upload if `folder` is None, else registered and about to be checked."""
@@ -48,7 +51,7 @@ def lock_for_files(connection: sa.Connection, identifier: str, project: str) -> 
     """Lock an intake that receives files, also one that was refused, until the transaction ends; return False if its files are fixed."""
     return connection.execute(intakes.update().where(
         intakes.c.id == identifier, intakes.c.project == project, intakes.c.folder.is_(None), intakes.c.state.in_((RECEIVING, REFUSED)),
-    ).values(state=RECEIVING, problem=None)).rowcount == 1
+    ).values(state=RECEIVING, problem=None, facts=sa.null())).rowcount == 1
 
 
 def last_used(database: Database, identifiers: Sequence[str]) -> dict[str, float]:
@@ -68,6 +71,11 @@ def begin_check(connection: sa.Connection, identifier: str) -> bool:
 def accept(database: Database, identifier: str, facts: dict[str, Any], allow: Callable[[sa.Connection], None] | None = None) -> None:
     """Record the facts of a check that found nothing wrong; `allow` is called in the transaction, and raises if the project may not."""
     _judge(database, identifier, allow, state=READY, facts=facts, problem=None)
+
+
+def propose(database: Database, identifier: str, proposal: dict[str, Any]) -> None:
+    """Record how the files of a capture can be imported; it receives files again."""
+    _judge(database, identifier, None, state=RECEIVING, facts={PROPOSAL: proposal}, problem=None)
 
 
 def refuse(database: Database, identifier: str, problem: str) -> None:

@@ -26,6 +26,7 @@ LATELY_S = 60.0
 """Seconds for which `watched` returns a job after it ended; the clocks of workers may differ by this much."""
 MOST_ENTRIES = 1000
 """Most entries of the log of a job; what comes after is not recorded."""
+KIND = jobs.c.request["kind"].as_string()
 OF_IDENTIFIERS = sa.select(jobs).where(jobs.c.id.in_(sa.bindparam("jobs", expanding=True)))
 WATCHED = sa.select(jobs.c.id, jobs.c.project, jobs.c.revision).where(sa.or_(
     jobs.c.id.in_(sa.bindparam("topics", expanding=True)),
@@ -81,13 +82,22 @@ def find(database: Database, job: str, project: str | None = None) -> sa.RowMapp
     return database.row(query if project is None else query.where(jobs.c.project == project))
 
 
-def latest(database: Database, project: str, *, states: Sequence[str] = (), limit: int, before: tuple[float, str] | None = None,
-           ) -> list[sa.RowMapping]:
+def latest(database: Database, project: str, *, states: Sequence[str] = (), kinds: Sequence[str] = (), limit: int,
+           before: tuple[float, str] | None = None) -> list[sa.RowMapping]:
     """Return a page of the jobs of a project, the newest first; `before` has time and identifier of the last of the page before."""
     query = sa.select(jobs).where(jobs.c.project == project)
     if states:
         query = query.where(jobs.c.state.in_(states))
+    if kinds:
+        query = query.where(KIND.in_(kinds))
     return database.rows(newest_first(query, jobs, limit=limit, before=before))
+
+
+def views_of(database: Database, intakes: Sequence[str]) -> dict[str, str]:
+    """Return for each capture that a view was prepared of, the newest job that has prepared one."""
+    query = sa.select(job_inputs.c.input, jobs.c.id).join(jobs, jobs.c.id == job_inputs.c.job).where(
+        job_inputs.c.input.in_(intakes), jobs.c.state == SUCCEEDED, KIND == "view").order_by(jobs.c.created_at)
+    return {row["input"]: row["id"] for row in database.rows(query)}
 
 
 def watched(database: Database, topics: Sequence[str]) -> list[sa.RowMapping]:
@@ -129,7 +139,7 @@ def frames(database: Database) -> int:
 def users_of(connection: sa.Connection, input_id: str, *, active: bool) -> list[str]:
     """Return the jobs, checks apart, that read a capture, an environment or a job; with `active`, those that have not ended."""
     query = sa.select(jobs.c.id).join(job_inputs, job_inputs.c.job == jobs.c.id).where(
-        job_inputs.c.input == input_id, jobs.c.request["kind"].as_string() != "check")
+        job_inputs.c.input == input_id, KIND != "check")
     return list(connection.execute(query.where(jobs.c.state.in_(ACTIVE)) if active else query).scalars())
 
 

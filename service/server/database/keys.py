@@ -5,6 +5,7 @@ import hmac
 import secrets
 import time
 from collections.abc import Collection
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -70,6 +71,17 @@ def find(database: Database, presented: str) -> Caller | None:
     return Caller(row["project"], Scope(row["scope"]), identifier, row["expires_at"])
 
 
+def fault_of(database: Database, presented: str) -> str:
+    """Return why a key was refused, in words; who does not have its secret is told nothing of it."""
+    identifier, _, secret = presented.partition(".")
+    row = database.row(sa.select(keys).where(keys.c.id == identifier))
+    if row is None or not hmac.compare_digest(row["digest"], _digest(secret)):
+        return "this service does not know the key"
+    if row["revoked_at"] is not None:
+        return f"the key was revoked on {_day(row['revoked_at'])}"
+    return f"the key expired on {_day(row['expires_at'])}"
+
+
 def still_valid(database: Database, identifiers: Collection[str]) -> set[str]:
     """Return those of the keys that have neither been revoked nor expired."""
     return {row["id"] for row in database.rows(STILL_VALID, keys=list(identifiers), now=time.time())}
@@ -95,3 +107,7 @@ def listing(database: Database, project: str | None = None) -> list[sa.RowMappin
 
 def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def _day(when: float) -> str:
+    return datetime.fromtimestamp(when, UTC).date().isoformat()

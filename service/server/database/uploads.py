@@ -31,6 +31,14 @@ def insert(connection: sa.Connection, *, identifier: str, project: str, intake: 
         touched_at=time.time(), done=False))
 
 
+def insert_made(connection: sa.Connection, *, identifier: str, project: str, intake: str, path: str, length: int) -> None:
+    """Insert a file that the service has made and put into the storage, in place of another of its path; the caller has locked the
+    intake."""
+    connection.execute(uploads.delete().where(uploads.c.intake == intake, uploads.c.path == path))
+    insert(connection, identifier=identifier, project=project, intake=intake, path=path, length=length, sha256=None)
+    connection.execute(uploads.update().where(uploads.c.id == identifier).values(received=length, done=True, pieces=[]))
+
+
 def find(database: Database, identifier: str, project: str) -> Row | None:
     """Return an upload of a project, or None."""
     row = database.row(sa.select(uploads).where(uploads.c.id == identifier, uploads.c.project == project))

@@ -10,7 +10,7 @@ from service.requests import jobs
 from service.requests.base.identifiers import CAPTURE
 from service.requests.light.frame_range import frame_numbers, numbered
 from service.server.database import intakes, quotas
-from service.server.jobs import scan_sets, solving
+from service.server.jobs import importing, scan_sets, solving
 from service.server.jobs.context import Job, JobStep, WorkerContext
 from service.server.jobs.one_step import ONE_STEP, export, write_keys
 from service.server.jobs.places import StepFiles
@@ -42,7 +42,9 @@ def steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
 def _steps_of(job: Job, context: WorkerContext) -> list[JobStep]:
     request = job.request
     if isinstance(request, jobs.CheckJob):
-        return [JobStep("check", lambda progress: _check(request, StepFiles(job, context, progress)))]
+        name, look = (("guess", importing.look) if request.guess else ("check", _check) if request.importing is None else
+                      ("import", importing.import_files))
+        return [JobStep(name, lambda progress: look(request, StepFiles(job, context, progress)))]
     if isinstance(request, jobs.SolveJob | jobs.DepthJob):
         return solving.steps(job, request, context)
     if isinstance(request, jobs.RegisterJob | jobs.FuseJob):

@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from service.requests.base.base import Choice, Commas, JobRequest, Role
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.base.options import Option, help_text, is_document, places_of, typed
+from service.requests.imports.layouts import LAYOUTS, Layout, options_of_layout
 from service.requests.jobs import JOBS
 from stage.capture.manifest import LIT_BY
 
@@ -117,6 +118,11 @@ def form_of(kind: str, model: type[JobRequest]) -> Form:
     main = [field for is_input, field in fields if is_input] + [field for is_input, field in fields if field.required and not is_input]
     return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(main),
                 tuple(field for _, field in fields if field not in main), BEGIN_WITH.get(kind, ()))
+
+
+def import_fields(layout: Layout) -> list[Field]:
+    """Return the controls of the options of an import, by the names that the API has."""
+    return [_field(LAYOUTS[layout], (name,), option) for name, option in options_of_layout(layout).items()]
 
 
 def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Field:

@@ -16,8 +16,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 
 from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
+from service.requests.imports.layouts import Layout
 from service.requests.jobs import JOBS
-from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, form_of
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
@@ -89,6 +90,12 @@ async def capture(request: Request, capture: CaptureId) -> Response:
                  forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
 
 
+@router.get("/import-form/{layout}")
+async def import_form(request: Request, layout: Layout) -> Response:
+    """Return the controls of an import, which the page of captures shows beside what files seem to be."""
+    return _page(request, "import_form.html", fields=import_fields(layout))
+
+
 @router.get("/jobs")
 async def jobs(request: Request) -> Response:
     """Show the jobs as they change, and the forms of the jobs that begin with neither a capture nor maps."""
@@ -142,6 +149,19 @@ async def drive(request: Request, job: JobId) -> Response:
 async def stage(request: Request) -> Response:
     """Take captures at the stage of this machine."""
     return _page(request, "set.html")
+
+
+def wants_page(request: Request) -> bool:
+    """Return whether a browser goes to an address, and so is answered with a page; a program names no HTML among what it accepts."""
+    return request.method in ("GET", "HEAD") and "text/html" in request.headers.get("Accept", "")
+
+
+def fault_page(request: Request, status: int, title: str, detail: str) -> Response:
+    """Return a page that says in one sentence why there is nothing else to show."""
+    sentence = f"{detail[:1].upper()}{detail[1:]}".rstrip(".") + "."
+    page = _page(request, "fault.html", title=title, sentence=sentence, status=status, request_id=getattr(request.state, "request_id", ""))
+    page.status_code = status
+    return page
 
 
 @router.get("/favicon.ico")

@@ -22,7 +22,7 @@ from tests.scenes.captures import edit_frame, edit_manifest, files_in, make_scen
 from tests.scenes.glossy import dome, write_dome, write_maps
 
 ROOT = Path(__file__).parents[3]
-FILES = {"view.json", "view.bin", "thumbnails.jpg"}
+FILES = {"view.json", "view.bin", "thumbnails.jpg", "card.jpg", "card_lights.jpg"}
 
 
 def strict(text: str) -> dict:

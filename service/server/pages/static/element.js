@@ -41,6 +41,12 @@ export function bytes(count) {
   return `${at === 0 ? count : count.toFixed(count < 10 ? 1 : 0)} ${units[at]}`;
 }
 
+/** Return how fast bytes are sent, and how long the rest takes, as a person reads it; empty where nothing can be said yet. */
+export function rate(sent, total, seconds) {
+  if (seconds < 1 || sent === 0) return "";
+  return `, ${bytes(sent / seconds)}/s, ${duration((total - sent) * seconds / sent)} left`;
+}
+
 /** Return a duration as a person reads it. */
 export function duration(seconds) {
   if (seconds < 60) return `${seconds.toFixed(seconds < 10 ? 1 : 0)} s`;
@@ -72,7 +78,7 @@ export function icon(name) {
   const [drawing, use] = ["svg", "use"].map((tag) => document.createElementNS("http://www.w3.org/2000/svg", tag));
   drawing.setAttribute("class", "icon");
   drawing.setAttribute("aria-hidden", "true");
-  use.setAttribute("href", `/static/icons.svg#${name}`);
+  use.setAttribute("href", `/static/look/icons.svg#${name}`);
   drawing.append(use);
   return drawing;
 }

@@ -105,7 +105,7 @@ async function copy(form, button) {
 }
 
 /** Return the request of a form, and its options as a command has them. What has its default is left out. */
-function entered(form) {
+export function entered(form) {
   const request = { kind: form.dataset.kind };
   const options = [];
   for (const field of form.querySelectorAll(".field")) {

@@ -1,15 +1,19 @@
 /** Files and folders that a person drops or chooses. */
 
-const IMAGES = /\.(exr|png|jpe?g|tiff?|hdr|npy|webp|bmp|tga|avif)$/i;
-
 /**
- * Return the files of what was dropped: one folder, or one file.
+ * Return the files of what was dropped: folders, files, or both.
  * @param {DataTransfer} dropped
- * @returns {Promise<{name: string, files: {path: string, file: File}[]}[]>} One entry for each folder or file.
+ * @returns {Promise<{name: string, files: {path: string, file: File}[]}[]>} One entry for each folder and environment, and one for all other
+ * files.
  */
 export async function droppedFiles(dropped) {
   const entries = [...dropped.items].map((item) => item.webkitGetAsEntry()).filter((entry) => entry !== null);
-  return Promise.all(entries.map(async (entry) => ({ name: entry.name, files: await filesBelow(entry, entry.isDirectory ? null : "") })));
+  const found = await Promise.all(entries.map(async (entry) => ({
+    name: entry.name, isFolder: entry.isDirectory, files: await filesBelow(entry, entry.isDirectory ? null : "") })));
+  const loose = found.filter((each) => !each.isFolder);
+  if (loose.length < 2 || loose.every(({ name }) => isEnvironment(name))) return found;
+  return [...found.filter((each) => each.isFolder),
+    { name: `${loose[0].name} and ${loose.length - 1} more`, files: loose.flatMap(({ files }) => files) }];
 }
 
 /** Return the files of a chosen folder, as `droppedFiles` does. */
@@ -18,14 +22,9 @@ export function chosenFolder(list) {
   return { name: list[0]?.webkitRelativePath.split("/")[0] ?? "", files };
 }
 
-/** Return why the files cannot be a capture, in one sentence; null: they can. */
-export function faultOfCapture({ name, files }) {
-  const paths = files.map(({ path }) => path);
-  if (!paths.some((path) => IMAGES.test(path))) return `${name}: the folder has no images: choose the folder that holds capture.json and the images`;
-  if (!paths.includes("capture.json")) {
-    return `${name}: the folder has no capture.json: relit import writes one for data that is laid out another way (docs/capture.md)`;
-  }
-  return null;
+/** Return whether files are a capture, a sequence of captures, a scan or a board as they are; else the server is asked what they are. */
+export function isCapture({ files }) {
+  return files.some(({ path }) => /^([^/]+\/)?capture\.json$|^(sequence|scan|board)\.json$/.test(path));
 }
 
 /** Return whether a name is that of an environment map. */

@@ -9,25 +9,28 @@ const LONGEST_WAIT_S = 15;
 const TUS = { "Tus-Resumable": "1.0.0" };
 
 /** A file with its path within the capture. @typedef {{path: string, file: File}} LocalFile */
+/** What stops an upload, whereupon the server keeps what it has; and who is told that the server cannot be reached, or can again.
+ * @typedef {{signal: AbortSignal, lost: function(boolean): void}} Link */
 
 /** Thrown where an upload was stopped by the person. */
 export class Stopped extends Error {}
 
 /**
- * Upload the files of a capture or environment, and have them checked.
+ * Upload the files of a capture or environment, and have them checked, or guessed where they are no capture yet.
  *
- * An upload of the same name that was interrupted is continued: files that the server has are not sent again.
+ * An upload of the same name that was interrupted is continued: files that the server has are not sent again. Files to be guessed that the
+ * server has as a capture of this name are that capture.
  * @param {"captures"|"environments"} listingName What is created.
  * @param {string} name Of the capture.
  * @param {LocalFile[]} files All of them.
  * @param {function(number, number, string): void} progress Told bytes sent, bytes in all, and what is being done.
- * @param {AbortSignal} signal Stops the upload; the server keeps what it has.
- * @returns {Promise<any>} The capture, ready or refused.
+ * @param {Link} link
+ * @param {"validate"|"guess"} then What is done with the files.
+ * @returns {Promise<any>} The capture: ready or refused, or receiving with the fact `proposal`.
  */
-export async function upload(listingName, name, files, progress, signal) {
-  const intake = await begun(listingName, name);
-  const known = new Map();
-  for await (const file of listing(`/v1/${listingName}/${intake.id}/files`, "files", "after")) known.set(file.path, file);
+export async function upload(listingName, name, files, progress, link, then = "validate") {
+  const [intake, known] = await begun(listingName, name, then === "guess" ? files : null);
+  if (intake.state === "ready") return intake;
   const total = files.reduce((sum, { file }) => sum + file.size, 0);
   const sent = new Map();
   let over = false; // one file failed, or the person stopped: the others end too, and tell nothing any more
@@ -39,7 +42,7 @@ export async function upload(listingName, name, files, progress, signal) {
   const waiting = [...files];
   const one = async () => {
     for (let next = waiting.shift(); next !== undefined && !over; next = waiting.shift()) {
-      await uploadFile(`/v1/${listingName}/${intake.id}/files`, next, known.get(next.path), (bytes) => tell(next.path, bytes), signal);
+      await uploadFile(`/v1/${listingName}/${intake.id}/files`, next, known.get(next.path), (bytes) => tell(next.path, bytes), link);
     }
   };
   try {
@@ -48,53 +51,86 @@ export async function upload(listingName, name, files, progress, signal) {
     over = true;
   }
   progress(total, total, "checking");
-  let found = await post(`/v1/${listingName}/${intake.id}/validate`);
+  return settled(await post(`/v1/${listingName}/${intake.id}/${then}`), listingName, link);
+}
+
+/** Return a capture or environment when nothing looks at it any more. */
+export async function settled(found, listingName, link) {
   while (found.state === "checking") {
-    await pause(0.5, signal);
-    found = await persist(() => read(`/v1/${listingName}/${intake.id}`), signal);
+    await pause(0.5, link.signal);
+    found = await persist(() => read(`/v1/${listingName}/${found.id}`), link);
   }
   return found;
 }
 
-async function begun(listingName, name) {
+/** Return a capture or environment of this name that can take the files, a new one if there is none, and the files that it has; with
+ * `same`, one that has nothing else than these files, or that was made of them. */
+async function begun(listingName, name, same) {
   for await (const intake of listing(`/v1/${listingName}`, "items")) {
-    if (intake.name === name && intake.state === "receiving") return intake;
+    if (intake.name !== name || intake.registered) continue;
+    if (same === null ? intake.state !== "receiving" : intake.state === "checking") continue;
+    const known = new Map();
+    for await (const file of listing(`/v1/${listingName}/${intake.id}/files`, "files", "after")) known.set(file.path, file);
+    if (same === null || (await isOf(intake, known, same))) return [intake, known];
   }
-  return post(`/v1/${listingName}`, { name });
+  return [await post(`/v1/${listingName}`, { name }), new Map()];
 }
 
-async function uploadFile(place, { path, file }, known, progress, signal) {
-  const digest = file.size <= DIGEST_BYTES ? await sha256(await file.arrayBuffer()) : null;
-  if (known?.done && known.length === file.size && (digest === null || known.sha256 === hex(digest))) {
+async function isOf(intake, known, files) {
+  if (intake.state !== "ready") {
+    const sizes = new Map(files.map(({ path, file }) => [path, file.size]));
+    return [...known.values()].every(({ path, length }) => sizes.get(path) === length);
+  }
+  if (!files.every(({ path, file }) => known.get(path)?.length === file.size)) return false;
+  for (const { path, file } of files) {
+    if (!(await isStored(known.get(path), file))) return false;
+  }
+  return true;
+}
+
+/** Return whether the server has a file whole; one too large for a digest is told by its length. */
+async function isStored(known, file, digest = undefined) {
+  if (!known?.done || known.length !== file.size) return false;
+  const ours = digest === undefined ? await digestOf(file) : digest;
+  return ours === null || known.sha256 === hex(ours);
+}
+
+async function digestOf(file) {
+  return file.size <= DIGEST_BYTES ? sha256(await file.arrayBuffer()) : null;
+}
+
+async function uploadFile(place, { path, file }, known, progress, link) {
+  const digest = await digestOf(file);
+  if (await isStored(known, file, digest)) {
     progress(file.size);
     return;
   }
   let target = known !== undefined && !known.done && known.length === file.size ? `/v1/uploads/${known.upload}` : null;
   if (target === null) {
     if (known !== undefined && !known.done) await send(`/v1/uploads/${known.upload}`, { method: "DELETE", headers: TUS });
-    target = await create(place, path, file.size, digest, signal);
+    target = await create(place, path, file.size, digest, link);
   }
-  let offset = await persist(() => offsetOf(target), signal);
+  let offset = await persist(() => offsetOf(target), link);
   while (offset < file.size) {
     progress(offset);
     const piece = await file.slice(offset, offset + PIECE_BYTES).arrayBuffer();
     try {
-      offset = await patch(target, offset, piece, signal);
+      offset = await patch(target, offset, piece, link.signal);
     } catch (error) {
       if (!(error instanceof Refusal) || ![0, 409, 423, 429, 460, 503].includes(error.status)) throw error;
-      await pause(1, signal);
-      offset = await persist(() => offsetOf(target), signal);
+      await pause(1, link.signal);
+      offset = await persist(() => offsetOf(target), link);
     }
   }
   progress(file.size);
 }
 
-async function create(place, path, size, digest, signal) {
+async function create(place, path, size, digest, link) {
   const metadata = [`path ${base64(new TextEncoder().encode(path))}`];
   if (digest !== null) metadata.push(`sha256 ${base64(new TextEncoder().encode(hex(digest)))}`);
   const token = newToken();
   const made = await persist(() => send(place, { method: "POST", headers: {
-    ...TUS, "Upload-Length": String(size), "Upload-Metadata": metadata.join(","), "Idempotency-Key": token } }), signal);
+    ...TUS, "Upload-Length": String(size), "Upload-Metadata": metadata.join(","), "Idempotency-Key": token } }), link);
   await made.json(); // a body that is not read counts as a broken request
   return new URL(made.headers.get("Location"), location.origin).pathname;
 }
@@ -113,14 +149,17 @@ async function patch(target, offset, piece, signal) {
 }
 
 /** Do something until the server can be reached. */
-async function persist(action, signal) {
+async function persist(action, link) {
   for (let wait = 1; ; wait = Math.min(2 * wait, LONGEST_WAIT_S)) {
     try {
-      return await action();
+      const done = await action();
+      link.lost(false);
+      return done;
     } catch (error) {
       if (!(error instanceof Refusal) || ![0, 429, 503].includes(error.status)) throw error;
+      link.lost(true);
     }
-    await pause(wait, signal);
+    await pause(wait, link.signal);
   }
 }
 

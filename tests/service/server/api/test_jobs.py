@@ -50,7 +50,8 @@ def test_a_depth_and_views_of_it_of_maps_and_of_a_capture_alone(server, client, 
                           "depth": {"capture": rig, "maps": job["id"]}, "capture": {"capture": dome}}.items():
         view = submit(client, kind="view", **request)
         finish(server, client, view)
-        assert made_by(client, view) == {"view.json", "view.bin", "thumbnails.jpg"}
+        lit = set() if name == "depth" else {"card_lights.jpg"}
+        assert made_by(client, view) == {"view.json", "view.bin", "thumbnails.jpg", "card.jpg"} | lit
         results = f"/v1/jobs/{view['id']}/results"
         shown[name] = client.get(f"{results}/view.json").raise_for_status().json()
         for offset, length in [place for layer in shown[name]["layers"] for place in layer["levels"][0]["tiles"]]:

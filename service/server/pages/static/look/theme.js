@@ -12,7 +12,7 @@
     const present = () => {
       button.setAttribute("aria-label", isDark() ? "Show in light" : "Show in dark");
       button.title = button.getAttribute("aria-label");
-      button.querySelector("use").setAttribute("href", `/static/icons.svg#${isDark() ? "sun" : "moon"}`);
+      button.querySelector("use").setAttribute("href", `/static/look/icons.svg#${isDark() ? "sun" : "moon"}`);
     };
     button.addEventListener("click", () => {
       root.dataset.theme = isDark() ? "light" : "dark";

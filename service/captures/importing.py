@@ -1,0 +1,205 @@
+"""Import files that are laid out another way as a capture: from the request of a layout to its capture.json."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
+from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
+from service.requests.imports.patterns import (
+    ExposureOrder,
+    GrayImport,
+    LaserImport,
+    OpencvGrayImport,
+    PatternImageOptions,
+    PhaseImport,
+    PhaseShift,
+    RigOptions,
+    ScannerImport,
+    WaveOrigin,
+)
+from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
+from service.requests.patterns import PatternAxis
+from stage.capture.manifest import read_manifest, write_manifest
+from stage.importers.layout import Imported
+
+if TYPE_CHECKING:
+    from stage.importers.camera_options import Selection, View
+    from stage.importers.patterns import PatternImages
+    from stage.importers.raw_arrays import ArrayFiles
+
+
+def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Imported:
+    """Write the capture.json of a request, and return where it is and how the files were understood.
+
+    Args:
+        assumed: what was taken for granted by who chose the layout, which the manifest then records.
+
+    Raises:
+        ManifestError: the files do not hold what the layout has, or do not fit the options.
+    """
+    imported = _IMPORTS[type(request)](request)
+    manifest = read_manifest(imported.path)
+    more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
+    if more:
+        write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
+    return imported
+
+
+def _diligent(request: DiligentImport) -> Imported:
+    from stage.importers import diligent
+
+    return Imported(diligent.import_folder(request.source, request.folder), ())
+
+
+def _lp(request: LpImport) -> Imported:
+    from stage.importers import lp
+
+    return Imported(lp.import_folder(request.source, request.folder, view=_view(request), color_space=request.color_space), ())
+
+
+def _opencv_gray(request: OpencvGrayImport) -> Imported:
+    from stage.importers.patterns import import_opencv_gray
+
+    return Imported(import_opencv_gray(request.source, request.folder, projector=request.projector, calibration=request.calibration,
+                                   unit_m=request.unit_m), ())
+
+
+def _olat(request: OlatImport) -> Imported:
+    from stage.importers import olat
+
+    return olat.import_folder(
+        request.source, request.folder, axes=request.axes, to_light=request.sense is Sense.TO_LIGHT, lights=request.lights,
+        variable=request.variable, run=request.lights_in, strengths=request.strengths, selection=_selection(request), view=_view(request),
+        color_space=request.color_space)
+
+
+def _photos(request: PhotosImport) -> Imported:
+    from stage.importers.olat import import_photos
+
+    return import_photos(request.source, request.folder, selection=_selection(request), view=_view(request),
+                         color_space=request.color_space)
+
+
+def _near_lights(request: NearLightsImport) -> Imported:
+    from stage.importers.olat import import_near_lights
+
+    return import_near_lights(
+        request.source, request.folder, axes=request.axes, unit_m=request.unit_m, lights=request.lights, camera=request.camera,
+        selection=_selection(request), view=_view(request), color_space=request.color_space)
+
+
+def _relightlab(request: RelightlabImport) -> Imported:
+    from stage.importers import relightlab
+
+    return relightlab.import_folder(request.source, request.destination, color_space=request.color_space)
+
+
+def _gray(request: GrayImport) -> Imported:
+    from stage.importers.pattern_order import GrayStack
+    from stage.importers.patterns import import_gray
+
+    gray = GrayStack(sequence=request.sequence, inverses=request.inverses, fine_first=request.fine_first, column_bits=request.column_bits,
+                     row_bits=request.row_bits)
+    pictures = _pattern_images(request, request, request)
+    return import_gray(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, gray=gray)
+
+
+def _phase(request: PhaseImport) -> Imported:
+    from stage.importers.pattern_order import GrayStack, PhaseStack
+    from stage.importers.patterns import import_phase
+
+    phase = PhaseStack(axes=_axes(request.axis), periods_px=request.periods, row_periods_px=request.row_periods, steps=request.steps,
+                       order=request.order, advancing=request.shift is PhaseShift.MINUS, offset_deg=request.offset_deg)
+    gray = GrayStack(inverses=request.gray_inverses, fine_first=request.gray_fine_first)
+    pictures = _pattern_images(request, request, request)
+    return import_phase(request.source if pictures.video is None else pictures.video.folder, request.folder, pictures=pictures, phase=phase,
+                        gray_images=request.gray_images, gray_stripe_px=request.gray_stripe, gray=gray,
+                        from_centre=request.origin is WaveOrigin.CENTRE)
+
+
+def _scanner(request: ScannerImport) -> Imported:
+    from stage.importers.patterns import import_scanner
+
+    return import_scanner(request.source, request.folder, calibration=request.calibration, codec=request.codec, axes=_axes(request.axis),
+                          unit_m=request.unit_m, projector=request.projector, images=request.images)
+
+
+def _laser(request: LaserImport) -> Imported:
+    from stage.importers import laser
+
+    return laser.import_folder(request.source, request.folder, view=_view(request), camera=request.camera, planes=request.planes,
+                               form=request.form, axes=request.axes, unit_m=request.unit_m, selection=_selection(request),
+                               color_space=request.color_space)
+
+
+def _tof(request: TofImport) -> Imported:
+    from stage.importers.tof import import_correlations
+
+    return import_correlations(
+        request.source, request.folder, frequencies_hz=request.frequencies_hz, phases_deg=request.phases_deg,
+        minus=request.signal is Signal.MINUS, order=request.order, arrays=_arrays(request), planes=request.planes,
+        source_m=request.source_m, view=_view(request))
+
+
+def _histogram(request: HistogramImport) -> Imported:
+    from stage.importers.tof import import_histograms
+
+    return import_histograms(
+        request.source, request.folder, bin_s=request.bin_s, start_s=request.start_s, count_scale=request.count_scale,
+        pulses=request.pulses, first_photon_only=request.first_photon_only, bins=request.bins, arrays=_arrays(request),
+        source_m=request.source_m, view=_view(request))
+
+
+def _kinect(request: KinectImport) -> Imported:
+    from stage.importers import kinect
+
+    return kinect.import_folder(request.source, request.folder, packet=request.packet, p0=request.p0, view=_view(request))
+
+
+def _arrays(request: ArrayOptions) -> "ArrayFiles":
+    from stage.importers.raw_arrays import ArrayFiles
+
+    return ArrayFiles(files=request.arrays, variables=request.variable, dtype=request.dtype, size=request.size)
+
+
+def _axes(axis: PatternAxis) -> tuple[str, ...]:
+    return ("column", "row") if axis is PatternAxis.BOTH else (axis.value,)
+
+
+def _pattern_images(images: PatternImageOptions, rig: RigOptions, given: ImportRequest) -> "PatternImages":
+    """Return which images are frames; those of a video are unpacked first."""
+    from stage.errors import ManifestError
+    from stage.importers.patterns import PatternImages
+    from stage.importers.video import FrameRange, is_video, unpack
+
+    video, space = None, images.color_space
+    if is_video(given.source):
+        if given.destination is None:
+            raise ManifestError(f"{given.source}: is a video: give a folder for its frames behind it")
+        video = unpack(given.source, given.destination, FrameRange.parse(images.video_frames or "0"))
+        if "color_space" not in images.model_fields_set:
+            space = "srgb_texture"  # videos are encoded for displays
+    elif images.video_frames is not None:
+        raise ManifestError(f"--video-frames {images.video_frames}: {given.source} is no video")
+    return PatternImages(projector=rig.projector, images=images.images, mask=images.mask, white=images.white, black=images.black,
+                         calibration=rig.calibration, unit_m=rig.unit_m, color_space=space, video=video, exposures_s=images.exposures_s,
+                         patterns_first=images.exposure_order is ExposureOrder.PATTERN)
+
+
+def _view(request: LensOptions) -> "View":
+    from stage.importers.camera_options import View
+
+    return View(**{field.name: getattr(request, field.name) for field in fields(View) if hasattr(request, field.name)})
+
+
+def _selection(request: ImageOptions) -> "Selection":
+    from stage.importers.camera_options import Selection
+
+    return Selection(images=request.images, mask=request.mask, ambient=request.ambient)
+
+
+_IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
+    DiligentImport: _diligent, LpImport: _lp, RelightlabImport: _relightlab, OlatImport: _olat, PhotosImport: _photos,
+    NearLightsImport: _near_lights, OpencvGrayImport: _opencv_gray, GrayImport: _gray, PhaseImport: _phase, ScannerImport: _scanner,
+    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser}

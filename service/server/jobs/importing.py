@@ -1,0 +1,107 @@
+"""Files without a manifest that were uploaded: a proposal of what they are, and their import as a capture.
+
+Both are done in a hidden folder of links to the files, among the results of the job, by a process of its own; so nothing of an import
+that fails or is killed is in the capture, and it is done again from the beginning. What a killed one left goes with the job.
+"""
+
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from service.errors import RequestError
+from service.requests import jobs
+from service.requests.base.identifiers import UPLOAD, new_id
+from service.server.database import intakes, quotas, uploads
+from service.server.jobs.places import StepFiles
+from service.server.storage import layout
+from stage.capture.manifest import FILE_NAME
+from stage.errors import storage
+from stage.importers.layout import place_images
+
+MOST_FILES = 1_000_000
+MADE = (FILE_NAME, ".npy")
+"""The endings of the names of files that imports make."""
+
+
+def look(request: jobs.CheckJob, files: StepFiles) -> None:
+    """Record how the files of a capture can be imported."""
+    from service.captures.check_process import propose_in_process
+
+    with _links(request.intake, files) as (folder, _):
+        proposal = propose_in_process(folder, max_pixels=files.context.max_pixels, progress=files.progress)
+    intakes.propose(files.context.database, request.intake, proposal)
+
+
+def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
+    """Import the files of a capture as the request says, check what was made, and let the capture be ready with it."""
+    from service.captures.check_process import check_in_process, import_in_process
+    from service.captures.proposals import still_assumed
+
+    context, job, choices = files.context, files.job, request.importing
+    row = intakes.find(context.database, request.intake, job.project)
+    if row is None or choices is None:
+        raise RequestError(f"{request.intake}: is not there any more")
+    proposal = (row["facts"] or {}).get(intakes.PROPOSAL)
+    with _links(request.intake, files) as (folder, given):
+        import_in_process(folder, choices, () if proposal is None else still_assumed(proposal, choices), row["name"],
+                          max_pixels=context.max_pixels, progress=files.progress)
+        facts = check_in_process(folder, environment=False, root=None, max_pixels=context.max_pixels, progress=files.progress)
+        made = _made(folder, given)
+        settings = context.settings
+        if settings is not None:  # asked again where it counts
+            context.database.transact(lambda connection: quotas.require(
+                connection, settings, quotas.BYTES, job.project, sum(made.values())))
+        for name in made:
+            context.storage.put(folder / name, layout.intake(job.project, request.intake), name)
+
+    def record(connection: sa.Connection) -> None:
+        if settings is not None:
+            quotas.require(connection, settings, quotas.PIXELS, job.project, quotas.pixels_of(facts))
+            quotas.require(connection, settings, quotas.BYTES, job.project, sum(made.values()))
+        for name, length in made.items():
+            uploads.insert_made(connection, identifier=new_id(UPLOAD), project=job.project, intake=request.intake, path=name, length=length)
+
+    try:
+        intakes.accept(context.database, request.intake, facts, record)
+    except RequestError:
+        for name in made:
+            context.storage.delete(layout.intake(job.project, request.intake), name)
+        raise
+
+
+@contextmanager
+def _links(intake: str, files: StepFiles) -> Iterator[tuple[Path, frozenset[str]]]:
+    """Yield a folder with links to the uploaded files of a capture, copies where there are no links, and their names.
+
+    What an import of the same capture made that was killed is not among them.
+    """
+    rows = uploads.listing(files.context.database, intake, limit=MOST_FILES)
+    names = frozenset(row["path"] for row in rows if row["path"] != FILE_NAME)
+    source, root = files.intake_place(intake)
+    if root is not None:
+        raise RequestError(f"{intake}: is registered, and stays as it is: relit import writes its {FILE_NAME} where it lies")
+    work = files.context.storage.workspace(layout.results(files.job.project, files.job.id))
+    with storage("write", work), tempfile.TemporaryDirectory(prefix=".import-", dir=work) as made:
+        folder = Path(made) / "files"
+        folder.mkdir()
+        place_images(source, folder, sorted(names))
+        yield folder, names
+
+
+def _made(folder: Path, given: frozenset[str]) -> dict[str, int]:
+    """Return the names and lengths of the files that an import made; refuse anything else that is new."""
+    made: dict[str, int] = {}
+    for path in sorted(folder.rglob("*")):
+        name, found = path.relative_to(folder).as_posix(), path.lstat()
+        if name in given or stat.S_ISDIR(found.st_mode):
+            continue
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not name.endswith(MADE):
+            raise RequestError(f"{name}: is named by the files, and was not uploaded with them")
+        made[name] = found.st_size
+    return made
+
+

@@ -1,0 +1,60 @@
+/** The jobs that the home page knows: those that have not ended, and those that failed lately. */
+
+import { listing, read } from "../api.js";
+import { watch } from "../events.js";
+import { words } from "../element.js";
+
+const MOST_FAILED = 10;
+
+export class Jobs {
+  #jobs = new Map();
+  #changed;
+  fault = ""; // what keeps the service from work
+
+  /** @param {function(any|null): void} changed Is told the job that has changed; null: all are new. */
+  constructor(changed) {
+    this.#changed = changed;
+  }
+
+  /** Return them, the newest first. */
+  get all() {
+    return [...this.#jobs.values()].sort((one, other) => (one.created_at < other.created_at ? 1 : -1));
+  }
+
+  /** Return how many run or wait. */
+  get active() {
+    return this.all.filter((job) => ["queued", "running"].includes(job.state)).length;
+  }
+
+  async load() {
+    for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#jobs.set(job.id, job);
+    const { jobs } = await read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`);
+    for (const job of jobs) this.#jobs.set(job.id, job);
+    await this.#askWhatIsWrong();
+    this.#changed(null);
+  }
+
+  follow() {
+    return watch("/v1/events", {
+      job: async (job) => {
+        const isNew = this.#jobs.get(job.id)?.state !== job.state;
+        this.#jobs.set(job.id, job);
+        if (isNew && job.state === "queued") await this.#askWhatIsWrong();
+        this.#changed(job);
+      },
+      gone: ({ id }) => { this.#jobs.delete(id); this.#changed(null); },
+    });
+  }
+
+  async #askWhatIsWrong() {
+    if (!this.all.some((job) => job.state === "queued")) return;
+    const answer = await fetch("/readyz");
+    this.fault = answer.ok ? "" : (await answer.json()).detail;
+  }
+}
+
+/** Return what a job is called, with the capture that it is about; `nameOf` gives the name of a capture or environment, or undefined. */
+export function titleOf({ request }, nameOf) {
+  const about = nameOf(request.capture ?? request.intake);
+  return request.name || (about === undefined ? words(request.kind) : `${words(request.kind)} · ${about}`);
+}

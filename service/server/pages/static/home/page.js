@@ -1,0 +1,150 @@
+/** The home page: all captures, sequences, assets and environments as cards, and the jobs above them. */
+
+import { attempt, load, read, Refusal, send } from "../api.js";
+import { mountDropZone } from "../drop_zone.js";
+import { byId, show } from "../element.js";
+import { captureOf } from "../view_jobs.js";
+import { cardOf, setPicture } from "./card.js";
+import { assetItem, chosen, intakeItem, itemsOf } from "./items.js";
+import { Jobs, titleOf } from "./jobs.js";
+import { environmentPicture, pictureOf } from "./picture.js";
+import { showStrip } from "./strip.js";
+
+const LISTS = ["captures", "environments", "assets"];
+const PAGE = 60; // cards that are added at once
+const items = new Map();
+const cards = new Map(); // of the items that have been shown
+const asked = new Set(); // captures whose view this page has asked for
+let most = PAGE;
+let isLoaded = false;
+let mayPrepare = true;
+const wanted = { words: byId("search"), order: byId("order"), get kind() { return byId("bar").elements.namedItem("kind"); } };
+const jobs = new Jobs(changed);
+const nameOf = (id) => items.get(id)?.name;
+
+const sight = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) {
+    target.classList.toggle("in-sight", isIntersecting);
+    if (isIntersecting && target.dataset.picture === undefined) showPicture(target);
+  }
+  prepareNext();
+}, { rootMargin: "200px" });
+
+/** Show the cards that are asked for, as many as there is room for. */
+function draw() {
+  const asks = { words: wanted.words.value, kind: wanted.kind.value, order: wanted.order.value };
+  const found = chosen(items.values(), asks);
+  byId("wall").replaceChildren(...found.slice(0, most).map((item) => cards.get(item.id) ?? makeCard(item)));
+  byId("count").textContent = !isLoaded || items.size === 0 ? "" : found.length === items.size ? `${found.length} in all` : `${found.length} of ${items.size}`;
+  show(byId("more"), found.length > most);
+  show(byId("empty"), isLoaded && items.size === 0);
+  if (isLoaded && items.size === 0) openDropZone(true);
+  const address = new URLSearchParams(Object.entries(asks).filter(([name, value]) => value !== (name === "order" ? "newest" : "")));
+  history.replaceState(null, "", address.size === 0 ? location.pathname : `?${address}`);
+}
+
+function makeCard(item) {
+  const card = cardOf(item);
+  cards.set(item.id, card);
+  sight.observe(card);
+  return card;
+}
+
+function openDropZone(open) {
+  show(byId("adding"), open);
+  byId("add").setAttribute("aria-expanded", String(open));
+}
+
+/** Take an item as it is now. */
+function put(item) {
+  items.set(item.id, item);
+  const before = cards.get(item.id);
+  if (before === undefined) return;
+  sight.unobserve(before);
+  before.replaceWith(makeCard(item));
+}
+
+async function showPicture(card) {
+  const item = items.get(card.dataset.id);
+  card.dataset.picture = "";
+  try {
+    const picture = item.kind === "environment" ? item.state === "ready" ? await environmentPicture(item.source) : null : await viewPicture(item);
+    if (picture === null) return;
+    setPicture(card, picture.canvas);
+    picture.mount(card.querySelector(".shown"));
+  } catch (error) {
+    if (!(error instanceof Refusal)) console.warn(`${item.name} has no picture:`, error.message); // the drawing of its kind stays
+  }
+}
+
+async function viewPicture(item) {
+  const capture = item.kind === "asset" ? items.get(await captureOf(item.source)) : item;
+  return capture?.source.view ? pictureOf(capture.source.view) : null;
+}
+
+/** Prepare the view of one capture that is in sight and has none, while nothing else is to be done. */
+async function prepareNext() {
+  if (!mayPrepare || !isLoaded || jobs.active > 0) return;
+  const isWanted = (item) => item !== undefined && ["capture", "sequence"].includes(item.kind) && item.state === "ready" && !item.source.view && !asked.has(item.id);
+  const card = [...byId("wall").querySelectorAll(".in-sight")].find(({ dataset }) => isWanted(items.get(dataset.id)));
+  if (card === undefined) return;
+  const item = items.get(card.dataset.id);
+  asked.add(item.id);
+  const body = JSON.stringify({ kind: "view", capture: item.id, ...(item.kind === "sequence" ? { step: 1 } : {}) });
+  try {
+    await send("/v1/jobs", { method: "POST", body, headers: { "Content-Type": "application/json", "Idempotency-Key": `card-${item.id}` } });
+  } catch {
+    mayPrepare = false; // a key that may only read, or a service that takes no jobs now: the drawings stay
+  }
+}
+
+/** Take over what a change of a job changes on the wall. */
+async function changed(job) {
+  showStrip(byId("strip"), jobs.all, (each) => titleOf(each, nameOf), jobs.fault);
+  if (job !== null && ["succeeded", "failed", "cancelled"].includes(job.state)) {
+    const { kind, capture = null, intake = capture } = job.request;
+    if (["view", "check"].includes(kind) && intake !== null) await attempt(() => refresh(intake));
+    else if (job.state === "succeeded" && ["export", "pipeline"].includes(kind)) put(assetItem(job));
+    draw();
+  }
+  prepareNext();
+}
+
+async function refresh(id) {
+  const list = id.startsWith("env_") ? "environments" : "captures";
+  try {
+    put(intakeItem(list, await read(`/v1/${list}/${id}`)));
+  } catch (error) {
+    if (error.status !== 404) throw error;
+    items.delete(id);
+  }
+}
+
+async function fill(list) {
+  for await (const item of itemsOf(list)) put(item);
+  draw();
+}
+
+const address = new URLSearchParams(location.search);
+wanted.words.value = address.get("words") ?? "";
+for (const [name, control] of [["kind", wanted.kind], ["order", wanted.order]]) {
+  if (address.has(name)) control.value = address.get(name);
+}
+byId("bar").addEventListener("input", () => { most = PAGE; draw(); });
+byId("bar").addEventListener("submit", (event) => event.preventDefault());
+byId("more").addEventListener("click", () => { most += PAGE; draw(); });
+new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !byId("more").hidden) byId("more").click(); }, { rootMargin: "600px" }).observe(byId("more"));
+byId("add").addEventListener("click", () => openDropZone(byId("adding").hidden));
+addEventListener("dragenter", () => { openDropZone(true); document.body.classList.add("dragging"); });
+for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
+addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));
+mountDropZone(fill);
+
+await load(async () => {
+  await fill("captures");
+  await Promise.all([...LISTS.slice(1).map(fill), jobs.load()]);
+  isLoaded = true;
+  draw();
+  prepareNext();
+});
+await attempt(() => jobs.follow());

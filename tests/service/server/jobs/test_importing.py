@@ -1,0 +1,89 @@
+"""An import that is killed, or that a project has no room for, leaves nothing in the capture, and can be done again."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from service.errors import RequestError
+from service.requests.base.identifiers import CAPTURE, UPLOAD, new_id
+from service.requests.imports.layouts import ImportChoices
+from service.requests.jobs import CheckJob
+from service.server.database import intakes, uploads
+from service.server.jobs.context import Job, WorkerContext
+from service.server.jobs.steps import steps_of
+from service.server.storage import layout
+from service.server.storage.folder import FolderStorage
+from service.server.storage.objects import open_storage
+from tests.scenes.foreign import write_photographs
+from tests.service.server.jobs.harness import PROJECT
+
+SILENT = SimpleNamespace(stage=lambda *_: None, advance=lambda *_: None)
+CHOICES = ImportChoices(layout="olat", options={"axes": "right,up,towards", "sense": "to-light"})
+
+
+@pytest.fixture
+def uploaded(idle_harness, tmp_path):
+    """A capture whose photographs were uploaded, and which is about to be imported."""
+    identifier, folder = new_id(CAPTURE), write_photographs(tmp_path / "photos")
+    storage = open_storage(idle_harness.settings)
+    names = sorted(path.name for path in folder.iterdir())
+
+    def record(connection):
+        intakes.insert(connection, identifier=identifier, project=PROJECT, kind="capture", name="dropped", folder=None)
+        for name in names:
+            uploads.insert_made(connection, identifier=new_id(UPLOAD), project=PROJECT, intake=identifier, path=name,
+                                length=(folder / name).stat().st_size)
+        intakes.begin_check(connection, identifier)
+
+    idle_harness.database.transact(record)
+    for name in names:
+        storage.put(folder / name, layout.intake(PROJECT, identifier), name)
+    return identifier, names
+
+
+def run(harness, identifier, **settings):
+    context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 1 << 20,
+                            lambda project: (), settings=harness.settings.model_copy(update=settings))
+    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=CHOICES), 1), context)
+    step.run(SILENT)
+
+
+def stored(harness, identifier):
+    files = open_storage(harness.settings).files(layout.intake(PROJECT, identifier))
+    return [file.name for file in files], [row["path"] for row in uploads.listing(harness.database, identifier, limit=100)]
+
+
+class Killed(BaseException):
+    """As if the process had ended."""
+
+
+@pytest.mark.parametrize("last", ["before", "after"])
+def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):
+    identifier, names = uploaded
+    put = FolderStorage.put
+
+    def killed(self, *arguments):
+        if last == "after":
+            put(self, *arguments)
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FolderStorage, "put", killed)
+        with pytest.raises(Killed):
+            run(idle_harness, identifier)
+    assert intakes.find(idle_harness.database, identifier, PROJECT)["state"] == "checking"
+    assert stored(idle_harness, identifier)[1] == names
+    run(idle_harness, identifier)
+    assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
+    assert intakes.find(idle_harness.database, identifier, PROJECT)["state"] == "ready"
+    assert list(idle_harness.settings.data.rglob(".import-*")) == []
+
+
+@pytest.mark.parametrize("limit", ["max_project_bytes", "max_project_pixels"])
+def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_harness, uploaded, limit):
+    """The photographs have 9 × 32 × 32 pixels, and capture.json some hundred bytes."""
+    identifier, names = uploaded
+    used = sum(row["length"] for row in uploads.listing(idle_harness.database, identifier, limit=100))
+    with pytest.raises(RequestError, match=f"quota {limit}"):
+        run(idle_harness, identifier, **{limit: {"max_project_bytes": used + 10, "max_project_pixels": 9 * 32 * 32 - 1}[limit]})
+    assert stored(idle_harness, identifier) == (names,) * 2
