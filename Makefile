@@ -61,6 +61,7 @@ samples: $(VENV)/installed-dev
 # the pictures of the pages in docs/, by the tests that make them (needs Chromium)
 screenshots: $(VENV)/installed-dev
 	RELIT_TEST_SCREENSHOTS=$(CURDIR)/docs $(BIN)/python -m pytest -q tests/service/server/pages/test_sample_pages.py tests/service/server/pages/test_twin_page.py \
+	  tests/service/server/pages/test_home_page.py tests/service/server/pages/test_machines_page.py \
 	  tests/service/server/pages/test_set_page.py tests/service/server/pages/test_published_page.py -k "shows_the_sample or to_an_asset"
 	$(BIN)/python -m docs.tools.chart_picture
 

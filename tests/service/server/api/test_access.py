@@ -3,14 +3,15 @@
 import hashlib
 import json
 import re
+import time
 from typing import NamedTuple
 
 import httpx2
 import pytest
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, HOOK, JOB, UPLOAD, new_id
-from service.requests.keys import Scope
-from service.server.database import keys
+from service.requests.keys import NewKey, Scope
+from service.server.database import keys, tables
 from service.server.database.engine import Database
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
@@ -120,6 +121,39 @@ def test_what_is_no_key_of_ours_or_revoked_is_refused(site):
         assert keys.revoke(site.database, key.partition(".")[0])
         assert client.get("/v1/jobs").status_code == 401
         assert not keys.revoke(site.database, key.partition(".")[0])
+
+
+def test_a_key_that_was_refused_is_told_why_if_its_secret_is_right(site):
+    good, revoked = site.server.key("larch"), site.server.key("larch")
+    keys.revoke(site.database, revoked.partition(".")[0])
+    expired = keys.create(site.database, NewKey(project="larch", name="test", scope=Scope.READ, expires_days=1e-9))
+    said = {"this service does not know the key": ("x", f"{good}x", f"{revoked}x", f"{expired}x"), "the key was revoked on": (revoked,),
+            "the key expired on": (expired,)}
+    with site.server.client() as client:
+        for words, given in said.items():
+            for key in given:
+                assert client.get("/v1/jobs", headers={"Authorization": f"Bearer {key}"}).json()["detail"].startswith(words), key
+
+
+def test_machines_and_the_audit_log_are_for_admins_and_show_nothing_of_other_projects(site):
+    with site.client("larch") as admin, site.client("unseen") as other, site.client("larch", Scope.WRITE) as writer:
+        assert writer.get("/v1/machines").status_code == writer.get("/v1/audit").status_code == 403
+        machines = admin.get("/v1/machines").raise_for_status().json()
+        assert machines["disk"]["total"] > machines["disk"]["free"] > 0 and machines["jobs"]["queued"] >= 1
+        assert machines["queued_since"] is not None and machines["workers"] == []
+        now = time.time()
+        site.database.execute(tables.workers.insert().values(id="worker", host="here", pid=1, device="cpu", started_at=now, seen_at=now,
+                                                             state="ready"))
+        worker, = admin.get("/v1/machines").json()["workers"]
+        assert (worker["device"], worker["state"], worker["busy"], worker["job"]) == ("cpu", "ready", False, None)
+        site.database.execute(tables.workers.delete())
+        page = admin.get("/v1/audit", params={"limit": 2}).raise_for_status().json()
+        assert len(page["entries"]) == 2 and page["next"] == page["entries"][1]["id"]
+        older = admin.get("/v1/audit", params={"limit": 500, "before": page["next"]}).json()
+        numbers = [entry["id"] for entry in page["entries"] + older["entries"]]
+        assert numbers == sorted(set(numbers), reverse=True) and older["next"] is None
+        assert {"intake.create", "job.submit", "hook.create"} <= {entry["action"] for entry in page["entries"] + older["entries"]}
+        assert other.get("/v1/audit").json() == {"entries": [], "next": None}
 
 
 def test_only_a_hash_of_a_key_is_kept_and_the_numbers_name_no_project(site):

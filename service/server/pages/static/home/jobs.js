@@ -26,6 +26,12 @@ export class Jobs {
     return this.all.filter((job) => ["queued", "running"].includes(job.state)).length;
   }
 
+  /** Know a job that was submitted, before the server tells of it. */
+  take(job) {
+    this.#jobs.set(job.id, job);
+    this.#changed(job);
+  }
+
   async load() {
     for await (const job of listing("/v1/jobs?limit=500&state=queued&state=running", "jobs")) this.#jobs.set(job.id, job);
     const { jobs } = await read(`/v1/jobs?limit=${MOST_FAILED}&state=failed`);

@@ -89,12 +89,14 @@ async function prepareNext() {
   const card = [...byId("wall").querySelectorAll(".in-sight")].find(({ dataset }) => isWanted(items.get(dataset.id)));
   if (card === undefined) return;
   const item = items.get(card.dataset.id);
+  mayPrepare = false;
   asked.add(item.id);
   const body = JSON.stringify({ kind: "view", capture: item.id, ...(item.kind === "sequence" ? { step: 1 } : {}) });
   try {
-    await send("/v1/jobs", { method: "POST", body, headers: { "Content-Type": "application/json", "Idempotency-Key": `card-${item.id}` } });
+    jobs.take(await (await send("/v1/jobs", { method: "POST", body, headers: { "Content-Type": "application/json", "Idempotency-Key": `card-${item.id}` } })).json());
+    mayPrepare = true;
   } catch {
-    mayPrepare = false; // a key that may only read, or a service that takes no jobs now: the drawings stay
+    // a key that may only read, or a service that takes no jobs now: this page asks no more, and the drawings stay
   }
 }
 

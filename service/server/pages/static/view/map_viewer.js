@@ -42,7 +42,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   const named = (text, control, ...more) => element("label", {}, `${text} `, control, ...more);
   const colourRow = named("Colour map", colours);
   const stopsRow = element("label", {}, "Exposure ", stops, " ", stopsText);
-  const [wipeRow, howRow] = [named("Wipe", wipe), named("Shown", how)];
+  const [wipeRow, howRow] = [named("Wipe", wipe), named("How", how)];
   const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), howRow, wipeRow,
     named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
     element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),

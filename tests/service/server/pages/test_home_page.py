@@ -1,0 +1,190 @@
+"""The home page: a wall of cards that does not freeze with a thousand captures, is searched, sorted and filtered, and says why jobs wait."""
+
+import json
+import re
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+from tests.service.server.pages.axe import violations_in_both_schemes
+from tests.service.server.pages.conftest import PICTURES, new_context
+
+CAPTURES = 1000
+EVIL = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
+SHOWN = 60
+"""Cards that the page adds at once."""
+
+
+def capture(number: int, **facts) -> dict:
+    """A capture as the API gives it."""
+    return {"id": f"cap_{number:020d}", "name": f"bird {number}", "state": "ready", "registered": True, "problem": None, "view": None,
+            "facts": {"captures": 1, "frames": 96, "resolution": [320, 320]} | facts, "created_at": f"2026-01-{1 + number % 28:02d}T10:00:00Z"}
+
+
+def job(number: int, state: str, **values) -> dict:
+    return {"id": f"job_{number:020d}", "state": state, "attempt": 1, "revision": 1, "priority": 50, "progress": None, "error": None,
+            "request": {"kind": "solve", "capture": f"cap_{number:020d}", "name": ""}, "created_at": f"2026-01-01T10:00:{number:02d}Z",
+            "started_at": None, "finished_at": None} | values
+
+
+def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  # noqa: B006
+    """Let the API answer with these captures and jobs; return the bodies of the jobs that the page submits."""
+    submitted: list[dict] = []
+
+    def answer(route):
+        request = route.request
+        path, query = urlsplit(request.url).path, parse_qs(urlsplit(request.url).query)
+        if request.method == "POST":
+            submitted.append(json.loads(request.post_data))
+            route.fulfill(status=202, json=job(99, "queued"))
+        elif path == "/v1/captures":
+            begin = next((at + 1 for at, each in enumerate(captures) if each["id"] == query.get("before", [""])[0]), 0)
+            part = captures[begin : begin + int(query["limit"][0])]
+            route.fulfill(json={"items": part, "next": part[-1]["id"] if begin + len(part) < len(captures) else None})
+        elif path == "/v1/environments":
+            route.fulfill(json={"items": [], "next": None})
+        elif path == "/v1/jobs":
+            route.fulfill(json={"jobs": [each for each in jobs if each["state"] in query["state"] and "kind" not in query], "next": None})
+        else:
+            route.fulfill(status=204)  # no events
+
+    page.route("**/v1/**", answer)
+    return submitted
+
+
+def names(page) -> list[str]:
+    return page.locator("#wall h3").all_inner_texts()
+
+
+def test_a_thousand_captures_are_searched_sorted_and_filtered(page):
+    found = [capture(number) for number in range(CAPTURES)]
+    found[7] = capture(7, steps=3) | {"name": EVIL}
+    submitted = pretend(page, found)
+    page.goto("/?words=bird+99")
+    page.get_by_text(f"{sum('99' in str(number) for number in range(CAPTURES))} of {CAPTURES}").wait_for()
+    page.locator(".in-sight").first.wait_for()
+    assert len(submitted) == 1 and submitted[0]["kind"] == "view"  # one view is prepared at a time
+    page.get_by_label("Search by name").fill("")
+    page.get_by_text(f"{CAPTURES} in all").wait_for()
+    assert page.url.endswith("/") and len(names(page)) == SHOWN
+    page.locator("#order").select_option("name")
+    assert names(page)[1:4] == ["bird 0", "bird 1", "bird 2"]  # numbers by value, and the other name before them
+    page.locator("#order").select_option("oldest")
+    assert names(page)[0] == "bird 0"
+    page.get_by_label("Sequences").check()
+    page.get_by_text(f"1 of {CAPTURES}").wait_for()
+    assert names(page) == [EVIL] and page.locator("#wall img, #wall script").count() == 0 and page.title() == "Home · Relit"
+    assert page.get_by_text("3 time steps · 96 frames · 320 × 320").is_visible()
+    page.reload()
+    page.get_by_text(f"1 of {CAPTURES}").wait_for()
+    assert page.get_by_label("Sequences").is_checked() and page.locator("#order").input_value() == "oldest"
+
+
+def test_jobs_say_why_they_wait_and_how_they_failed(page):
+    progress = {"stage": "normals", "done": 3, "total": 12, "rate": 1.0, "remaining_s": 9.0}
+    pretend(page, [capture(number) | {"view": None} for number in range(1, 4)], [
+        job(1, "running", progress=progress), job(2, "queued"), job(3, "queued", priority=90), job(4, "queued", request={
+            "kind": "depth", "capture": "cap_x", "name": EVIL}),
+        job(5, "failed", error="bird: no frame can be read", finished_at="2100-01-01T00:00:00Z"),
+        job(6, "failed", error="long ago", finished_at="2020-01-01T00:00:00Z")])
+    page.goto("/")
+    strip = page.locator("#strip")
+    strip.get_by_text("normals 3 of 12, 9.0 s left").wait_for()
+    assert strip.get_by_text("behind Solve · bird 1, which runs").count() == 1  # of the highest priority
+    strip.get_by_text("behind 2 jobs, first Solve · bird 1, which runs").wait_for()
+    strip.get_by_text("behind 3 jobs, first Solve · bird 1, which runs").wait_for()
+    strip.get_by_text("bird: no frame can be read").wait_for()
+    assert strip.locator("li").count() == 5 and strip.locator("img").count() == 0
+
+
+def test_nothing_yet_says_what_to_do(page):
+    pretend(page, [])
+    page.goto("/")
+    page.get_by_role("heading", name="Nothing here yet").wait_for()
+    assert page.get_by_text("Choose a folder").is_visible() and page.locator(".skeleton:visible").count() == 0
+
+
+@pytest.mark.long
+def test_what_is_loading_is_seen_at_once(page):
+    page.route("**/v1/**", lambda route: None)  # no answer
+    page.goto("/", wait_until="commit")
+    page.locator(".card.skeleton").first.wait_for()
+    page.goto("/jobs", wait_until="commit")
+    page.locator("main .skeleton").first.wait_for()
+
+
+@pytest.mark.long
+def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, sky):
+    page.goto("/")
+    card = page.locator(f"[data-id={solved.capture}]")
+    card.locator("canvas").wait_for()
+    light = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 4 === 0)"
+    seen = {}
+    for side, x in {"left": 0.1, "right": 0.9}.items():
+        box = card.locator(".shown").bounding_box()
+        before = card.locator("canvas").evaluate(f"c => ({light})(c).join()")
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
+        page.wait_for_function(f"([c, before]) => ({light})(c).join() !== before", arg=[card.locator("canvas").element_handle(), before])
+        red = card.locator("canvas").evaluate(light)
+        width = round(len(red) ** 0.5)
+        seen[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
+    assert seen["left"][0] > seen["right"][0] and seen["left"][1] < seen["right"][1]
+    page.locator(f"[data-id={sky}] canvas").wait_for()
+    card.get_by_role("link").press("Enter")
+    page.wait_for_url(re.compile(f"/{solved.capture}$"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("width", [1280, 640, 390])  # 640: as at 200 %
+def test_the_wall_fits_and_has_no_serious_violation(browser, server, solved, sky, width):
+    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": width, "height": 844}).new_page()
+    page.goto("/")
+    page.locator(f"[data-id={solved.capture}] canvas").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert violations_in_both_schemes(page) == []
+    page.close()
+
+
+@pytest.mark.long
+def test_the_wall_is_used_by_the_keyboard_alone(page, solved):
+    page.goto("/")
+    page.locator(f"[data-id={solved.capture}] h3").wait_for()
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    page.get_by_label("Search by name").focus()
+    page.keyboard.type("lambert")
+    for key in ("Tab", "ArrowRight"):  # the kinds are one stop, and arrow keys choose
+        page.keyboard.press(key)
+    assert page.get_by_label("Captures", exact=True).is_checked()
+    page.wait_for_function("() => new URLSearchParams(location.search).get('kind') === 'capture'")
+
+
+@pytest.mark.long
+def test_light_and_dark_are_chosen_and_kept(browser, server):
+    context = new_context(browser, base_url=server.url, color_scheme="light")
+    page = context.new_page()
+    page.goto("/jobs")
+    paper = "() => getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(paper)
+    page.get_by_role("button", name="Show in dark").click()
+    dark = page.evaluate(paper)
+    assert light != dark
+    page.goto("/captures")
+    assert page.evaluate(paper) == dark
+    page.get_by_role("button", name="Show in light").click()
+    assert page.evaluate(paper) == light
+    context.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_home_page_shows_the_sample(browser, owl, solved, sky, tmp_path, scheme):
+    page = new_context(browser, base_url=owl.server.url, viewport={"width": 1280, "height": 720}, color_scheme=scheme).new_page()
+    page.goto("/")
+    for name in (owl.capture, solved.capture, sky):
+        page.locator(f"[data-id={name}] canvas").wait_for()
+    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_home_{scheme}.png"
+    page.screenshot(path=path)
+    assert path.stat().st_size > 50_000
+    page.close()

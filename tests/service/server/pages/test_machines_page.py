@@ -1,0 +1,63 @@
+"""The page for operators: workers, queue, space, errors and the audit log, for those who may see them."""
+
+from pathlib import Path
+
+import pytest
+
+from service.requests.keys import Scope
+from tests.service.server.pages.axe import violations_in_both_schemes
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+from tests.service.server_process import serving
+
+pytestmark = pytest.mark.long
+
+
+def opened(browser, url: str, key: str, **options):
+    """The page with a key in the tab."""
+    page = new_context(browser, base_url=url, bypass_csp=True, **options).new_page()
+    page.add_init_script(f"sessionStorage.setItem('relit-key', '{key}')")
+    page.goto("/machines")
+    return page
+
+
+@pytest.fixture(scope="module")
+def locked(tmp_path_factory: pytest.TempPathFactory):
+    with serving(tmp_path_factory.mktemp("machines"), "--device", "none", roots=str(SAMPLES)) as running:
+        yield running
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_of_machines_shows_the_sample(browser, server, solved, tmp_path, scheme):
+    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 1280, "height": 860}, color_scheme=scheme).new_page()
+    page.goto("/machines")
+    page.locator("#workers").get_by_text("cpu").first.wait_for()
+    page.locator("#audit").get_by_text("Intake: register").first.wait_for()
+    assert page.get_by_text("Space left").is_visible()
+    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_machines_{scheme}.png"
+    page.screenshot(path=path)
+    if scheme == "light":
+        page.set_viewport_size({"width": 390, "height": 844})
+        page.wait_for_function("() => document.documentElement.scrollWidth <= 390")
+        assert violations_in_both_schemes(page) == []
+    page.close()
+
+
+def test_the_audit_log_is_paged_and_names_stay_text(browser, locked):
+    with locked.client(locked.key("birds")) as client:
+        for number in range(60):
+            client.post("/v1/captures", json={"name": f"<img src=x onerror=alert({number})>"}).raise_for_status()
+    page = opened(browser, locked.url, locked.key("birds"))
+    page.get_by_text("No worker was seen lately.").wait_for()
+    page.get_by_text("no worker was seen in the last 30 seconds").wait_for()
+    assert page.locator("#audit tbody tr").count() == 50
+    page.get_by_role("button", name="Show older lines").click()
+    page.wait_for_function("() => document.querySelectorAll('#audit tbody tr').length === 60")
+    assert page.locator("main img").count() == 0 and page.get_by_role("button", name="Show older lines").is_hidden()
+    page.close()
+
+
+def test_who_may_not_see_machines_is_told_so(browser, locked):
+    page = opened(browser, locked.url, locked.key("birds", Scope.WRITE))
+    page.get_by_text("This page is for operators: the key has the scope write, this needs admin").wait_for()
+    assert page.locator("#view").is_hidden() and page.locator(".skeleton:visible").count() == 0
+    page.close()
