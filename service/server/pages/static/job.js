@@ -96,6 +96,7 @@ async function presentResults(job) {
   byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
   const solved = job.state === "succeeded" && [...MAPS, SEQUENCE].some((name) => names.includes(name));
   offer("look", solved, `/maps/${identifier}`);
+  offer("object", job.state === "succeeded" && job.request.capture !== undefined, `/object/${job.request.capture}`);
   offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);

@@ -4,6 +4,7 @@ import { attempt, listing, load, read, resultsOf, save } from "../api.js";
 import { byId, bytes, element, factText, show, words } from "../element.js";
 import { Address } from "../publish/address.js";
 import { ViewFile } from "../view/view_file.js";
+import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
 import { mountAsset } from "./asset.js";
 import { mountLight } from "./light.js";
@@ -27,12 +28,12 @@ async function jobsOfObject() {
 }
 
 /** Return the modes that this object has: what each is called and how it is mounted. */
-function modesOf(view, jobs) {
+function modesOf(view, step, jobs) {
   const of = (kinds) => jobs.filter((job) => kinds.includes(job.request.kind));
   const [solved, measured, exported] = [of(MAPS), of(["depth"]), of(["export", "pipeline"])];
   const nameOf = (job) => `${job.request.name || job.request.options?.method || job.request.kind} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
   const modes = {};
-  if (view.info.relight !== null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view) };
+  if (view.info.relight !== null && step === null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view) };
   if (solved.length > 0) modes.maps = { title: "Maps", mount: async (parent) => mountResults(parent, await viewOf(solved[0].id)) };
   if (exported.length > 0) modes["3d"] = { title: "3-D", mount: (parent) => mountAsset(parent, exported[0]) };
   if (view.info.frames.length > 0) {
@@ -100,8 +101,9 @@ await load(async () => {
     byId("view").replaceChildren(element("p", {}, `${capture.problem ?? `This capture is ${capture.state}.`} `, element("a", { href: `/captures/${identifier}` }, "Its page says more.")));
     return;
   }
-  const [view, jobs] = await Promise.all([openView(identifier, null).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
-  const modes = modesOf(view, jobs);
+  const step = await chosenStep(identifier);
+  const [view, jobs] = await Promise.all([openView(identifier, null, step).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
+  const modes = modesOf(view, step, jobs);
   const wanted = { mode: "" };
   address.read(wanted);
   byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name, "aria-pressed": "false",
