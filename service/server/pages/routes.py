@@ -8,9 +8,10 @@ import hashlib
 import json
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
@@ -41,7 +42,7 @@ NAVIGATION = [("/", "Home"), ("/captures", "Captures"), ("/jobs", "Jobs"), ("/ma
 router = APIRouter(include_in_schema=False)
 set_router = APIRouter(include_in_schema=False)
 """The page of the stage at this machine, where there is one."""
-JobKind = Literal[*TITLES]  # type: ignore[valid-type]  # the names are known when the program runs
+JobKind = Annotated[str, PathParameter(pattern=f"^({'|'.join(TITLES)})$")]
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
 templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, navigation=NAVIGATION)
