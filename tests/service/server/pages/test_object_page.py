@@ -88,7 +88,7 @@ def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, 
     page.locator("canvas.picture").focus()
     for key in ("+", "+", "Shift+ArrowRight"):
         page.keyboard.press(key)
-    page.wait_for_function("() => location.hash.includes('zoom=1.563') && location.hash.includes('size=12') && location.hash.includes('turn=40')")
+    page.wait_for_function("() => ['zoom=1.563', 'size=12', 'turn=40'].every((each) => location.hash.includes(each))")
     link, before, state = page.url, picture(page), page.evaluate("relit.state()")
     other = new_context(browser, viewport={"width": 900, "height": 700}).new_page()
     other.goto(link)
