@@ -68,7 +68,7 @@ def install(app: FastAPI) -> None:
 
 @router.get("/")
 async def home(request: Request) -> Response:
-    """Show the object that was prepared last, to be lit; without one, the captures."""
+    """Show captures, assets and environments as cards, and the jobs above them."""
     return _page(request, "home.html")
 
 

@@ -4,7 +4,7 @@ import { element, icon, show, time, words } from "../element.js";
 
 /** Return the card of an item; its picture is put into `.shown` when it comes into sight. */
 export function cardOf(item) {
-  const name = item.href === null ? item.name : element("a", { href: item.href }, item.name);
+  const name = item.href === null ? item.name : element("a", { href: item.href }, item.name || words(item.kind));
   const isFlat = item.kind === "environment";
   return element("li", { class: isFlat ? "card flat" : "card", "data-id": item.id },
     element("div", { class: "shown" }, icon(item.kind)),

@@ -37,7 +37,7 @@ export function intakeItem(list, intake) {
 /** Return the item of a job that has made an asset. */
 export function assetItem(job) {
   const { format } = job.request;
-  return { id: job.id, kind: "asset", name: job.request.name || "Asset", state: "ready", problem: null, size: format.toUpperCase(), created: job.created_at,
+  return { id: job.id, kind: "asset", name: job.request.name, state: "ready", problem: null, size: format.toUpperCase(), created: job.created_at,
     href: VIEWED.includes(format) ? `/asset/${job.id}` : `/jobs/${job.id}`, source: job };
 }
 

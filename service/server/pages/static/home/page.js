@@ -71,7 +71,7 @@ async function showPicture(card) {
     const picture = item.kind === "environment" ? item.state === "ready" ? await environmentPicture(item.source) : null : await viewPicture(item);
     if (picture === null) return;
     setPicture(card, picture.canvas);
-    picture.mount(card.querySelector(".shown"));
+    picture.mount(card);
   } catch (error) {
     if (!(error instanceof Refusal)) console.warn(`${item.name} has no picture:`, error.message); // the drawing of its kind stays
   }
@@ -79,6 +79,10 @@ async function showPicture(card) {
 
 async function viewPicture(item) {
   const capture = item.kind === "asset" ? items.get(await captureOf(item.source)) : item;
+  if (capture !== undefined && item.name === "") { // an asset without a name of its own has that of its capture
+    item.name = capture.name;
+    cards.get(item.id).querySelector("h3").firstChild.textContent = item.name;
+  }
   return capture?.source.view ? pictureOf(capture.source.view) : null;
 }
 

@@ -24,12 +24,12 @@ export async function pictureOf(view) {
     const [u, v] = [(event.clientX - left) / width, (event.clientY - top) / height].map((share) => Math.min(Math.max(share, 0), 1));
     sheet ??= bitmap(files, "card_lights.jpg").catch(() => null);
     const loaded = await sheet;
-    if (loaded !== null && canvas.parentElement?.matches(":hover")) blend(context, loaded, u, v);
+    if (loaded !== null && canvas.closest(".card").matches(":hover")) blend(context, loaded, u, v);
   };
-  return { canvas, mount: (place) => {
+  return { canvas, mount: (card) => {
     rest();
-    place.addEventListener("pointermove", follow);
-    place.addEventListener("pointerleave", rest);
+    card.addEventListener("pointermove", follow);
+    card.addEventListener("pointerleave", rest);
   } };
 }
 
