@@ -16,7 +16,6 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, JOB, pattern
 from service.requests.base.options import Option, help_text, is_document, places_of, typed
 from service.requests.imports.layouts import LAYOUTS, Layout, options_of_layout
 from service.requests.jobs import JOBS
-from stage.capture.manifest import LIT_BY
 
 TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
           "scan": "Turn shots of a scanning laser into points",
@@ -45,12 +44,14 @@ FREE_JOBS = {name: JOBS[name] for name in ("patterns", "gauge-board", "drive")}
 """Jobs that begin with neither a capture nor maps, by kind."""
 MAPS_JOBS = {name: JOBS[name] for name in TITLES if name not in CAPTURE_JOBS and name not in FREE_JOBS}
 """Jobs that begin with the maps of another job, by kind."""
+LIT = ("light", "pattern", "laser", "tof", "stereo")
+"""All that can have lit the frames of a capture, as `lit_by` of its facts names it."""
 BEGIN_WITH: dict[str, tuple[str, ...]] = {
     "solve": ("light",), "pipeline": ("light",), "relight": ("light",), "basis": ("light",),
     "depth": ("pattern", "laser", "tof", "stereo"), "separate": ("pattern",), "scan": ("shots",), "inspect-board": ("tiles",),
     "calibrate-mirror-ball": ("light",), "calibrate-light-positions": ("light",), "calibrate-grey-ball": ("light",),
-    "calibrate-intensity": ("light",), "calibrate-rig": ("light",), "calibrate-dark": LIT_BY, "calibrate-flat-field": LIT_BY,
-    "calibrate-saturation": LIT_BY, "calibrate-white-balance": ("light", "pattern", "stereo"),
+    "calibrate-intensity": ("light",), "calibrate-rig": ("light",), "calibrate-dark": LIT, "calibrate-flat-field": LIT,
+    "calibrate-saturation": LIT, "calibrate-white-balance": ("light", "pattern", "stereo"),
     "calibrate-chart": ("light", "pattern", "stereo"), "calibrate-procam": ("pattern",), "calibrate-stereo": ("stereo",),
     "calibrate-response": ("pattern",), "calibrate-tof": ("tof",), "calibrate-laser-planes": ("laser",),
     "export": ("maps.exr", "depth.exr", "sequence.json"), "shade": ("maps.exr",), "join": ("maps.exr",), "register": ("depth.exr",),
