@@ -19,7 +19,8 @@ STEPS = 40
 STARTS = (13, 27)
 """Steps at which the server is killed and started again: starting takes seconds, so that chance does not choose them."""
 ACTIONS = ("go", "go", "back", "back", "forward", "reload", "tab", "offline", "hasty")
-CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map", "capture": "#frames canvas", "job": "#stages tbody tr",
+CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map",
+           "capture": "#frames canvas", "job": "#stages tbody tr",
            "jobs": "#jobs tbody a", "captures": "#captures tbody a"}
 
 
