@@ -4,15 +4,15 @@ import re
 
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, JOB, new_id
 from service.requests.keys import NewKey, Scope
 from service.server.database import keys
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server_process import serving
 
+CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
 HTML = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
-FAULTS = {"/nothing": 404, "/captures/%3Cscript%3E": 422, "/v1/jobs/job_0123456789abcdefghjk": 404, "/v1/nothing": 404}
+FAULTS = {"/nothing": 404, "/captures/%3Cscript%3E": 422, f"/v1/jobs/{JOB}": 404, "/v1/nothing": 404}
 
 
 @pytest.mark.parametrize("path", FAULTS)
@@ -27,8 +27,7 @@ def test_a_browser_gets_a_page_and_a_program_a_problem(server, path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("path", [f"/captures/{new_id(CAPTURE)}", f"/jobs/{new_id(JOB)}", f"/light/{new_id(CAPTURE)}", f"/maps/{new_id(JOB)}",
-                                  "/nothing"])
+@pytest.mark.parametrize("path", [f"/captures/{CAPTURE}", f"/jobs/{JOB}", f"/light/{CAPTURE}", f"/maps/{JOB}", "/nothing"])
 def test_what_does_not_exist_is_a_page_with_a_way_on(browser, server, path):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
     page.goto(path)

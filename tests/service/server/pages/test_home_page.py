@@ -1,4 +1,5 @@
-"""The home page: a wall of cards that does not freeze with a thousand captures, is searched, sorted and filtered, and says why jobs wait."""
+"""The home page: a wall of cards that does not freeze with a thousand captures and is searched and sorted, and jobs that say why they
+wait."""
 
 import json
 import re
@@ -19,7 +20,8 @@ SHOWN = 60
 def capture(number: int, **facts) -> dict:
     """A capture as the API gives it."""
     return {"id": f"cap_{number:020d}", "name": f"bird {number}", "state": "ready", "registered": True, "problem": None, "view": None,
-            "facts": {"captures": 1, "frames": 96, "resolution": [320, 320]} | facts, "created_at": f"2026-01-{1 + number % 28:02d}T10:00:00Z"}
+            "facts": {"captures": 1, "frames": 96, "resolution": [320, 320]} | facts,
+            "created_at": f"2026-01-{1 + number % 28:02d}T10:00:00Z"}
 
 
 def job(number: int, state: str, **values) -> dict:

@@ -28,7 +28,8 @@ def locked(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_page_of_machines_shows_the_sample(browser, server, solved, tmp_path, scheme):
-    page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 1280, "height": 860}, color_scheme=scheme).new_page()
+    context = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 1280, "height": 860}, color_scheme=scheme)
+    page = context.new_page()
     page.goto("/machines")
     page.locator("#workers").get_by_text("cpu").first.wait_for()
     page.locator("#audit").get_by_text("Intake: register").first.wait_for()
