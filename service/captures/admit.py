@@ -7,7 +7,7 @@ from service.relight.time_steps import time_steps
 from service.reporting.progress import Progress, Timings
 from stage import inputs
 from stage.capture.capture import Capture
-from stage.capture.manifest import FILE_NAME, Manifest, read_manifest
+from stage.capture.manifest import FILE_NAME, LIT_BY, Manifest, read_manifest
 from stage.capture.sequence import SEQUENCE_FILE, is_sequence, read_sequence
 from stage.colour.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
@@ -32,8 +32,8 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
     or the tiles of a board.
 
     Returns:
-        A description: number of captures and frames, resolution, colour space, name; of a scan its number of shots and name; of a
-        board its number of tiles and name.
+        A description: number of captures and frames, resolution, colour space, name, and what frames are lit by, as `LIT_BY` names it; of a
+        scan its number of shots and name; of a board its number of tiles and name.
 
     Raises:
         ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
@@ -46,7 +46,7 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
         shots = read_scan(folder)
         return {"captures": 0, "frames": 0, "shots": len(shots.time_s), "name": shots.scan.name}
     timings = Timings(progress)
-    frames, manifest = 0, None
+    frames, manifest, lit_by = 0, None, set[str]()
     _check_manifest_files(folder)
     steps = time_steps(folder)
     timings.stage("check", len(steps))
@@ -55,11 +55,12 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
             _check_places(step, read_manifest(step / FILE_NAME), folder, max_pixels)
         manifest = Capture.open(step).manifest
         frames += len(manifest.frames)
+        lit_by |= {name for frame in manifest.frames for name in LIT_BY if getattr(frame, name) is not None}
         timings.advance(done)
     timings.close()
     assert manifest is not None, "time_steps gives at least one"
     return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
-            "name": manifest.name, **({"steps": len(steps)} if is_sequence(folder) else {})}
+            "name": manifest.name, "lit_by": sorted(lit_by), **({"steps": len(steps)} if is_sequence(folder) else {})}
 
 
 def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:

@@ -35,7 +35,8 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "progress": {"stage": "frames", "done": 60, "total": 240, "rate": 20.0, "remaining_s": 9.0}, "error": None},
     "IntakeView": {
         "id": "cap_0123456789abcdefghjk", "name": "owl", "state": "ready", "registered": False, "problem": None,
-        "facts": {"captures": 1, "frames": 96, "resolution": [320, 320], "color_space": "lin_rec709_scene", "name": "owl"},
+        "facts": {"captures": 1, "frames": 96, "resolution": [320, 320], "color_space": "lin_rec709_scene", "name": "owl",
+                  "lit_by": ["light"]},
         "view": "job_0123456789abcdefghjm", "created_at": "2026-11-20T08:59:00Z"},
     "ResultView": {
         "name": "frame.0001.exr", "size": 177062, "modified_at": "2026-11-20T09:00:02Z",

@@ -46,6 +46,27 @@ FREE_JOBS = {name: JOBS[name] for name in ("patterns", "gauge-board", "drive")}
 """Jobs that begin with neither a capture nor maps, by kind."""
 MAPS_JOBS = {name: JOBS[name] for name in TITLES if name not in CAPTURE_JOBS and name not in FREE_JOBS}
 """Jobs that begin with the maps of another job, by kind."""
+LIT = ("light", "pattern", "laser", "tof", "stereo")
+"""All that can have lit the frames of a capture, as `lit_by` of its facts names it."""
+BEGIN_WITH: dict[str, tuple[str, ...]] = {
+    "solve": ("light",), "pipeline": ("light",), "relight": ("light",), "basis": ("light",),
+    "depth": ("pattern", "laser", "tof", "stereo"), "separate": ("pattern",), "scan": ("shots",), "inspect-board": ("tiles",),
+    "calibrate-mirror-ball": ("light",), "calibrate-light-positions": ("light",), "calibrate-grey-ball": ("light",),
+    "calibrate-intensity": ("light",), "calibrate-rig": ("light",), "calibrate-dark": LIT, "calibrate-flat-field": LIT,
+    "calibrate-saturation": LIT, "calibrate-white-balance": ("light", "pattern", "stereo"),
+    "calibrate-chart": ("light", "pattern", "stereo"), "calibrate-procam": ("pattern",), "calibrate-stereo": ("stereo",),
+    "calibrate-response": ("pattern",), "calibrate-tof": ("tof",), "calibrate-laser-planes": ("laser",),
+    "export": ("maps.exr", "depth.exr", "sequence.json"), "shade": ("maps.exr",), "join": ("maps.exr",), "register": ("depth.exr",),
+    "fuse": ("scan-set.json",)}
+"""What there must be one of for a job to begin with something, by kind: in a capture what lit its frames (`lit_by` of its facts), the shots
+of a scan or the tiles of a board; in the results of another job a file."""
+NEXT_STEPS: dict[str, tuple[tuple[str, str], ...]] = {
+    "light": (("pipeline", "Make an asset"), ("solve", "Solve normals and materials")),
+    "pattern": (("depth", "Measure depth"), ("separate", "Separate direct and global light")),
+    "laser": (("depth", "Measure depth"),), "tof": (("depth", "Measure depth"),), "stereo": (("depth", "Measure depth"),),
+    "shots": (("scan", "Turn shots into points"),), "tiles": (("inspect-board", "Inspect the board"),)}
+"""What a capture is made for, by what it holds: jobs that need nothing but the capture, and the words of their buttons. A capture that
+can be relit is lit first."""
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
 """The kind of thing that the identifiers of a pattern name."""
 
@@ -85,6 +106,8 @@ class Form(NamedTuple):
     """Inputs of the job, and options without a default."""
     more: tuple[Field, ...]
     """Options with a default."""
+    begins_with: tuple[str, ...]
+    """What there must be one of, as BEGIN_WITH says; empty: the job begins with nothing."""
 
 
 def form_of(kind: str, model: type[JobRequest]) -> Form:
@@ -97,7 +120,7 @@ def form_of(kind: str, model: type[JobRequest]) -> Form:
     fields = [(option.role is Role.INPUT, _field(model, tuple(places[name]), option)) for name, option in options.items()]
     main = [field for is_input, field in fields if is_input] + [field for is_input, field in fields if field.required and not is_input]
     return Form(kind, TITLES[kind], " ".join((model.__doc__ or "").split()), tuple(main),
-                tuple(field for _, field in fields if field not in main))
+                tuple(field for _, field in fields if field not in main), BEGIN_WITH.get(kind, ()))
 
 
 def import_fields(layout: Layout) -> list[Field]:

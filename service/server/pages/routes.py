@@ -8,16 +8,18 @@ import hashlib
 import json
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.staticfiles import StaticFiles
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
 from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
 from service.requests.base.import_choices import Layout
-from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, form_of, import_fields
+from service.requests.jobs import JOBS
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
@@ -40,6 +42,7 @@ NAVIGATION = [("/", "Home"), ("/captures", "Captures"), ("/jobs", "Jobs"), ("/ma
 router = APIRouter(include_in_schema=False)
 set_router = APIRouter(include_in_schema=False)
 """The page of the stage at this machine, where there is one."""
+JobKind = Annotated[str, PathParameter(pattern=f"^({'|'.join(TITLES)})$")]
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
 templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, navigation=NAVIGATION)
@@ -84,7 +87,8 @@ async def machines(request: Request) -> Response:
 @router.get("/captures/{capture}")
 async def capture(request: Request, capture: CaptureId) -> Response:
     """Show a capture and its lights, and the forms of the jobs that begin with it."""
-    return _page(request, "capture.html", identifier=capture, forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+    return _page(request, "capture.html", identifier=capture, next_steps=NEXT_STEPS,
+                 forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
 
 
 @router.get("/import-form/{layout}")
@@ -105,10 +109,23 @@ async def job(request: Request, job: JobId) -> Response:
     return _page(request, "job.html", identifier=job, forms=[form_of(kind, model) for kind, model in MAPS_JOBS.items()])
 
 
+@router.get("/forms/{kind}")
+async def form_words(kind: JobKind) -> list[dict[str, Any]]:
+    """Return how the form of a kind of job names its fields, for pages that show a request: places in the JSON, label, default as typed."""
+    form = form_of(kind, JOBS[kind])
+    return [{"paths": field.paths, "label": field.label, "default": field.default} for field in (*form.main, *form.more)]
+
+
 @router.get("/light/{capture}")
 async def light(request: Request, capture: CaptureId) -> Response:
     """Relight a capture live."""
     return _page(request, "light.html", identifier=capture)
+
+
+@router.get("/object/{capture}")
+async def object_page(request: Request, capture: CaptureId) -> Response:
+    """Show what was captured and what was made of it, as modes of one view."""
+    return _page(request, "object.html", identifier=capture)
 
 
 @router.get("/maps/{job}")

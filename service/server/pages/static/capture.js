@@ -1,14 +1,17 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read, remove } from "./api.js";
+import { attempt, listing, load, read, submitJob } from "./api.js";
 import { byId, element, factText, show, words } from "./element.js";
-import { mountDome } from "./dome.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
+import { mountPhotographs } from "./object/photographs.js";
+import { removeLater } from "./object/removal.js";
 import { chosenStep } from "./time_steps.js";
+import { ViewFile } from "./view/view_file.js";
 import { openView } from "./view_jobs.js";
 
+const MOST_STEPS = 2; // beside lighting it
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
 
@@ -21,7 +24,7 @@ async function open() {
     present(capture);
   }
   if (capture.state !== "ready") return;
-  show(byId("work"), true);
+  offer(capture.facts ?? {});
   enableForms(byId("work"), identifier);
   if ((capture.facts?.frames ?? 0) > 0) await load(look);
 }
@@ -35,40 +38,37 @@ function present(capture) {
   byId("facts").replaceChildren(...facts.flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
 }
 
+/** Show what can be done with a capture that holds this: what it is made for as buttons, the same with options, and the rest behind More. */
+function offer(facts) {
+  const holds = facts.lit_by ?? ["shots", "tiles"].filter((name) => name in facts);
+  const first = [...byId("next").querySelectorAll("[data-kind]")].filter(({ dataset }) => holds.includes(dataset.holds)).slice(0, MOST_STEPS);
+  for (const button of first) {
+    show(button, true);
+    button.addEventListener("click", () => attempt(async () => {
+      button.disabled = true;
+      const job = await submitJob({ kind: button.dataset.kind, capture: identifier }).finally(() => { button.disabled = false; });
+      location.assign(`/jobs/${job.id}`);
+    }));
+  }
+  for (const box of byId("more").querySelectorAll(".job-form")) {
+    if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
+    else if (first.some(({ dataset }) => dataset.kind === box.querySelector("form").dataset.kind)) byId("first").append(box);
+  }
+  show(byId("work"), true);
+}
+
 async function look() {
   const step = await chosenStep(identifier);
   const { files } = await openView(identifier, null, step);
-  const view = await files.json("view.json");
-  show(byId("relight"), view.relight !== null && step === null);
-  byId("findings").replaceChildren(...view.findings.map((finding) => element("li", {}, finding)));
-  if (view.frames.length === 0) return;
+  const view = await ViewFile.open(files);
+  show(byId("relight"), view.info.relight !== null && step === null);
+  byId("findings").replaceChildren(...view.info.findings.map((finding) => element("li", {}, finding)));
+  if (view.info.frames.length === 0) return;
   show(byId("lights"), true);
-  const atlas = await createImageBitmap(new Blob([await files.bytes("thumbnails.jpg")], { type: "image/jpeg" }));
-  const figures = view.frames.map((frame, index) => figure(frame, index, atlas));
-  byId("frames").replaceChildren(...figures);
-  let mark = () => {};
-  const choose = (index) => {
-    figures.forEach((each, at) => each.classList.toggle("chosen", at === index));
-    figures[index].scrollIntoView({ block: "nearest", inline: "nearest" });
-    mark(index);
-  };
-  if (view.frames.some((frame) => frame.direction !== null)) mark = mountDome(byId("dome"), view.frames, choose);
+  await mountPhotographs(byId("frames"), byId("dome"), view);
 }
 
-function figure(frame, index, atlas) {
-  const [x, y, width, height] = frame.thumbnail ?? [0, 0, 96, 96];
-  const canvas = element("canvas", { width, height, role: "img", "aria-label": `Frame ${index + 1}: ${frame.image}` });
-  if (frame.thumbnail !== null) canvas.getContext("2d").drawImage(atlas, x, y, width, height, 0, 0, width, height);
-  const clipped = frame.saturated === null ? "cannot be read" : frame.saturated > 0.0005 ? `${(100 * frame.saturated).toFixed(1)} % clipped` : null;
-  return element("figure", { class: frame.suspect === null ? "" : "suspect" }, canvas,
-    element("figcaption", {}, frame.image, element("small", {}, [frame.label, clipped, frame.suspect].filter(Boolean).join(" · "))));
-}
-
-byId("delete").addEventListener("click", () => attempt(async () => {
-  if (!confirm("Delete this capture from the service? A registered folder stays where it lies.")) return;
-  await remove(`/v1/captures/${identifier}`);
-  location.assign("/captures");
-}));
+byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, byId("name").textContent, "/captures"));
 await load(open);
 await load(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

@@ -1,7 +1,7 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, load, post, read, remove, resultsOf, save } from "./api.js";
-import { byId, bytes, duration, element, factText, show, time, words } from "./element.js";
+import { attempt, listing, load, post, read, Refusal, remove, resultsOf, save } from "./api.js";
+import { byId, bytes, duration, element, show, time, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { titleOf } from "./jobs_table.js";
@@ -10,7 +10,6 @@ const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
 const MAPS = ["maps.exr", "depth.exr"];
 const SEQUENCE = "sequence.json";
-const BEGIN_WITH = { export: [...MAPS, SEQUENCE], shade: ["maps.exr"], join: ["maps.exr"], register: ["depth.exr"], fuse: ["scan-set.json"] }; // kinds of jobs
 let logged = "";
 
 function present(job) {
@@ -40,22 +39,45 @@ function present(job) {
   logged = happened;
 }
 
-function presentRequest(job) {
-  const rows = [];
-  const add = (name, value) => {
-    if (value === null || value === "" || (Array.isArray(value) && value.length === 0)) return;
-    if (typeof value.schema === "string") rows.push(element("dt", {}, words(name)), element("dd", {}, value.name ?? value.schema));
-    else if (typeof value === "object" && !Array.isArray(value)) Object.entries(value).forEach(([inner, each]) => add(inner, each));
-    else rows.push(element("dt", {}, words(name)), element("dd", {}, link(name, value)));
-  };
-  Object.entries(job.request).forEach(([name, value]) => add(name, value));
-  byId("request").replaceChildren(...rows);
+/** Show what was asked for as the form of its kind names it: inputs and what differs from the defaults, and the rest folded away. */
+async function presentRequest(job) {
+  const valueAt = (path) => path.split(".").reduce((value, name) => value?.[name], job.request) ?? "";
+  const given = [[], []]; // chosen, and as it is by default
+  if (job.request.name) given[0].push(["Name", job.request.name]);
+  for (const { paths, label, default: usual } of await formWords(job.request.kind)) {
+    const value = valueAt(paths[0]);
+    if (value === "" || value.length === 0 || (label === "Name" && paths[0] === "name")) continue;
+    const isUsual = valueText(value) === usual || (value === false && usual === "");
+    given[Number(isUsual)].push([label, value]);
+  }
+  const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label), element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each)]))]));
+  byId("request").replaceChildren(...chosen);
+  byId("usual").replaceChildren(...usual);
+  show(byId("usual-part"), usual.length > 0);
 }
 
-function link(name, value) {
+/** Return how the form of a kind names its fields; jobs that the service makes on its own have no form, and their fields are named by themselves. */
+async function formWords(kind) {
+  try {
+    return await read(`/forms/${kind}`);
+  } catch (error) {
+    if (!(error instanceof Refusal && error.status === 422)) throw error;
+    return ["capture", "maps", "intake"].map((name) => ({ paths: [name], label: words(name), default: "" }));
+  }
+}
+
+/** Return a value of a request as a person reads it: a document by its name, or by how much it holds. */
+function valueText(value) {
+  if (typeof value === "boolean") return value ? "true" : "";
+  if (typeof value !== "object") return String(value);
+  if (Array.isArray(value)) return value.map(valueText).join(",");
+  return value.name ?? value.schema ?? `${Object.keys(value).length} values`;
+}
+
+function link(value) {
   if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, value);
   if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
-  return factText(name, value);
+  return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
 }
 
 async function log() {
@@ -74,11 +96,12 @@ async function presentResults(job) {
   byId("results").tBodies[0].replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 2 }, "No files yet."))]));
   const solved = job.state === "succeeded" && [...MAPS, SEQUENCE].some((name) => names.includes(name));
   offer("look", solved, `/maps/${identifier}`);
+  offer("object", job.state === "succeeded" && job.request.capture !== undefined, `/object/${job.request.capture}`);
   offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);
   const forms = [...byId("work").querySelectorAll("form[data-kind]")];
-  const fitting = job.state === "succeeded" ? forms.filter(({ dataset }) => BEGIN_WITH[dataset.kind].some((name) => names.includes(name))) : [];
+  const fitting = job.state === "succeeded" ? forms.filter((form) => form.closest(".job-form").dataset.begins.split(" ").some((name) => names.includes(name))) : [];
   if (fitting.length > 0 && byId("work").hidden) {
     forms.forEach((form) => show(form.closest(".job-form"), fitting.includes(form)));
     show(byId("work"), true);
@@ -106,7 +129,7 @@ function download(event, result) {
 
 async function follow() {
   let job = await read(`/v1/jobs/${identifier}`);
-  presentRequest(job);
+  attempt(() => presentRequest(job));
   present(job);
   const results = attempt(() => presentResults(job)); // the job is followed whether or not they can be had now
   if (ENDED.includes(job.state)) {

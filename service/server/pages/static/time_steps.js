@@ -14,7 +14,7 @@ export async function chosenStep(capture, names = []) {
   if (count === 0) return null;
   const asked = Number(new URLSearchParams(location.search).get("step") ?? 1);
   const step = Number.isInteger(asked) && asked >= 1 && asked <= count ? asked : 1;
-  const go = (to) => location.assign(`?step=${to}`);
+  const go = (to) => location.assign(`?step=${to}${location.hash}`);
   const options = Array.from({ length: count }, (_, index) => element("option", { value: index + 1, selected: index + 1 === step },
     names[index] === undefined ? `${index + 1} of ${count}` : `${names[index]} (${index + 1} of ${count})`));
   const select = element("select", { id: "time-step", onchange: () => go(select.value) }, ...options);

@@ -94,14 +94,14 @@ class Solved:
 
     def __init__(self, server: Server, capture: str, solve: str | None) -> None:
         self.server, self.capture, self.solve = server, capture, solve
-        self.pages = {"capture": f"/captures/{capture}", "light": f"/light/{capture}"}
+        self.pages = {"capture": f"/captures/{capture}", "light": f"/light/{capture}", "object": f"/object/{capture}"}
         if solve is not None:
             self.pages |= {"job": f"/jobs/{solve}", "maps": f"/maps/{solve}"}
 
     def wait_for_content(self, page, name: str) -> None:
         """Wait until a page shows what it is for."""
         content = {"captures": "#captures a", "jobs": "#jobs tbody tr", "capture": "#frames canvas", "job": "#stages tbody tr",
-                   "light": "canvas.picture[data-ready]", "maps": "canvas.map"}[name]
+                   "light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map"}[name]
         page.locator(content).first.wait_for(timeout=CONTENT_MS)
 
     def result(self, job: str, name: str, folder: Path) -> Path:

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.long
 PAGES = {"captures": "/captures", "jobs": "/jobs"}
 
 
-@pytest.mark.parametrize("name", [*PAGES, "capture", "job", "light", "maps"])
+@pytest.mark.parametrize("name", [*PAGES, "capture", "job", "light", "object", "maps"])
 def test_a_page_is_small_fits_and_has_no_serious_violation(browser, server, solved, name):
     page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
     loaded = count_bytes(page)

@@ -8,7 +8,8 @@ from service.requests.base.base import Role
 from service.requests.base.options import build, options_of
 from service.requests.calibration_jobs import ProcamJob
 from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
-from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, Form, form_of
+from service.server.pages.forms import BEGIN_WITH, CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, Form, form_of
+from stage.capture.manifest import LIT_BY
 
 KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS
 CAPTURE, JOB, OTHER = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk", "job_1123456789abcdefghjk"
@@ -89,6 +90,17 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
         text = ",".join(map(str, value)) if isinstance(value, list) else value
         words = {name: given for name, given in typed.items() if name not in others}
         assert ANY_JOB.validate_python(request) == build(model, words | {field.name: text}), field.name
+
+
+def test_what_each_job_begins_with_is_declared():
+    assert set(BEGIN_WITH) == set(CAPTURE_JOBS) | set(MAPS_JOBS)
+    assert {each for kind in CAPTURE_JOBS for each in BEGIN_WITH[kind]} == {*LIT_BY, "shots", "tiles"} == set(NEXT_STEPS)
+
+
+@pytest.mark.parametrize(("holds", "kind"), [(holds, kind) for holds, steps in NEXT_STEPS.items() for kind, _ in steps])
+def test_a_next_step_needs_nothing_but_the_capture(holds, kind):
+    assert holds in BEGIN_WITH[kind]
+    assert ANY_JOB.validate_python({"kind": kind, "capture": CAPTURE}).kind == kind
 
 
 def test_limits_and_defaults_are_those_of_the_model():

@@ -8,8 +8,12 @@ import subprocess
 import sys
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 
+from service.client import Client
+from service.server.pages.forms import BEGIN_WITH, NEXT_STEPS
+from tests.scenes.captures import write_exr
 from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.conftest import SAMPLES, new_context
 from tests.service.server.tcp_proxy import tcp_proxy
@@ -27,9 +31,75 @@ def capture(server) -> str:
         return admitted(server, client, SAMPLES / "lambert")["id"]
 
 
+@pytest.fixture(scope="module")
+def patterns(server, tmp_path_factory) -> str:
+    """A capture of projected patterns, uploaded and ready."""
+    folder = tmp_path_factory.mktemp("patterns") / "<b>stripes"
+    folder.mkdir()
+    images = [f"{index}.exr" for index in range(2)]
+    for image in images:
+        write_exr(folder / image, np.ones((8, 8, 3)))
+    frames = [{"image": image, "pattern": {"code": code}} for image, code in zip(images, ("black", "white"), strict=True)]
+    (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "<b>stripes", "frames": frames, "camera": {
+        "projection": "orthographic", "resolution": [8, 8], "pixel_size_m": 0.001}}))
+    with Client(server.url) as client:
+        return client.captures.upload(folder).id
+
+
+def offered(page) -> set[str]:
+    """Open all that a capture's page offers, and return the kinds of jobs."""
+    page.locator("#work:not([hidden])").wait_for()
+    page.locator("#more > summary").click()
+    forms = page.locator(".job-form:visible form[data-kind]")
+    return set(forms.evaluate_all("all => all.map((each) => each.dataset.kind)"))
+
+
+def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot_apply(server, page, capture, patterns):
+    page.goto(f"/captures/{patterns}")
+    page.get_by_role("heading", name="<b>stripes", level=1).wait_for()
+    assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "pattern" in what}
+    assert page.locator("#next > button[data-kind]:visible").all_inner_texts() == [words for _, words in NEXT_STEPS["pattern"]]
+    page.goto(f"/captures/{capture}")
+    page.get_by_role("link", name="Light it").wait_for()
+    assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "light" in what}
+    page.get_by_role("button", name=dict(NEXT_STEPS["light"])["pipeline"]).click()
+    page.wait_for_url("**/jobs/job_*")
+    page.locator("#request dd", has_text=capture).wait_for()
+    page.locator("#usual-part > summary").click()
+    request = page.locator("#request, #usual").all_inner_texts()
+    assert "[object" not in "".join(request) and "{" not in "".join(request)
+    names = page.locator("#request dt, #usual dt").all_inner_texts()
+    assert len(names) == len(set(names)) and {"Capture", "Clip negative", "Textures"} <= set(names)
+    with server.client() as client:
+        client.post(f"/v1/jobs/{page.url.rpartition('/')[2]}/cancel")
+
+
+def test_a_deletion_is_undone_and_done(server, page):
+    """Time is the page's own clock, which the test moves."""
+    with server.client() as client:
+        capture = admitted(server, client, SAMPLES / "lambert")["id"]
+        page.clock.install()
+        page.goto(f"/captures/{capture}")
+        page.locator("#frames canvas").first.wait_for(timeout=JOB_MS)  # a capture that a job still reads is not deleted
+        for _ in range(2):
+            page.get_by_role("button", name="Delete").click()
+            page.get_by_role("alert").get_by_text("lambert is deleted in 8 s.").wait_for()
+            page.get_by_role("button", name="Undo").click()
+            page.clock.run_for(20_000)
+        assert client.get(f"/v1/captures/{capture}").status_code == 200
+        page.get_by_role("button", name="Delete").click()
+        page.clock.run_for(9_000)
+        page.wait_for_url("**/captures")
+        assert client.get(f"/v1/captures/{capture}").status_code == 404
+
+
 def opened_form(page, title: str, options: bool = True):
     """Open the form of a job, its options and what shows it as a command."""
-    page.locator("summary", has_text=title).first.click()
+    page.locator("#work:not([hidden])").wait_for()
+    summary = page.locator("summary", has_text=title).first
+    if not summary.is_visible():
+        page.locator("#more > summary").click()
+    summary.click()
     form = page.locator(".job-form[open] form")
     if options:
         form.locator("> details:not(.same-as) > summary").click()
@@ -84,13 +154,13 @@ def test_patterns_are_drawn_from_the_page_of_jobs(page):
     page.locator("#results").get_by_text("patterns.json").wait_for()
 
 
-def test_forms_of_several_captures_and_images(page, capture):
-    page.goto(f"/captures/{capture}")
+def test_forms_of_several_captures_and_images(page, capture, patterns):
+    page.goto(f"/captures/{patterns}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
     form.get_by_label("Board").fill("9x6")
     form.get_by_label("Square m").fill("0.03")
     command = form.locator("[data-shows=command]").inner_text()
-    assert f"calibrate-procam {capture} " in command and command.endswith("--board 9x6 --square-m 0.03")  # the page's capture is entered
+    assert f"calibrate-procam {patterns} " in command and command.endswith("--board 9x6 --square-m 0.03")  # the page's capture is entered
     page.goto(f"/captures/{capture}")
     form = opened_form(page, "Calibrate the dark frame", options=False)
     form.get_by_label("Images").fill("b.exr\na.exr")

@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 import pytest
 
 CAPTURE, JOB = "cap_0123456789abcdefghjk", "job_0123456789abcdefghjk"
-PAGES = ["/", "/machines", "/captures", f"/captures/{CAPTURE}", "/jobs", f"/jobs/{JOB}", f"/light/{CAPTURE}", f"/maps/{JOB}",
-         f"/asset/{JOB}", f"/drive/{JOB}"]
+PAGES = ["/", "/machines", "/captures", f"/captures/{CAPTURE}", "/jobs", f"/jobs/{JOB}", f"/light/{CAPTURE}",
+         f"/object/{CAPTURE}", f"/maps/{JOB}", f"/asset/{JOB}", f"/drive/{JOB}"]
 
 
 class Document(HTMLParser):

@@ -10,7 +10,7 @@ from tests.service.server.pages.frames import assert_same, picture, rendered
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["light", "maps", "capture"])
+@pytest.mark.parametrize("name", ["light", "object", "maps", "capture"])
 def test_a_page_shows_the_sample(browser, owl, material, sky, tmp_path, name):
     sample = material if name == "maps" else owl
     page = new_context(browser, base_url=sample.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark").new_page()
@@ -23,6 +23,9 @@ def test_a_page_shows_the_sample(browser, owl, material, sky, tmp_path, name):
         page.get_by_role("button", name="Expose for this light").click()
     if name == "maps":
         page.get_by_label("Compare with", exact=True).first.select_option("roughness")
+    if name == "object":
+        page.get_by_role("button", name="Photographs").click()
+        page.locator("[data-shows=photographs] figure").first.wait_for()
     page.evaluate("() => scrollTo(0, 0)")
     page.wait_for_timeout(1500)  # the last tiles, and a frame
     path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_{name}.png"

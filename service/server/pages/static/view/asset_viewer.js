@@ -64,8 +64,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   inCameraFrame.add(asset.object);
   scene.add(inCameraFrame);
   view.frame(inCameraFrame);
-  const style = getComputedStyle(parent);
-  const markers = new RigLights(lights, view.center, view.radius, { light: style.getPropertyValue("--accent"), suspect: style.getPropertyValue("--warn") });
+  const markers = new RigLights(lights, view.center, view.radius, { light: colourOf(parent, "--accent"), suspect: colourOf(parent, "--warn") });
   scene.add(markers.object);
 
   /** Light the asset as chosen, and expose for it. */
@@ -144,6 +143,16 @@ export async function mount(parent, file, { rig = null, environments = [], load 
       triangles: asset.triangles, points: asset.points, textures: asset.textures, problems: asset.problems }),
     picture: () => view.picture(),
   };
+}
+
+/** Return a colour of the page as three.js reads it, in light or dark as the page is. */
+function colourOf(parent, token) {
+  const probe = element("span", { hidden: true });
+  probe.style.color = `var(${token})`;
+  parent.append(probe);
+  const { color } = getComputedStyle(probe);
+  probe.remove();
+  return color;
 }
 
 function words({ triangles, points, textures }, lights) {

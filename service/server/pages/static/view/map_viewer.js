@@ -1,6 +1,7 @@
 /** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
 
 import { element, tell } from "../element.js";
+import { ControlAddress } from "./control_address.js";
 import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
 import { mountHistogram, short } from "./histogram.js";
 import { codeWords, OUTSIDE, REFUSED, stateOf, UNSURE } from "./pixel_states.js";
@@ -11,15 +12,17 @@ const LARGEST_SCALE = 64;
 const ZOOM = 1.25;
 const PAN = 0.1; // of the canvas, for one press of an arrow key
 const NONE = "";
+const WAYS = { wipe: "by a wipe", difference: "as the difference of their colours", beside: "side by side" };
 
 /**
  * Show the layers of a view.
  * @param {HTMLElement} parent Takes the viewer.
  * @param {import("./view_file.js").ViewFile} view
- * @param {{onpick?: function(number, number): void}} [options] `onpick` is called with row and column of a pixel that was chosen.
- * @returns {{destroy: function(): void, pixelAt: function(number, number): Promise<any>}}
+ * @param {{onpick?: function(number, number): void, others?: {name: string, view: import("./view_file.js").ViewFile}[]}} [options] `onpick` is called with row and
+ *     column of a pixel that was chosen; `others` are views of the same pixels, to compare with, the first of which is at first.
+ * @returns {{destroy: function(): void}}
  */
-export function mount(parent, view, { onpick = () => {} } = {}) {
+export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   const { rows, cols } = view.info;
   const canvas = element("canvas", { class: "map", tabindex: 0, role: "img",
     "aria-label": "Map. Plus and minus zoom, arrow keys move, 0 shows all, Enter chooses the pixel in the middle." });
@@ -28,6 +31,9 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   const histogram = element("div", { class: "histogram" });
   const layerSelect = layerChoice("Layer");
   const otherSelect = layerChoice("Compare with", true);
+  otherSelect.append(...others.map(({ name, view: { info } }, at) => element("optgroup", { label: name },
+    ...info.layers.map((layer) => element("option", { value: `${at}/${layer.name}` }, `${layer.title} of ${name}`)))));
+  const how = element("select", {}, ...Object.entries(WAYS).map(([value, text]) => element("option", { value }, text)));
   const wipe = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Where the two layers meet" });
   const colours = element("select", {}, ...COLOUR_MAPS.map((name) => element("option", { value: name }, name)));
   const stops = element("input", { type: "range", min: -6, max: 6, step: 0.1, value: 0, "aria-label": "Exposure in stops" });
@@ -36,8 +42,8 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   const named = (text, control, ...more) => element("label", {}, `${text} `, control, ...more);
   const colourRow = named("Colour map", colours);
   const stopsRow = element("label", {}, "Exposure ", stops, " ", stopsText);
-  const wipeRow = named("Wipe", wipe);
-  const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), wipeRow,
+  const [wipeRow, howRow] = [named("Wipe", wipe), named("How", how)];
+  const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), howRow, wipeRow,
     named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
     element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
     element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`));
@@ -70,10 +76,14 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
       const { width, height } = canvas;
       context.clearRect(0, 0, width, height);
       const marks = { unsure: hatched.unsure.checked, refused: hatched.refused.checked };
-      const border = other === null ? width : Math.round((width * Number(wipe.value)) / 100);
-      image.draw(context, place, { left: 0, right: border }, marks);
-      other?.draw(context, place, { left: border, right: width }, marks);
-      if (other !== null) {
+      const way = other === null ? null : how.value;
+      const border = { wipe: Math.round((width * Number(wipe.value)) / 100), beside: Math.round(width / 2) }[way] ?? width;
+      const shift = beside() ? width / 4 : 0; // each stands in the middle of its half
+      image.draw(context, { ...place, x: place.x - shift }, { left: 0, right: border }, marks);
+      if (way === "difference") context.globalCompositeOperation = "difference";
+      other?.draw(context, { ...place, x: place.x + shift }, { left: way === "difference" ? 0 : border, right: width }, marks);
+      context.globalCompositeOperation = "source-over";
+      if (border < width) {
         context.fillStyle = getComputedStyle(canvas).color;
         context.fillRect(border - 1, 0, 2, height);
       }
@@ -81,22 +91,32 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   }
 
   function select() {
-    const look = image === null ? {} : { colours: colours.value, stops: Number(stops.value) };
+    const look = { colours: colours.value, stops: Number(stops.value) };
+    stopsText.textContent = `${stops.value} stops`;
     const failed = (error) => tell(error.message);
-    const made = (name) => new TiledImage(view, view.layer(name), draw, failed);
+    const made = (chosen) => {
+      const [at, name] = chosen.includes("/") ? chosen.split("/") : [null, chosen];
+      const from = at === null ? view : others[Number(at)].view;
+      return new TiledImage(from, from.layer(name), draw, failed);
+    };
     image = made(layerSelect.value);
     other = otherSelect.value === NONE ? null : made(otherSelect.value);
     for (const each of [image, other]) each?.setLook(look);
     const kinds = [image, other].map((each) => each?.layer.kind);
     colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
     stopsRow.hidden = !kinds.includes("colour");
-    wipeRow.hidden = other === null;
+    howRow.hidden = other === null;
+    wipeRow.hidden = other === null || how.value !== "wipe";
     mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
     draw();
   }
 
+  function beside() {
+    return other !== null && how.value === "beside";
+  }
+
   function fit() {
-    const scale = Math.min(canvas.width / cols, canvas.height / rows);
+    const scale = Math.min(canvas.width / (beside() ? 2 : 1) / cols, canvas.height / rows);
     place = { scale, x: (canvas.width - scale * cols) / 2, y: (canvas.height - scale * rows) / 2 };
     draw();
   }
@@ -115,7 +135,8 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   }
 
   function pixelOf(x, y) {
-    const [row, col] = [Math.floor((y - place.y) / place.scale), Math.floor((x - place.x) / place.scale)];
+    const shift = beside() ? (x < canvas.width / 2 ? -1 : 1) * canvas.width / 4 : 0;
+    const [row, col] = [Math.floor((y - place.y) / place.scale), Math.floor((x - place.x - shift) / place.scale)];
     return row < 0 || col < 0 || row >= rows || col >= cols ? null : [row, col];
   }
 
@@ -124,23 +145,24 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
     return [((event.clientX - box.left) * canvas.width) / box.width, ((event.clientY - box.top) * canvas.height) / box.height];
   }
 
-  async function pixelAt(row, col) {
-    const found = {};
-    for (const layer of new Set([image.layer, other?.layer, view.layer("status"), view.layer("mask")])) {
-      if (layer !== undefined) found[layer.name] = await view.pixel(layer, row, col);
-    }
-    return found;
-  }
-
   async function read(x, y) {
     const mine = ++looked;
     const pixel = pixelOf(x, y);
     if (pixel === null) return;
-    const found = await pixelAt(...pixel).catch((error) => { tell(error.message); return null; });
-    if (found === null || mine !== looked) return;
-    const parts = [image, other].filter((each) => each !== null && each.layer.name !== "status").map(({ layer }) => `${layer.title} ${words(layer, found[layer.name])}`);
-    const code = found.status?.[0];
-    const state = found.mask === undefined ? undefined : STATE_WORDS[stateOf(view.info.codes, code, found.mask[0])];
+    const shown = [image, other].filter((each) => each !== null && each.layer.name !== "status");
+    const asked = [view.layer("status"), view.layer("mask")].map((layer) => (layer === undefined ? null : view.pixel(layer, ...pixel)));
+    let found;
+    try {
+      found = await Promise.all([...asked, ...shown.map((each) => each.pixel(...pixel))]);
+    } catch (error) {
+      tell(error.message);
+      return;
+    }
+    if (mine !== looked) return;
+    const [status, mask, ...values] = found;
+    const parts = shown.map(({ layer }, at) => `${layer.title} ${words(layer, values[at])}`);
+    const code = status?.[0];
+    const state = mask === null ? undefined : STATE_WORDS[stateOf(view.info.codes, code, mask[0])];
     if (code !== undefined && state !== STATE_WORDS[OUTSIDE]) parts.push(`status: ${codeWords(view.info.codes, code)}`);
     if (state !== undefined) parts.push(state);
     value.textContent = `row ${pixel[0]}, column ${pixel[1]}: ${parts.join("; ")}`;
@@ -188,8 +210,12 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
     event.preventDefault();
     keys[event.key]();
   });
-  layerSelect.addEventListener("change", select);
-  otherSelect.addEventListener("change", select);
+  if (others.length > 0) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
+  const address = new ControlAddress({ layer: layerSelect, with: otherSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
+  address.read();
+  panel.addEventListener("input", () => address.write());
+  for (const each of [layerSelect, otherSelect, how]) each.addEventListener("change", select);
+  how.addEventListener("change", fit);
   wipe.addEventListener("input", draw);
   for (const each of Object.values(hatched)) each.addEventListener("change", draw);
   colours.addEventListener("change", () => [image, other].forEach((each) => each?.setLook({ colours: colours.value })));
@@ -206,5 +232,5 @@ export function mount(parent, view, { onpick = () => {} } = {}) {
   });
   select();
   resized.observe(canvas);
-  return { destroy: () => resized.disconnect(), pixelAt };
+  return { destroy: () => resized.disconnect() };
 }

@@ -27,13 +27,14 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
  *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
  *     light; `embedded`: the page moves the light, and the address is its own.
- * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void}>}
+ * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void,
+ *     canvas: HTMLCanvasElement|null, turn: function(number): void}>} `turn` turns the environment by degrees, or the light where there is none.
  */
 export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, turn: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
@@ -47,7 +48,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     size: range("Size of the light in degrees", 0, 90, 0.5, 0.5), environment: element("select", { "aria-label": "Environment map" }, element("option", { value: "" }, "none"),
       ...environments.map(({ id, name }) => element("option", { value: id }, name))),
     file: element("input", { type: "file", accept: ".exr,.hdr", class: "visually-hidden" }),
-    environmentStops: range("Brightness of the environment", -10, 10, 0.1, 0), turn: range("Turn of the environment in degrees", 0, 360, 1, 0),
+    environmentStops: range("Brightness of the environment", -10, 10, 0.1, 0), turn: range("Turn of the environment in degrees", 0, 360, 0.1, 0),
     exposure: range("Exposure in stops", -10, 10, 0.1, 0),
     compare: element("select", { "aria-label": "Photograph to compare with" }, element("option", { value: "" }, "nothing"),
       ...lights.map((frame, index) => element("option", { value: index }, frame.image))),
@@ -208,6 +209,17 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     control.environment.value = "";
     await chooseEnvironment(null, file.name, await file.arrayBuffer());
   }));
+  function turn(degrees) {
+    if (map !== null) {
+      control.turn.value = String((Number(control.turn.value) + degrees + 360) % 360);
+      change();
+      return;
+    }
+    const [x, y, z] = place.light;
+    const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
+    move([x * cos - y * sin, x * sin + y * cos, z]); // around the view axis, so that it stays among the captured lights
+  }
+
   let spinning = null;
   play.addEventListener("click", () => {
     play.setAttribute("aria-pressed", String(spinning === null));
@@ -218,9 +230,8 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     }
     let before = performance.now();
     const step = (time) => {
-      control.turn.value = String((Number(control.turn.value) + ((time - before) / 1000) * SPIN_DEGREES_PER_S) % 360);
+      turn(((time - before) / 1000) * SPIN_DEGREES_PER_S);
       before = time;
-      change();
       spinning = requestAnimationFrame(step);
     };
     spinning = requestAnimationFrame(step);
@@ -249,6 +260,8 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     pixels: () => { draw(); return renderer.pixels(); },
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
+    canvas,
+    turn,
   };
 }
 

@@ -27,6 +27,11 @@ export class TiledImage {
     this.look = { low, high, stops: 0, colours: "viridis", space: view.info.color_space };
   }
 
+  /** Return the values of a pixel at the whole resolution. */
+  pixel(row, col) {
+    return this.#view.pixel(this.layer, row, col);
+  }
+
   /** Change how values are shown. */
   setLook(changes) {
     this.look = { ...this.look, ...changes };

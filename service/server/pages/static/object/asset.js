@@ -1,0 +1,51 @@
+/** An exported asset in 3D, with the lights of the rig that it was captured under. */
+
+import { attempt, fetched, listing, resultsOf } from "../api.js";
+import { byId, bytes, element, tell } from "../element.js";
+import { loadEnvironment, readyEnvironments } from "../environments.js";
+import { canRender } from "../view/basis_renderer.js";
+import { captureOf, findView } from "../view_jobs.js";
+
+const SHOWN = /(^|\/)asset\.(usdz|glb)$/;
+const LARGE = 100e6; // bytes, which are asked about before they are loaded
+
+/** Return view.json of the capture that a job comes from; null: no view of it is prepared. */
+async function rigOf(job) {
+  const capture = await captureOf(job);
+  const view = capture === null ? null : await findView({ capture });
+  return view?.state === "succeeded" ? resultsOf(view.id).json("view.json") : null;
+}
+
+async function findAsset(job) {
+  for await (const result of listing(`/v1/jobs/${job.id}/results`, "results", "after")) if (SHOWN.test(result.name)) return result;
+  throw new Error("this job has no asset.usdz or asset.glb, which are the formats that this page shows");
+}
+
+/**
+ * Show the asset of a job.
+ * @param {HTMLElement} parent Takes it.
+ * @param {any} job As the API gives it.
+ * @param {function(string): void} [named] Told the name of the asset.
+ */
+export async function mountAsset(parent, job, named = () => {}) {
+  const result = await findAsset(job);
+  if (!canRender()) {
+    byId("state").textContent = "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it.";
+    parent.replaceChildren();
+    return;
+  }
+  const show = async () => {
+    byId("state").textContent = `Loading ${bytes(result.size)} …`;
+    const [{ mount }, data, environments, rig] = await Promise.all([import("../view/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
+      readyEnvironments(), rigOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; })]);
+    named(job.request.name || rig?.name || job.id);
+    globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data }, { rig, environments, load: loadEnvironment });
+    byId("state").textContent = "";
+  };
+  if (result.size <= LARGE) {
+    await show();
+    return;
+  }
+  const button = element("button", { type: "button", onclick: () => { button.remove(); attempt(show); } }, `Load ${bytes(result.size)}`);
+  parent.replaceChildren(element("p", {}, `${result.name} is large: a browser needs several times its size as memory. `, button));
+}

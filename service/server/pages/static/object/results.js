@@ -1,0 +1,44 @@
+/** The maps or the depth of a job: their layers, the readings behind each pixel, and the points of a depth. */
+
+import { attempt, read, Refusal, resultsOf } from "../api.js";
+import { element } from "../element.js";
+import { chosenStep } from "../time_steps.js";
+import { mount as mountMaps } from "../view/map_viewer.js";
+import { mount as mountPlot } from "../view/pixel_plot.js";
+import { ViewFile } from "../view/view_file.js";
+import { captureOf, openView } from "../view_jobs.js";
+
+/** Return the view of the maps of a job, prepared if it is not yet. */
+export async function viewOf(job) {
+  const capture = await captureOf(await read(`/v1/jobs/${job}`));
+  return ViewFile.open((await openView(capture, job, await chosenStep(capture, await stepNames(job)))).files);
+}
+
+/** Show a view of maps; `others` to compare with, as the viewer of maps takes them. */
+export async function mountResults(parent, view, others = []) {
+  const [maps, plot] = [element("div"), element("section", { "aria-label": "Readings of a pixel" })];
+  parent.replaceChildren(warningsOf(view), maps, plot);
+  const readings = mountPlot(plot, view);
+  mountMaps(maps, view, { others, onpick: (row, col) => attempt(() => readings?.show(row, col)) });
+  if (view.info.points !== null) {
+    const points = element("div");
+    parent.append(element("section", { "aria-labelledby": "points-title" }, element("h2", { id: "points-title" }, "Points"), points));
+    const { mount } = await import("../view/cloud_viewer.js"); // three.js is large: only a depth needs it here
+    globalThis.cloud = await mount(points, view);
+  }
+}
+
+/** Return what is wrong with maps, in words. */
+export function warningsOf(view) {
+  return element("ul", { class: "findings plain" }, ...[...view.info.findings, ...view.info.warnings].map((each) => element("li", {}, each)));
+}
+
+/** Return the names of the time steps of a job of a sequence; empty where it is of one capture. */
+async function stepNames(job) {
+  try {
+    return (await resultsOf(job).json("sequence.json")).steps.map((step) => step.path);
+  } catch (error) {
+    if (error instanceof Refusal && error.status === 404) return [];
+    throw error;
+  }
+}

@@ -1,0 +1,164 @@
+"""An object on one page: modes that it has, an address that says what is shown, maps compared, files, and a video."""
+
+import numpy as np
+import pytest
+
+from tests.service.server.pages.axe import violations_in_both_schemes
+from tests.service.server.pages.conftest import Solved, done, new_context
+from tests.service.server.pages.frames import picture
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def made(server, solved) -> Solved:
+    """The small sample, solved twice and exported."""
+    with server.client() as client:
+        other = done(server, client, {"kind": "solve", "capture": solved.capture, "name": "<i>other", "options": {"method": "robust"}})
+        done(server, client, {"kind": "export", "maps": other})
+    return solved
+
+
+def mode(page, name: str, content: str) -> None:
+    page.get_by_role("group", name="What is shown").get_by_role("button", name=name, exact=True).click()
+    page.locator(content).first.wait_for()
+
+
+def test_the_modes_of_an_object_are_those_that_exist_and_stand_in_the_address(small_page, made):
+    page = small_page
+    page.goto(made.pages["object"])
+    made.wait_for_content(page, "object")
+    assert page.locator("#modes button").all_inner_texts() == ["Light", "Maps", "3-D", "Photographs", "Compare"]
+    page.locator("#files a", has_text="asset.usdz").wait_for()
+    assert {"asset.usdz", "maps.exr"} <= set(page.locator("#files a").all_inner_texts())
+    mode(page, "Maps", "[data-shows=maps] canvas.map")
+    page.wait_for_function("() => location.hash.includes('mode=maps')")
+    mode(page, "3-D", "canvas.scene")
+    page.wait_for_function("() => globalThis.asset?.state().triangles > 1000")
+    mode(page, "Photographs", "[data-shows=photographs] figure canvas")
+    page.wait_for_function("() => location.hash.includes('mode=photographs')")
+    page.goto("/jobs")
+    page.go_back()
+    page.locator("[data-shows=photographs] figure canvas").first.wait_for()
+    assert page.locator("[data-shows=light]").count() == 0  # what is not looked at is not loaded
+    with page.expect_download() as download:
+        page.locator("#files a", has_text="maps.exr").click()
+    assert download.value.path().read_bytes()[:4] == b"\x76\x2f\x31\x01"
+
+
+def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made):
+    page.goto(f"{made.pages['object']}#mode=compare")
+    page.locator("[data-shows=compare] canvas.map").wait_for()
+    assert page.get_by_label("Maps", exact=True).locator("option:checked").inner_text().startswith("<i>other (")
+    how = page.locator("label", has_text="How").locator("select")
+
+    def shown() -> np.ndarray:
+        return np.array(page.locator("canvas.map").evaluate("""(canvas) => {
+          const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+          const sums = [0, 0];
+          for (let at = 0; at < data.length; at += 4) {
+            sums[(at / 4) % canvas.width < canvas.width / 2 ? 0 : 1] += data[at] + data[at + 1] + data[at + 2];
+          }
+          return sums;
+        }""")) / 1e3
+
+    page.wait_for_function("""() => { const canvas = document.querySelector("canvas.map");
+      return canvas.getContext("2d").getImageData(canvas.width / 2 - 20, canvas.height / 2, 1, 1).data[3] === 255
+        && canvas.getContext("2d").getImageData(canvas.width / 2 + 20, canvas.height / 2, 1, 1).data[3] === 255; }""")
+    wiped = shown()
+    how.select_option("difference")
+    page.wait_for_function("() => location.hash.includes('how=difference')")
+    assert (shown() < 0.3 * wiped).all()  # the two solves agree on the normals of a Lambertian object but for unsure pixels
+    how.select_option("beside")
+    page.wait_for_function("() => location.hash.includes('how=beside')")
+    page.reload()
+    page.locator("[data-shows=compare] canvas.map").wait_for()
+    assert page.locator("label", has_text="How").locator("select").input_value() == "beside"
+
+
+def test_a_link_shows_what_its_sender_saw_and_back_returns_to_it(page, browser, made, sky):
+    page.goto(made.pages["light"])
+    made.wait_for_content(page, "light")
+    page.get_by_label("Environment map").select_option(sky)
+    page.locator("canvas.preview").wait_for()
+    page.wait_for_function("() => relit.state().light === null")  # the environment is seen alone at first
+    page.get_by_label("Turn of the environment in degrees").fill("40")
+    page.evaluate("relit.set([-0.3, 0.2, 0.9])")
+    page.get_by_label("Size of the light in degrees").fill("12")
+    page.locator("canvas.picture").focus()
+    for key in ("+", "+", "Shift+ArrowRight"):
+        page.keyboard.press(key)
+    page.wait_for_function("() => ['zoom=1.563', 'size=12', 'turn=40'].every((each) => location.hash.includes(each))")
+    link, before, state = page.url, picture(page), page.evaluate("relit.state()")
+    other = new_context(browser, viewport={"width": 900, "height": 700}).new_page()
+    other.goto(link)
+    made.wait_for_content(other, "light")
+    assert np.abs(picture(other) - before).max() <= 2 / 255  # the direction is kept with three decimals
+    assert other.evaluate("relit.state().exposure") == state["exposure"]
+    other.close()
+    page.goto("/jobs")
+    page.go_back()
+    made.wait_for_content(page, "light")
+    assert np.abs(picture(page) - before).max() <= 2 / 255
+    page.evaluate("location.hash = '#light=nonsense&size=1000&environment=env_0123456789abcdefghjk&colour=javascript'")
+    page.get_by_role("alert").get_by_text("The environment of this address is not on this server").wait_for()
+    assert page.evaluate("relit.state().environment") is None
+
+
+def test_a_zoomed_picture_is_smooth_has_a_scale_bar_and_fills_the_screen(page, made):
+    page.goto(f"{made.pages['light']}#zoom=4")
+    made.wait_for_content(page, "light")
+    width, height, largest = page.locator("canvas.picture").evaluate("""(canvas) => {
+      const { width, height } = canvas;
+      const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+      let largest = 0;
+      for (let at = 4; at < data.length; at += 4) if ((at / 4) % width > 0) largest = Math.max(largest, Math.abs(data[at] - data[at - 4]));
+      return [width, height, largest];
+    }""")
+    source = picture(page)
+    scale = 4 * min(width, height) / len(source)
+    assert 0 < largest < 2 * 255 * np.abs(np.diff(source[..., 0], axis=1)).max() / scale  # a block of a pixel's colour ends in a whole step
+    assert page.locator(".scale-bar").inner_text().split()[1] in ("mm", "cm", "µm")
+    page.get_by_role("button", name="Full screen").click()
+    page.wait_for_function("() => document.fullscreenElement?.classList.contains('stage')")
+    page.evaluate("document.exitFullscreen()")
+
+
+def test_two_fingers_zoom_the_picture(browser, server, made):
+    context = new_context(browser, base_url=server.url, has_touch=True, viewport={"width": 390, "height": 800})
+    page = context.new_page()
+    page.goto(made.pages["light"])
+    made.wait_for_content(page, "light")
+    page.locator("canvas.picture").evaluate("""(canvas) => {
+      const { left, top, width, height } = canvas.getBoundingClientRect();
+      canvas.setPointerCapture = () => {};
+      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
+        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
+      send("pointerdown", 11, -20); send("pointerdown", 12, 20);
+      send("pointermove", 11, -40); send("pointermove", 12, 40);
+    }""")
+    page.wait_for_function("() => location.hash.includes('zoom=2')")
+    context.close()
+
+
+def test_a_video_is_recorded_by_the_browser(page, made):
+    page.goto(made.pages["light"])
+    made.wait_for_content(page, "light")
+    before = page.evaluate("relit.state().light.direction")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save a video").click()
+    assert download.value.suggested_filename == "lambert.webm"
+    assert download.value.path().read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
+    assert np.allclose(page.evaluate("relit.state().light.direction"), before, atol=0.01)  # once around
+
+
+@pytest.mark.parametrize("shown", ["compare", "photographs", "maps"])
+def test_each_mode_has_no_serious_violation_and_fits_a_phone(browser, server, made, shown):
+    page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()
+    page.goto(f"{made.pages['object']}#mode={shown}")
+    page.locator(f"[data-shows={shown}] canvas").first.wait_for()
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        page.wait_for_function("(width) => document.documentElement.scrollWidth <= width", arg=width)
+    assert violations_in_both_schemes(page) == []
+    page.close()
