@@ -1,4 +1,4 @@
-"""Pages come alive whatever happens to them: Back, Forward, reload, a second tab, a lost network, a server that is killed and started again."""
+"""Pages come alive whatever happens to them: Back, Forward, reload, a second tab, a lost network, a killed server."""
 
 import os
 import random
@@ -9,8 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
 from tests.service.server.api.job_calls import admitted
+from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
 from tests.service.server_process import Server, serving
 
 pytestmark = pytest.mark.long
@@ -18,7 +18,9 @@ pytestmark = pytest.mark.long
 STEPS = 40
 STARTS = (13, 27)
 """Steps at which the server is killed and started again: starting takes seconds, so that chance does not choose them."""
-CONTENT = {"light": "canvas.picture[data-ready]", "maps": "canvas.map", "capture": "#frames canvas", "job": "#stages tbody tr",
+ACTIONS = ("go", "go", "back", "back", "forward", "reload", "tab", "offline", "hasty")
+CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map",
+           "capture": "#frames canvas", "job": "#stages tbody tr",
            "jobs": "#jobs tbody a", "captures": "#captures tbody a"}
 
 
@@ -84,7 +86,7 @@ def test_no_page_is_ever_dead(browser, own, seed):
     go("light")
     for step in range(STEPS):
         wait_alive(page, visited[at])
-        action = "restart" if step in STARTS else chance.choice(["go", "go", "back", "back", "forward", "reload", "tab", "offline", "hasty"])
+        action = "restart" if step in STARTS else chance.choice(ACTIONS)
         print(step, action, visited[at])
         if action == "back" and at > 0:
             at -= 1
