@@ -25,7 +25,7 @@ GRID = 5
 sphere."""
 REACH = 0.85
 """Directions further from the view axis, in the corners of the grid, are brought to this distance from it."""
-FIRST_LIGHT = (0.45, 0.5, 0.74)
+FIRST_LIGHT = np.array([0.45, 0.5, 0.74])
 """Direction of the light of the picture: above right of the camera, as on the page that relights."""
 WHITE_PERCENTILE = 99.0
 MAT = 0x2B / 255
@@ -57,7 +57,8 @@ class RelitCard:
         pictures = np.matmul(np.matmul(self._weights, matrix), images)  # [tiles, 3, pictures, side²]
         planes = put_together(pictures.reshape(len(pictures), len(self._sums), -1), row, side, self._cols)
         columns = np.add.reduceat(planes, np.arange(0, self._cols, self._step), axis=2)
-        np.add.at(self._sums, (slice(None), np.arange(row.rows.start, row.rows.stop) // self._step), columns)
+        for place, sums in zip(range(row.rows.start, row.rows.stop), columns.swapaxes(0, 1), strict=True):
+            self._sums[:, place // self._step] += sums
 
     def write(self, folder: Path, coverage: np.ndarray, space: str) -> None:
         """Write both pictures; `coverage` [rows, cols] is that of the coefficient images, `space` their colour space."""

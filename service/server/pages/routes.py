@@ -6,6 +6,7 @@ Pages load nothing from another server: the content security policy allows scrip
 import base64
 import hashlib
 import json
+from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -159,6 +160,8 @@ def wants_page(request: Request) -> bool:
 
 def fault_page(request: Request, status: int, title: str, detail: str) -> Response:
     """Return a page that says in one sentence why there is nothing else to show."""
+    if detail == HTTPStatus.NOT_FOUND.phrase:  # of the router, which knows no more
+        title, detail = "There is nothing here", f"no page has the address {request.url.path}"
     sentence = f"{detail[:1].upper()}{detail[1:]}".rstrip(".") + "."
     page = _page(request, "fault.html", title=title, sentence=sentence, status=status, request_id=getattr(request.state, "request_id", ""))
     page.status_code = status

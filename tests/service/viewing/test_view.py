@@ -65,7 +65,7 @@ def test_the_card_shows_the_object_lit_from_where_the_grid_says(relit, tmp_path)
     assert relit("view", ROOT / "samples" / "lambert", "--cache", tmp_path / "cache", "--out", tmp_path).code == 0
     picture, sheet = (oiio.ImageBuf(str(tmp_path / name)).get_pixels(oiio.UINT8) for name in ("card.jpg", "card_lights.jpg"))
     assert picture.shape == (128, 128, 3) and sheet.shape == (800, 800, 3)
-    assert np.abs(picture[0].astype(int) - 0x2B).max() <= 3  # the grey behind the object, within what JPEG loses
+    assert np.abs(picture[:16, :16].astype(int) - 0x2B).max() <= 1  # blocks of the JPEG that hold the grey behind the object alone
     cells = sheet.reshape(5, 160, 5, 160, 3).swapaxes(1, 2).astype(float)
     for one, other in ((cells[2, 0], cells[2, 4]), (cells[0, 2].swapaxes(0, 1), cells[4, 2].swapaxes(0, 1))):  # left and right, up and down
         assert one[:, :80].mean() > 1.2 * other[:, :80].mean() and other[:, 80:].mean() > 1.2 * one[:, 80:].mean()
