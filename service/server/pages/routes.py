@@ -126,7 +126,7 @@ async def light(request: Request, capture: CaptureId) -> Response:
 @router.get("/object/{capture}")
 async def object_page(request: Request, capture: CaptureId) -> Response:
     """Show what was captured and what was made of it, as modes of one view."""
-    return _page(request, "object.html", identifier=capture)
+    return _page(request, "object.html", identifier=capture, next_steps=NEXT_STEPS)
 
 
 @router.get("/maps/{job}")

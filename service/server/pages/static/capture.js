@@ -1,17 +1,17 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read, submitJob } from "./api.js";
+import { attempt, listing, load, read } from "./api.js";
 import { byId, element, factText, show, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
+import { heldBy, offerSteps } from "./object/next_steps.js";
 import { mountPhotographs } from "./object/photographs.js";
 import { removeLater } from "./object/removal.js";
 import { chosenStep } from "./time_steps.js";
 import { ViewFile } from "./view/view_file.js";
 import { openView } from "./view_jobs.js";
 
-const MOST_STEPS = 2; // beside lighting it
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
 
@@ -40,19 +40,11 @@ function present(capture) {
 
 /** Show what can be done with a capture that holds this: what it is made for as buttons, the same with options, and the rest behind More. */
 function offer(facts) {
-  const holds = facts.lit_by ?? ["shots", "tiles"].filter((name) => name in facts);
-  const first = [...byId("next").querySelectorAll("[data-kind]")].filter(({ dataset }) => holds.includes(dataset.holds)).slice(0, MOST_STEPS);
-  for (const button of first) {
-    show(button, true);
-    button.addEventListener("click", () => attempt(async () => {
-      button.disabled = true;
-      const job = await submitJob({ kind: button.dataset.kind, capture: identifier }).finally(() => { button.disabled = false; });
-      location.assign(`/jobs/${job.id}`);
-    }));
-  }
+  const holds = heldBy(facts);
+  const first = offerSteps(byId("next"), facts, identifier);
   for (const box of byId("more").querySelectorAll(".job-form")) {
     if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
-    else if (first.some(({ dataset }) => dataset.kind === box.querySelector("form").dataset.kind)) byId("first").append(box);
+    else if (first.includes(box.querySelector("form").dataset.kind)) byId("first").append(box);
   }
   show(byId("work"), true);
 }

@@ -9,9 +9,9 @@ import { listing } from "../api.js";
 
 const VIEWED = ["usdz", "glb"]; // formats that the page of assets shows
 
-/** Return the address of the page of a capture. */
-export function pageOf(capture) {
-  return `/captures/${capture}`;
+/** Return the address of the page of a capture: of one that is not ready, the page that says why. */
+export function pageOf({ id, state }) {
+  return state === "ready" ? `/object/${id}` : `/captures/${id}`;
 }
 
 /** Yield the items of a list of the API, page by page. */
@@ -31,7 +31,7 @@ export function intakeItem(list, intake) {
     facts.resolution === undefined ? null : facts.resolution.join(" × ")];
   return { id: intake.id, kind: list === "environments" ? "environment" : steps > 0 ? "sequence" : "capture", name: intake.name, state: intake.state,
     problem: intake.problem, size: facts.proposal?.summary ?? parts.filter(Boolean).join(" · "), created: intake.created_at,
-    href: list === "captures" ? pageOf(intake.id) : null, source: intake };
+    href: list === "captures" ? pageOf(intake) : null, source: intake };
 }
 
 /** Return the item of a job that has made an asset. */

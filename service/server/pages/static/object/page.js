@@ -8,12 +8,14 @@ import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
 import { mountAsset } from "./asset.js";
 import { mountLight } from "./light.js";
+import { offerSteps } from "./next_steps.js";
 import { mountPhotographs } from "./photographs.js";
 import { removeLater } from "./removal.js";
 import { mountResults, viewOf, warningsOf } from "./results.js";
 
 const identifier = byId("main").dataset.identifier;
 const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
+const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
 const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json)$/;
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
@@ -104,6 +106,7 @@ await load(async () => {
   const step = await chosenStep(identifier);
   const [view, jobs] = await Promise.all([openView(identifier, null, step).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
   const modes = modesOf(view, step, jobs);
+  offerSteps(byId("next"), capture.facts ?? {}, identifier, jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]));
   const wanted = { mode: "" };
   address.read(wanted);
   byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name, "aria-pressed": "false",
