@@ -18,9 +18,10 @@ from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.journal import Journal
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
-from service.acquisition.plans.shots import TRACKING, Shot, shots_of
+from service.acquisition.plans.shots import Shot, shots_of
 from service.acquisition.projector import Projector
 from service.acquisition.projector_response import PatternImages
+from service.acquisition.resuming import compared_shot, refuse_other_picture, refuse_other_settings, settings_of_files
 from service.errors import RequestError
 from service.play.play import ended_by_signals
 from service.reporting.progress import Progress, Timings
@@ -127,6 +128,8 @@ class Acquisition:
                     receiving.callback(receiver.stop)
                     self._receivers.append(receiver)
                 self._recall()
+                if not self.journal.taken:
+                    self.journal.camera(self._camera.settings)
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
                 self._open_projector()
                 self._adopt()
@@ -207,9 +210,9 @@ class Acquisition:
                 self.faults.pop(key, None)
 
     def _compare(self, lights: Lights, stopping: threading.Event) -> None:
-        """Take the last tracking picture of an earlier run again, or else its last picture, and refuse to go on if something has moved."""
-        there = [shot for shot in self.shots if shot.key in self.journal.taken]
-        shot = next((shot for shot in reversed(there) if shot.name.endswith(TRACKING)), there[-1])
+        """Take a picture of an earlier run again, and refuse to go on if something is not as it was."""
+        refuse_other_settings(self._request.out, self.journal.settings, self._camera.settings, self.shots)
+        shot = compared_shot([shot for shot in self.shots if shot.key in self.journal.taken], self.judge, self.rig)
         self._light(shot, lights)
         if stopping.wait(self.plan.settle_s):
             return
@@ -218,11 +221,8 @@ class Acquisition:
         except NoPictureError as error:
             raise RequestError(f"the camera does not answer: {error}") from error
         self.journal.picture(shot.key, "compared", {"source": picture.path.name})
-        earlier = images.read_pixels(self._request.out / self.journal.taken[shot.key]["file"])
-        fault = self.judge.compare(shot, earlier, picture.pixels, *self._encoding(picture.path))
-        if fault is not None:
-            raise RequestError(f"{self._request.out}: {fault.sentence} since {shot.key} was taken: put it back, or give another folder to "
-                               "--out and begin again")
+        refuse_other_picture(shot, self.judge, self.rig, self._request.out, self._request.out / self.journal.taken[shot.key]["file"],
+                             picture, *self._encoding(picture.path))
 
     def _take(self, shot: Shot, lights: Lights, stopping: threading.Event) -> None:
         """Take the picture of a shot, again where it has a fault, and keep the last one."""
@@ -328,10 +328,10 @@ class Acquisition:
         missing = [shot.key for shot in self.shots if shot.key not in self.journal.taken]
         own = {"median": round(1e3 * float(np.median(self._own)), 1)} if self._own else {}
         inputs = {} if (rig := self._request.rig) is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
-        text = report(self._request, inputs=inputs, rig=self.rig.name, camera_settings=settings, shots=len(self.shots),
-                      pictures=len(self.journal.taken), missing=missing, faults=[fault._asdict() for fault in faults],
-                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own, projector_response=self.patterns.entry(),
-                      seconds=self._timings.close())
+        text = report(self._request, inputs=inputs, rig=self.rig.name, shots=len(self.shots), pictures=len(self.journal.taken),
+                      camera_settings=settings or settings_of_files(self._request.out, self.journal.taken), missing=missing,
+                      faults=[fault._asdict() for fault in faults], retaken=[fault._asdict() for fault in self.retaken], own_ms=own,
+                      projector_response=self.patterns.entry(), seconds=self._timings.close())
         write_text(self._request.out / REPORT_FILE, text)
 
 
