@@ -50,9 +50,10 @@ class Journal:
         self._append({**self._head, "files": list(files), "time": time.time()})
 
     def camera(self, settings: Mapping[str, str]) -> None:
-        """Record the settings that the camera tells."""
-        self._append({"event": "camera", "settings": dict(settings), "time": time.time()})
-        self.settings = settings
+        """Record the settings that the camera tells, if no picture was taken under earlier ones."""
+        if not self.taken:
+            self._append({"event": "camera", "settings": dict(settings), "time": time.time()})
+            self.settings = settings
 
     def release(self, key: str, attempt: int) -> None:
         """Record that the camera is about to be released for a shot."""

@@ -21,10 +21,9 @@ SAME_LIGHT = 0.06
 """The part by which the light of a picture may differ when it is taken again: half of a sixth of a stop, the finest step of lenses."""
 SHADE_PART = 0.05
 """Pixels below this part of the brightest thousandth are left out, as ambient light may be all that they have."""
-PUT_BACK = "set it back, or give another folder to --out and begin again"
 
 
-def refuse_other_settings(folder: Path, earlier: Mapping[str, str], now: Mapping[str, str], shots: Sequence[Shot] = ()) -> None:
+def refuse_other_settings(folder: Path, earlier: Mapping[str, str], now: Mapping[str, str], shots: Sequence[Shot]) -> None:
     """Refuse to go on where a camera tells another value of a setting than it told when the capture began.
 
     Args:
@@ -34,10 +33,10 @@ def refuse_other_settings(folder: Path, earlier: Mapping[str, str], now: Mapping
     Raises:
         RequestError: names the setting and both values.
     """
-    timed = any(shot.exposure_s is not None for shot in shots)
-    for name, value in earlier.items():
-        if now.get(name, value) != value and not (timed and name in EXPOSURE_TIMES):
-            raise RequestError(f"{folder}: was begun with {name} {value}, and the camera has {now[name]} now: {PUT_BACK}")
+    timed = EXPOSURE_TIMES if any(shot.exposure_s is not None for shot in shots) else ()
+    change = _other_setting({name: value for name, value in earlier.items() if name not in timed}, now)
+    if change is not None:
+        raise RequestError(f"{folder}: {change}, or give another folder to --out and begin again")
 
 
 def recorded_settings(path: Path) -> dict[str, str]:
@@ -62,31 +61,33 @@ def compared_shot(taken: Sequence[Shot], judge: Judge, rig: Rig) -> Shot:
     return taken[-1] if _by_hand(taken[-1], rig) else max(taken[since:], key=judge.light)
 
 
-def refuse_other_picture(shot: Shot, judge: Judge, rig: Rig, folder: Path, earlier: Path, picture: Picture, space: str, full_scale: float
-                         ) -> None:
-    """Refuse to go on where a shot that is taken again shows other settings, something that has moved, or other light.
+def change_since(earlier: Path, picture: Picture, shot: Shot, judge: Judge, rig: Rig, space: str, full_scale: float) -> str | None:
+    """Return what has changed since a shot was taken, settings, place or light, and what to do; None: nothing.
 
     Args:
-        folder: of the capture, for messages.
         earlier: the file of the picture that the shot has.
-        picture: the one that has just been taken.
-        space: their colour space.
+        picture: the shot, taken again.
+        space: the colour space of both.
         full_scale: the recorded value from which readings are clipped.
-
-    Raises:
-        RequestError: says what has changed.
     """
     before = images.read_pixels(earlier)
-    refuse_other_settings(folder, _told(earlier, before), _told(picture.path, picture.pixels))
+    if (change := _other_setting(_told(earlier, before), _told(picture.path, picture.pixels))) is not None:
+        return change
     if (fault := judge.compare(shot, before, picture.pixels, space, full_scale)) is not None:
-        raise RequestError(f"{folder}: {fault.sentence} since {shot.key} was taken: put it back, or give another folder to --out and begin "
-                           "again")
+        return f"{fault.sentence} since {shot.key} was taken: put it back"
     if _by_hand(shot, rig) or not (shot.projected or shot.levels.any()):
-        return
+        return None
     factor = _light_factor(before, picture.pixels, space, full_scale)
-    if abs(factor - 1) > SAME_LIGHT:
-        change = f"brighter by {100 * (factor - 1):.0f} %" if factor > 1 else f"darker by {100 * (1 - factor):.0f} %"
-        raise RequestError(f"{folder}: {shot.key}, taken again, is {change}: check the settings of the camera and the lamps: {PUT_BACK}")
+    if abs(factor - 1) <= SAME_LIGHT:
+        return None
+    change = f"brighter by {100 * (factor - 1):.0f} %" if factor > 1 else f"darker by {100 * (1 - factor):.0f} %"
+    return f"{shot.key}, taken again, is {change}: set the camera and the lamps as they were"
+
+
+def _other_setting(earlier: Mapping[str, str], now: Mapping[str, str]) -> str | None:
+    """Return the first setting that has another value, and what to do; None: there is none."""
+    name = next((name for name, value in earlier.items() if now.get(name, value) != value), None)
+    return None if name is None else f"was begun with {name} {earlier[name]}, and the camera has {now[name]} now: set it back"
 
 
 def _told(path: Path, pixels: np.ndarray) -> dict[str, str]:
