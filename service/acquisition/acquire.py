@@ -6,21 +6,22 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup, open_camera
 from service.acquisition.capture_files import CaptureFiles
-from service.acquisition.checks.fault import Fault, FaultKind
+from service.acquisition.checks.fault import Fault, FaultKind, said
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.journal import Journal
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
-from service.acquisition.plans.shots import TRACKING, Shot, shots_of
+from service.acquisition.plans.shots import Shot, shots_of
 from service.acquisition.projector import Projector
 from service.acquisition.projector_response import PatternImages
+from service.acquisition.resuming import change_since, compared_shot, refuse_other_settings, settings_of_files
 from service.errors import RequestError
 from service.play.play import ended_by_signals
 from service.reporting.progress import Progress, Timings
@@ -127,6 +128,7 @@ class Acquisition:
                     receiving.callback(receiver.stop)
                     self._receivers.append(receiver)
                 self._recall()
+                self.journal.camera(self._camera.settings)
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
                 self._open_projector()
                 self._adopt()
@@ -189,7 +191,7 @@ class Acquisition:
             return
         picture = Picture(left[0], images.read_pixels(left[0]))
         if faults := self.judge.judge(shot, picture.pixels, *self._encoding(picture.path)):
-            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, released["attempt"]), **_said(faults)})
+            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, released["attempt"]), **said(faults)})
         else:
             self._accept(shot, picture, [])
 
@@ -207,22 +209,24 @@ class Acquisition:
                 self.faults.pop(key, None)
 
     def _compare(self, lights: Lights, stopping: threading.Event) -> None:
-        """Take the last tracking picture of an earlier run again, or else its last picture, and refuse to go on if something has moved."""
-        there = [shot for shot in self.shots if shot.key in self.journal.taken]
-        shot = next((shot for shot in reversed(there) if shot.name.endswith(TRACKING)), there[-1])
+        """Take a picture of an earlier run again, and refuse to go on if something is not as it was."""
+        refuse_other_settings(self._request.out, self.journal.settings, self._camera.settings, self.shots)
+        shot = compared_shot([shot for shot in self.shots if shot.key in self.journal.taken], self.judge, self.rig)
         self._light(shot, lights)
         if stopping.wait(self.plan.settle_s):
             return
-        try:
-            picture = self._camera.take(shot.exposure_s)
-        except NoPictureError as error:
-            raise RequestError(f"the camera does not answer: {error}") from error
-        self.journal.picture(shot.key, "compared", {"source": picture.path.name})
-        earlier = images.read_pixels(self._request.out / self.journal.taken[shot.key]["file"])
-        fault = self.judge.compare(shot, earlier, picture.pixels, *self._encoding(picture.path))
-        if fault is not None:
-            raise RequestError(f"{self._request.out}: {fault.sentence} since {shot.key} was taken: put it back, or give another folder to "
-                               "--out and begin again")
+        for owed in (1, 0):  # the first to come may be a picture for which a run that was killed had released the camera
+            try:
+                picture = self._camera.take(shot.exposure_s)
+            except NoPictureError as error:
+                raise RequestError(f"the camera does not answer: {error}") from error
+            self.journal.picture(shot.key, "compared", {"source": picture.path.name})
+            change = change_since(self._request.out / self.journal.taken[shot.key]["file"], picture, shot, self.judge, self.rig,
+                                  *self._encoding(picture.path))
+            if change is None:
+                return
+            self._await(shot, owed, stopping)
+        raise RequestError(f"{self._request.out}: {change}, or give another folder to --out and begin again")
 
     def _take(self, shot: Shot, lights: Lights, stopping: threading.Event) -> None:
         """Take the picture of a shot, again where it has a fault, and keep the last one."""
@@ -253,7 +257,7 @@ class Acquisition:
             faults = self.judge.judge(shot, picture.pixels, *self._encoding(picture.path))
             if faults and attempt <= self._request.retakes:
                 self.retaken += faults
-                self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
+                self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **said(faults)})
                 continue
             self._refuse_darkness(shot, picture, faults, attempt)
             self._accept(shot, picture, faults)
@@ -266,7 +270,7 @@ class Acquisition:
             return
         lamps = {each.key for each in self.shots if each.lamp is not None and each.key in self.journal.taken}
         if lamps and all(any(fault.kind is FaultKind.UNLIT for fault in self.faults.get(key, ())) for key in lamps):
-            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **_said(faults)})
+            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, attempt), **said(faults)})
             raise RequestError(f"no lamp has lit yet: {ADVICE} Then run the same command again, with --retake {min(lamps)}")
 
     def _await(self, shot: Shot, owed: int, stopping: threading.Event) -> None:
@@ -280,7 +284,7 @@ class Acquisition:
     def _notice(self, fault: Fault, path: Path) -> None:
         """Record a picture that no shot has."""
         self.retaken.append(fault)
-        self.journal.picture(fault.shot, "unasked", {"source": path.name, **_said([fault])})
+        self.journal.picture(fault.shot, "unasked", {"source": path.name, **said([fault])})
 
     def _encoding(self, path: Path) -> tuple[str, float]:
         """Return the colour space of a picture, and the value from which its readings are clipped."""
@@ -289,7 +293,7 @@ class Acquisition:
     def _accept(self, shot: Shot, picture: Picture, faults: list[Fault]) -> None:
         self.judge.accept(shot, picture.pixels, *self._encoding(picture.path), faults)
         self.faults[shot.key] = faults
-        self.journal.picture(shot.key, "taken", {**self._files.keep(shot, picture.path), **_said(faults)})
+        self.journal.picture(shot.key, "taken", {**self._files.keep(shot, picture.path), **said(faults)})
         self._files.write_manifest(shot.folder, self.journal.taken)
         self._send(shot, new=True)
 
@@ -306,7 +310,7 @@ class Acquisition:
             if self.faults.get(shot.key) or stopping.is_set():
                 continue
             self.retaken.append(fault)
-            self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line, 0), **_said([fault])})
+            self.journal.picture(shot.key, "rejected", {**self._files.withdraw(shot, line, 0), **said([fault])})
             self.judge.forget(shot)
             self._take(shot._replace(prompt=None), lights, stopping)
         self.faults = {key: found for key, found in self.faults.items() if key not in self.journal.taken}  # no picture came
@@ -328,10 +332,10 @@ class Acquisition:
         missing = [shot.key for shot in self.shots if shot.key not in self.journal.taken]
         own = {"median": round(1e3 * float(np.median(self._own)), 1)} if self._own else {}
         inputs = {} if (rig := self._request.rig) is None else {"rig": {"path": str(rig), "content": fingerprint.digest(rig)}}
-        text = report(self._request, inputs=inputs, rig=self.rig.name, camera_settings=settings, shots=len(self.shots),
-                      pictures=len(self.journal.taken), missing=missing, faults=[fault._asdict() for fault in faults],
-                      retaken=[fault._asdict() for fault in self.retaken], own_ms=own, projector_response=self.patterns.entry(),
-                      seconds=self._timings.close())
+        text = report(self._request, inputs=inputs, rig=self.rig.name, shots=len(self.shots), pictures=len(self.journal.taken),
+                      camera_settings=settings or settings_of_files(self._request.out, self.journal.taken), missing=missing,
+                      faults=[fault._asdict() for fault in faults], retaken=[fault._asdict() for fault in self.retaken], own_ms=own,
+                      projector_response=self.patterns.entry(), seconds=self._timings.close())
         write_text(self._request.out / REPORT_FILE, text)
 
 
@@ -344,7 +348,3 @@ def acquire(request: AcquireRequest, ask: Ask, tell: Ask = print, progress: Prog
 def refuse_to_ask(what: str) -> None:
     """Refuse what a person would have to do, where nobody can be asked."""
     raise RequestError(f"somebody must act: {what}: start the capture from a terminal")
-
-
-def _said(faults: list[Fault]) -> Mapping[str, Any]:
-    return {"faults": [[str(fault.kind), fault.sentence] for fault in faults]} if faults else {}

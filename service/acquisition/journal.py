@@ -36,6 +36,8 @@ class Journal:
         """The line of the last release whose picture is not recorded."""
         self.known: set[str] | None = None
         """The names of files that were there before the capture began, or that the camera wrote for it; None: it has just begun."""
+        self.settings: Mapping[str, str] = {}
+        """The settings that the camera told when the first picture was to be taken, by name."""
         self._head = {"schema": JOURNAL_SCHEMA, **head}
         with storage("read", self._path):
             if self._path.exists() and self._path.stat().st_size > 0:
@@ -46,6 +48,12 @@ class Journal:
         with storage("write", self._path):
             self._path.parent.mkdir(parents=True, exist_ok=True)
         self._append({**self._head, "files": list(files), "time": time.time()})
+
+    def camera(self, settings: Mapping[str, str]) -> None:
+        """Record the settings that the camera tells, if no picture was taken under earlier ones."""
+        if not self.taken:
+            self._append({"event": "camera", "settings": dict(settings), "time": time.time()})
+            self.settings = settings
 
     def release(self, key: str, attempt: int) -> None:
         """Record that the camera is about to be released for a shot."""
@@ -87,6 +95,8 @@ class Journal:
                     self.known = set(line["files"])
                 elif line["event"] == "released":
                     self.released = line
+                elif line["event"] == "camera":
+                    self.settings = dict(line["settings"])
                 else:
                     self._take(line)
                     self.released = None

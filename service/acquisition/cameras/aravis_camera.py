@@ -5,6 +5,7 @@ functions that are needed are called by ctypes, with the signatures of arvcamera
 """
 
 import ctypes
+from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint32, c_uint64, c_void_p
 from ctypes.util import find_library
 from functools import cache
@@ -30,7 +31,7 @@ FORMATS: dict[str, tuple[int, int | None]] = {
 """Pixel formats, the best first: the bits of a reading, and OpenCV's code where it is one of a mosaic."""
 AUTOMATIC = ("ExposureAuto", "GainAuto", "BalanceWhiteAuto")
 """Features of GenICam (SFNC) that must be off."""
-RECORDED = ("DeviceVendorName", "DeviceModelName", "PixelFormat")
+RECORDED = ("DeviceVendorName", "DeviceModelName", "DeviceSerialNumber", "PixelFormat")
 EXPOSURE_PART = 0.02
 """The largest part by which the exposure time that a camera takes may differ from the one that is asked for."""
 FULL = 65535
@@ -70,8 +71,11 @@ class AravisCamera:
 
     @property
     def settings(self) -> dict[str, str]:
-        """Return the settings that the camera tells."""
-        found = {name: self._text(name) for name in RECORDED if self._has(name)}
+        """Return the settings that the camera tells; of one that is lost none."""
+        found = {}
+        with suppress(AravisError):
+            found = {name: self._text(name) for name in RECORDED if self._has(name)}
+            found["Gain"] = f"{_call('arv_camera_get_gain', c_double, [c_void_p], self._camera):g}"
         time = self.exposure_s
         return found | ({} if time is None else {"ExposureTime": f"{time:g} s"})
 

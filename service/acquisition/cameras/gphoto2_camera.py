@@ -13,8 +13,8 @@ from service.errors import RequestError
 from stage.files import replacing
 from stage.formats import images
 
-RECORDED = ("cameramodel", "shutterspeed", "f-number", "aperture", "iso", "whitebalance", "imageformat", "imagequality", "imagesize",
-            "expprogram", "autoexposuremode", "focusmode")
+RECORDED = ("cameramodel", "serialnumber", "shutterspeed", "f-number", "aperture", "iso", "whitebalance", "imageformat", "imagequality",
+            "imagesize", "expprogram", "autoexposuremode", "focusmode")
 """The settings that decide what a picture looks like, under the names that makers give them in libgphoto2."""
 BY_HAND = {"expprogram": ("m", "manual"), "autoexposuremode": ("m", "manual")}
 """The settings of the exposure mode, and their values without automatic."""

@@ -1,5 +1,6 @@
 """The faults that a picture can have."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from service.requests.base.base import Choice
@@ -28,3 +29,8 @@ class Fault(NamedTuple):
     kind: FaultKind
     sentence: str
     """What was found, with its figures."""
+
+
+def said(faults: Sequence[Fault]) -> dict[str, list[list[str]]]:
+    """Return what a line of the journal says of the faults of a picture."""
+    return {"faults": [[str(fault.kind), fault.sentence] for fault in faults]} if faults else {}

@@ -112,6 +112,10 @@ class Judge:
         """Take note that a shot has no picture any more."""
         self._seen.pop(shot.key, None)
 
+    def light(self, shot: Shot) -> float:
+        """Return the mean reading of the picture that a shot has, scene-linear."""
+        return float(self._seen[shot.key].sample.blocks.mean())
+
     def compare(self, shot: Shot, earlier: np.ndarray, pixels: np.ndarray, space: str, full_scale: float) -> Fault | None:
         """Return what moved between two pictures of one shot, or None."""
         before, after = (self._look(shot, picture, space, full_scale) for picture in (earlier, pixels))

@@ -23,7 +23,7 @@ from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
 from stage.errors import StageError
-from tests.scenes.captures import make_scene, write_exr
+from tests.scenes.captures import make_scene, rgb, write_exr
 from tests.service.full_disk import files_of_at_most
 from tests.service.waiting import until
 
@@ -116,15 +116,15 @@ def controller(folder: Path, stage: Stage) -> Iterator[tuple[Path, str]]:
             server.shutdown()
 
 
-def check(folder: Path, stage: Stage, taken_twice: int = 0) -> None:
-    """Compare each frame with the light that its entry names, and each file with the one that came."""
+def check(folder: Path, stage: Stage, taken_twice: int = 0, rounds: int = 1) -> None:
+    """Compare each frame with the light that its entry names, and each file with the one that came, of so many rounds of the lamps."""
     capture, lines = Capture.open(folder), [json.loads(line) for line in (folder / "acquisition.jsonl").read_text().splitlines()]
     sources = {line["file"]: line["source"] for line in lines if line.get("event") == "taken"}
-    assert len(capture.manifest.frames) == LAMPS + 1 and len(sources) == LAMPS + 1
+    assert len(capture.manifest.frames) == len(sources) == rounds * LAMPS + 1
     for frame in capture.manifest.frames:
         assert (folder / frame.image).read_bytes() == (stage.folder / sources[frame.image]).read_bytes()
     lights = [frame.light.direction for frame in capture.manifest.frames if frame.light.type == "distant"]
-    assert np.allclose(lights, stage.scene.directions, atol=1e-6)
+    assert np.allclose(lights, np.tile(stage.scene.directions, (rounds, 1)), atol=1e-6)
     pictures = [line["shot"] for line in lines if line.get("event") == "taken"]
     assert len(pictures) == len(set(pictures)) + taken_twice
 
@@ -284,24 +284,29 @@ def test_a_picture_that_is_there_is_taken_again_on_request(tmp_path, stage):
 
 @pytest.mark.long
 def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
-    stage = Stage(tmp_path / "watch")
+    stage, rounds, most = Stage(tmp_path / "watch"), 14, 3
+    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, *[{"take": "olat"}] * rounds]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
     with controller(tmp_path, stage) as (rig, url):
         given = request(tmp_path, stage, rig)
         shoot = f"{sys.executable} -S -c \"import urllib.request as u; u.urlopen('{url}/shoot')\""
         command = [sys.executable, "-m", "service.cli.main", "capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out",
                    str(given.out), "--trigger", shoot, "--timeout", "10"]
-        random, kills = np.random.default_rng(2), 0
+        random = np.random.default_rng(2)
         for _ in range(10):
-            before = stage.released
+            wanted = stage.released + int(random.integers(1, most + 1))  # the first shows that nothing moved
             program = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
-            until(lambda program=program, before=before: stage.released > before or program.poll() is not None, "no picture", every_s=0.001)
-            time.sleep(random.uniform(0, 0.4))
-            kills += program.poll() is None
+            until(lambda program=program, wanted=wanted: stage.released >= wanted or program.poll() is not None, "no picture",
+                  every_s=0.001)
+            time.sleep(random.uniform(0, 0.1))
+            assert program.poll() is None, "the capture ended before it was killed"
             program.kill()
             program.wait()
         subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)
-    assert kills and stage.on == set()
-    check(tmp_path / "capture", stage)
+    assert stage.on == set()
+    check(tmp_path / "capture", stage, rounds=rounds)
+    seen = [rgb(path) for path in sorted((tmp_path / "capture").glob("*_light_*.exr"))]  # and each picture is that of its lamp
+    assert [np.abs(0.2 * stage.scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == rounds * list(range(LAMPS))
 
 
 def test_bad_input_is_refused_with_one_sentence(tmp_path, stage):
