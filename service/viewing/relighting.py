@@ -138,7 +138,7 @@ def _error(stack: Stack, matte: Matte, tiling: Tiling, step: int, basis: TiledBa
     left, whole, side = 0.0, 0.0, tiling.side
     factor = plane_means(matte.factor, step)
     across = -(-factor.shape[1] // side) * side
-    for row in tile_rows(stack, matte.factor, tiling, step, timings, "error"):
+    for row in tile_rows(stack, matte.factor, tiling, step, timings, "compare"):
         stored = np.zeros((*basis.images.shape[:2], side, across), dtype=np.float32)
         stored[:, :, : row.rows.stop - row.rows.start, : factor.shape[1]] = basis.images[:, :, row.rows]
         inside = np.zeros((side, across), dtype=bool)

@@ -96,8 +96,9 @@ def _lp(folder: Folder) -> Guess | None:
     if not files:
         return None
     path = folder.path / files[0]
-    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True, sure=True,
-                summary=lit(max(len(read_lines(path)) - 1, 0), "from {} directions", path))
+    others = () if len(files) == 1 else (f"{files[0]} is the list of the lights, and not {files[1]}",)
+    return made("images of RTI with a light list", f"it has {files[0]}", ["lp", path], folder.path, solve=True, sure=not others,
+                assumed=others, summary=lit(max(len(read_lines(path)) - 1, 0), "from {} directions", path))
 
 
 def _kinect(folder: Folder) -> Guess | None:
@@ -145,7 +146,7 @@ def _laser(folder: Folder) -> Guess | None:
         if table is None or chosen is None:
             continue
         form = ["--form", "zero"] if table.values.shape[1] == 4 else []
-        return made("images of a laser's stripe with its planes", f"{path} holds {len(table.values)} planes, as many as there are images",
+        return made("images of a laser's stripe with its planes", f"{path.name} holds {len(table.values)} planes, as many as there are images",
                      ["laser", folder.path, *camera, "--planes", path, *form, "--axes", "right,down,away", "--unit-m", "0.001", *chosen],
                      folder.path, solve=False, assumed=(
                          *unknown, "planes are in OpenCV's axes and in millimetres: the files do not say it",
@@ -173,7 +174,7 @@ def _near_lights(folder: Folder) -> Guess | None:
                        and set(CAMERA_MATRIX) & set(arrays_of(other))), None)
         words = ["near-lights", folder.path, "--lights", path, *(["--camera", camera] if camera else []), "--axes", "right,down,away",
                  "--unit-m", "0.001", *chosen]
-        return made("images under LEDs, as near_ps has them", f"{path} holds as many positions of lights as there are images", words,
+        return made("images under LEDs, as near_ps has them", f"{path.name} holds as many positions of lights as there are images", words,
                      folder.path, solve=True, sure=True, summary=lit(len(rig.positions), "by {} near lights", path),
                      assumed=("axes and millimetres are those of near_ps",
                                           "nothing says how far the object is: relit solve estimates it; --surface-z-m gives it",
@@ -193,7 +194,7 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
         chosen = [] if table.names is not None else group_of(folder, len(table.vectors))
         if chosen is None:
             continue
-        reason = f"{path} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
+        reason = f"{path.name} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
         ahead = table.vectors[:, 2].mean() > 0
         across, up = guess_images.followed(shown, table.vectors) if table.names is None and not chosen else (0.0, 0.0)
         mirrored = min(across, up) < -guess_images.FOLLOWED and max(across, up) > guess_images.FOLLOWED  # else an object may be hollow

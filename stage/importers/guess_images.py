@@ -59,7 +59,7 @@ def scanner(folder: Folder, shown: Pictures) -> Guess | None:
         if count not in codecs or not _shows(shown, codecs[count][0]):
             continue
         codec, axis = codecs[count]
-        return made("a scan of SLStudio", f"{path} is its calibration, and {count} images are those of {codec}",
+        return made("a scan of SLStudio", f"{path.name} is its calibration, and {count} images are those of {codec}",
                      ["scanner", folder.path, "--calibration", path, "--codec", codec, "--axis", axis, "--unit-m", "0.001"], folder.path,
                      solve=False, sure=True, assumed=("the calibration is in millimetres",))
     return None

@@ -8,7 +8,9 @@ import { JobsTable } from "./jobs_table.js";
 import { heldBy, offerSteps } from "./object/next_steps.js";
 import { mountPhotographs } from "./object/photographs.js";
 import { removeLater } from "./object/removal.js";
+import { proposalOf } from "./proposal.js";
 import { chosenStep } from "./time_steps.js";
+import { settled } from "./upload.js";
 import { ViewFile } from "./view/view_file.js";
 import { openView } from "./view_jobs.js";
 
@@ -23,18 +25,31 @@ async function open() {
     capture = await read(`/v1/captures/${identifier}`);
     present(capture);
   }
+  if (capture.state === "receiving" && capture.facts?.proposal !== undefined) await ask(capture);
   if (capture.state !== "ready") return;
   offer(capture.facts ?? {});
   enableForms(byId("work"), identifier);
   if ((capture.facts?.frames ?? 0) > 0) await load(look);
 }
 
+/** Ask how files are imported that were looked at. */
+async function ask(capture) {
+  const link = { signal: new AbortController().signal, lost: () => {} };
+  byId("state").after(await proposalOf(capture, async (importing) => {
+    const imported = await settled(importing, "captures", link);
+    if (imported.state === "ready") location.reload();
+    return imported;
+  }));
+}
+
 function present(capture) {
   document.title = `${capture.name} · Relit`;
   byId("name").textContent = capture.name;
-  byId("state").textContent = capture.problem ?? (capture.state === "receiving" ? "Not all files are here yet: drop its folder on the page of captures to continue." : capture.state);
+  const { proposal, ...known } = capture.facts ?? {};
+  const missing = proposal === undefined ? "Not all files are here yet: drop its folder on the page of captures to continue." : "Its files are here: say how they are imported.";
+  byId("state").textContent = capture.problem ?? (capture.state === "receiving" ? missing : capture.state);
   byId("state").classList.toggle("fault", capture.problem !== null);
-  const facts = Object.entries({ identifier: capture.id, ...(capture.registered ? { place: "a folder of the server" } : {}), ...capture.facts });
+  const facts = Object.entries({ identifier: capture.id, ...(capture.registered ? { place: "a folder of the server" } : {}), ...known });
   byId("facts").replaceChildren(...facts.flatMap(([name, value]) => [element("dt", {}, words(name)), element("dd", {}, factText(name, value))]));
 }
 
@@ -42,6 +57,7 @@ function present(capture) {
 function offer(facts) {
   const holds = heldBy(facts);
   const first = offerSteps(byId("next"), facts, identifier);
+  if (!holds.includes("light")) byId("next").querySelector("[data-kind]:not([hidden])")?.classList.remove("quiet"); // else lighting it comes first
   for (const box of byId("more").querySelectorAll(".job-form")) {
     if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
     else if (first.includes(box.querySelector("form").dataset.kind)) byId("first").append(box);

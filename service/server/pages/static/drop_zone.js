@@ -15,6 +15,7 @@ let changed = () => {};
 export function mountDropZone(onchange) {
   changed = onchange;
   const drop = byId("drop");
+  for (const kind of ["dragover", "drop"]) addEventListener(kind, (event) => event.preventDefault()); // else the browser opens a file that misses it
   drop.addEventListener("dragover", (event) => { event.preventDefault(); drop.classList.add("over"); });
   drop.addEventListener("dragleave", () => drop.classList.remove("over"));
   drop.addEventListener("drop", (event) => {
@@ -87,6 +88,7 @@ async function end(what, found, line, status, link) {
   if (what !== "captures") return;
   if (found.state !== "receiving") {
     status.append(" ", element("a", { href: `/captures/${found.id}` }, "Look at it"));
+    if (found.state === "ready") status.append(" · ", element("a", { href: `/object/${found.id}` }, "Open the object"));
     return;
   }
   line.append(await proposalOf(found, async (importing) => {

@@ -63,6 +63,9 @@ def test_what_is_needed_is_told_from_names_and_lengths():
     assert listed_below.files == {"dome.lp": "dome.lp", "jpg/a.jpg": "jpg/a.jpg", "jpg/b.jpg": "jpg/b.jpg"}
     with pytest.raises(ManifestError, match="holds 20000 folders with images, and 100 are taken"):
         needed_files({f"{number}/a.npy": 5 for number in range(20_000)})
+    photos_below = {f"owl/{number:03d}.png": 5 for number in range(5)}
+    table_above, = needed_files({"lights.npy": 700, **photos_below})
+    assert table_above.files == {**{path: path[4:] for path in photos_below}, "lights.npy": "lights.npy"}
     picture_above, = needed_files({"overview.png": 5, "photos/a.png": 4, "photos/b.png": 4, "photos/c.png": 4})
     assert picture_above.folder == "photos"
 

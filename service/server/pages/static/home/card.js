@@ -11,7 +11,12 @@ export function cardOf(item) {
     element("div", { class: "text" }, element("h3", {}, name),
       element("div", { class: "kind" }, element("span", {}, words(item.kind)), shortTime(item.created)),
       item.problem === null ? element("span", {}, item.size) : element("span", { class: "fault" }, item.problem),
-      item.state === "ready" ? null : element("span", { class: `state ${item.state}` }, item.state)));
+      item.state === "ready" ? null : element("span", { class: `state ${item.state}` }, waitsForChoice(item) ? "waits for your choice" : item.state)));
+}
+
+/** Return whether files were looked at, and somebody has to say how they are imported. */
+function waitsForChoice({ state, source }) {
+  return state === "receiving" && source.facts?.proposal !== undefined;
 }
 
 /** Put a picture into a card, in place of the drawing of its kind. */
