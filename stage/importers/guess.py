@@ -146,7 +146,8 @@ def _laser(folder: Folder) -> Guess | None:
         if table is None or chosen is None:
             continue
         form = ["--form", "zero"] if table.values.shape[1] == 4 else []
-        return made("images of a laser's stripe with its planes", f"{path.name} holds {len(table.values)} planes, as many as there are images",
+        return made("images of a laser's stripe with its planes",
+                    f"{path.name} holds {len(table.values)} planes, as many as there are images",
                      ["laser", folder.path, *camera, "--planes", path, *form, "--axes", "right,down,away", "--unit-m", "0.001", *chosen],
                      folder.path, solve=False, assumed=(
                          *unknown, "planes are in OpenCV's axes and in millimetres: the files do not say it",
@@ -194,7 +195,8 @@ def _table(folder: Folder, shown: Pictures) -> Guess | None:
         chosen = [] if table.names is not None else group_of(folder, len(table.vectors))
         if chosen is None:
             continue
-        reason = f"{path.name} holds {len(table.vectors)} lights" + (" with names of images" if table.names else ", as many as there are images")
+        told = " with names of images" if table.names else ", as many as there are images"
+        reason = f"{path.name} holds {len(table.vectors)} lights{told}"
         ahead = table.vectors[:, 2].mean() > 0
         across, up = guess_images.followed(shown, table.vectors) if table.names is None and not chosen else (0.0, 0.0)
         mirrored = min(across, up) < -guess_images.FOLLOWED and max(across, up) > guess_images.FOLLOWED  # else an object may be hollow

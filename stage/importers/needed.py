@@ -56,7 +56,7 @@ def needed_files(lengths: Mapping[str, int]) -> tuple[Needed, ...]:
              if folder and sum(_suffix(path) in images.SUFFIXES for path in paths) >= FEWEST_IMAGES}
     captures = [folder for folder, paths in inside.items()
                 if (len(paths) >= FEWEST_IMAGES or any(_suffix(path) not in images.SUFFIXES for path in paths))
-                and not (folder in above and all(_suffix(path) in ARRAYS for path in paths))] or list(inside)  # tables of lights of images below
+                and not (folder in above and all(_suffix(path) in ARRAYS for path in paths))] or list(inside)  # tables of images below
     if not captures:
         raise ManifestError(_nothing_found(shown))
     depth = min(map(_depth, captures))

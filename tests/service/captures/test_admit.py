@@ -21,7 +21,7 @@ def test_a_capture_is_described_without_its_pixels(tmp_path):
     write_capture(tmp_path, SCENE)
     recording = Recording()
     assert admit_capture(tmp_path, max_pixels=PIXELS, progress=recording) == {
-        "captures": 1, "frames": 4, "resolution": [16, 16], "color_space": "lin_rec709_scene", "name": "cap"}
+        "captures": 1, "frames": 4, "resolution": [16, 16], "color_space": "lin_rec709_scene", "name": "cap", "lit_by": ["light"]}
     assert recording.stages == [("check", 1, [1])]
     recheck_capture(tmp_path, max_pixels=PIXELS)
 
