@@ -136,7 +136,7 @@ def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness
             run(idle_harness, identifier)
     intakes.refuse(idle_harness.database, identifier, "its worker was lost too often")
     idle_harness.database.transact(lambda connection: intakes.begin_check(connection, identifier))
-    with pytest.raises(RequestError, match="capture.json"):
+    with pytest.raises(RequestError, match=r"capture\.json"):
         run(idle_harness, identifier, None)
     assert stored(idle_harness, identifier) == (names,) * 2
 
