@@ -56,8 +56,8 @@ def test_a_capture_that_an_earlier_build_has_checked_is_offered_what_its_light_a
 
     page.route(f"**/v1/captures/{solved.capture}", earlier)
     page.goto(solved.pages["capture"])
-    page.locator("#next button:visible").first.wait_for()
-    assert page.locator("#next button:visible").all_inner_texts() == ["Make an asset", "Solve normals and materials"]
+    page.locator("#next [data-kind]:visible").first.wait_for()
+    assert page.locator("#next [data-kind]:visible").all_inner_texts() == ["Make an asset", "Solve normals and materials"]
 
 
 def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made):
