@@ -119,6 +119,11 @@ def is_allowed(path: Path) -> bool:
     return not _enclosed or _folder_of(path) is not None
 
 
+def is_file(path: Path) -> bool:
+    """Return whether this process opens files at a path and there is one; where it opens none, nothing is looked for."""
+    return is_allowed(path) and path.is_file()
+
+
 @contextmanager
 def opened(path: str | Path) -> Iterator[Source]:
     """Open a file for reading.

@@ -14,6 +14,7 @@ from service.requests.imports.layouts import LAYOUTS, options_of_layout, request
 from stage.capture.manifest import read_manifest, write_manifest
 from stage.errors import ManifestError
 from stage.importers.guess import guess
+from stage.importers.video import is_video
 
 
 def propose(folder: Path) -> dict[str, Any]:
@@ -30,6 +31,7 @@ def propose(folder: Path) -> dict[str, Any]:
     if found.arguments[0] not in LAYOUTS:
         raise ManifestError(f"{folder}: looks like {found.layout}, which relit import {found.arguments[0]} takes, and the service does not")
     typed = taken_apart(found.arguments)
+    _require_no_video(typed.layout, typed.source)
     missing = unsettled(typed.layout, typed.options)
     known = options_of_layout(typed.layout)
     asked = [str(typed.options[name]) for name in missing if name in typed.options]  # such as FOCAL, which the form asks for
@@ -48,11 +50,19 @@ def import_chosen(folder: Path, choices: ImportChoices, assumed: tuple[str, ...]
         assumed: the sentences of the proposal that are still true.
         name: that the capture is to have.
     """
+    _require_no_video(choices.layout, folder / (choices.file or ""))
     known = options_of_layout(choices.layout)
     options = {key: folder / value if key in known and known[key].role is Role.INPUT and isinstance(value, str) else value
                for key, value in choices.options.items()}
     path = import_files(request_of(choices.layout, folder / (choices.file or ""), folder, options), assumed).path
     write_manifest(read_manifest(path).model_copy(update={"name": name}), path)
+
+
+def _require_no_video(layout: str, source: Path) -> None:
+    """Refuse a video, whose decoder sets no bounds to what a file asks of it."""
+    if is_video(source):
+        raise ManifestError(f"{source}: is a video: unpack it with relit import {layout if layout == 'phase' else 'gray'} on your machine, "
+                            "and upload the folder that it writes")
 
 
 def still_assumed(proposal: Mapping[str, Any], choices: ImportChoices) -> tuple[str, ...]:

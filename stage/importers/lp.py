@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stage import inputs
 from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
@@ -77,5 +78,5 @@ def _frame(path: Path, folder: Path, number: int, row: str) -> dict[str, Any]:
     # names often hold folders of the machine that made the file, while the images lie beside the file
     name = parts[0].replace("\\", "/")
     with storage("read", folder / name):  # a name that is too long is an error of the file system
-        relative = name if not name.startswith("/") and ":" not in name and (folder / name).is_file() else name.rsplit("/", 1)[-1]
+        relative = name if not name.startswith("/") and ":" not in name and inputs.is_file(folder / name) else name.rsplit("/", 1)[-1]
     return {"image": relative, "light": {"type": "distant", "direction": direction, "irradiance": [1.0, 1.0, 1.0]}}

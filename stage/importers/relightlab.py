@@ -120,7 +120,7 @@ def _project(path: Path, data: dict[str, Any]) -> tuple[Path, list[dict[str, Any
         folder = path.parent
     first = next((entry["filename"] for entry in entries), "")
     with storage("read", folder):
-        if not (folder / first).is_file() and (path.parent / first).is_file():
+        if not inputs.is_file(folder / first) and inputs.is_file(path.parent / first):
             folder = path.parent  # the project was moved together with its images
         if not folder.is_dir():
             raise ManifestError(f"{path}: folder: {given} is not there: put the project beside its images")

@@ -69,7 +69,10 @@ def begin_check(connection: sa.Connection, identifier: str) -> bool:
 
 
 def accept(database: Database, identifier: str, facts: dict[str, Any], allow: Callable[[sa.Connection], None] | None = None) -> None:
-    """Record the facts of a check that found nothing wrong; `allow` is called in the transaction, and raises if the project may not."""
+    """Record the facts of a check that found nothing wrong; `allow` is called in the transaction, and raises if the project may not.
+
+    Nothing happens to an intake that is not checking any more: another run of the same job has judged it.
+    """
     _judge(database, identifier, allow, state=READY, facts=facts, problem=None)
 
 
@@ -94,8 +97,8 @@ def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
 
 def _judge(database: Database, identifier: str, allow: Callable[[sa.Connection], None] | None, **values: Any) -> None:
     def work(connection: sa.Connection) -> None:
-        if allow is not None:
+        checking = intakes.c.id == identifier, intakes.c.state == CHECKING
+        if connection.execute(intakes.update().where(*checking).values(**values)).rowcount == 1 and allow is not None:
             allow(connection)
-        connection.execute(intakes.update().where(intakes.c.id == identifier, intakes.c.state == CHECKING).values(**values))
 
     database.transact(work, patience_s=PATIENCE_S)

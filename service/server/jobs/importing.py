@@ -15,6 +15,8 @@ import sqlalchemy as sa
 from service.errors import RequestError
 from service.requests import jobs
 from service.requests.base.identifiers import UPLOAD, new_id
+from service.requests.states import CHECKING
+from service.server.base.safe_names import folded
 from service.server.database import intakes, quotas, uploads
 from service.server.jobs.places import StepFiles
 from service.server.storage import layout
@@ -45,42 +47,60 @@ def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
     row = intakes.find(context.database, request.intake, job.project)
     if row is None or choices is None:
         raise RequestError(f"{request.intake}: is not there any more")
+    if row["state"] != CHECKING:  # a run that was killed after it had let the capture be ready
+        return
+    delete_strays(request.intake, files)
     proposal = (row["facts"] or {}).get(intakes.PROPOSAL)
     with _links(request.intake, files) as (folder, given):
         import_in_process(folder, choices, () if proposal is None else still_assumed(proposal, choices), row["name"],
                           max_pixels=context.max_pixels, progress=files.progress)
         facts = check_in_process(folder, environment=False, root=None, max_pixels=context.max_pixels, progress=files.progress)
         made = _made(folder, given)
-        settings = context.settings
-        if settings is not None:  # asked again where it counts
-            context.database.transact(lambda connection: quotas.require(
-                connection, settings, quotas.BYTES, job.project, sum(made.values())))
-        for name in made:
-            context.storage.put(folder / name, layout.intake(job.project, request.intake), name)
 
-    def record(connection: sa.Connection) -> None:
-        if settings is not None:
-            quotas.require(connection, settings, quotas.PIXELS, job.project, quotas.pixels_of(facts))
-            quotas.require(connection, settings, quotas.BYTES, job.project, sum(made.values()))
-        for name, length in made.items():
-            uploads.insert_made(connection, identifier=new_id(UPLOAD), project=job.project, intake=request.intake, path=name, length=length)
+        def allow(connection: sa.Connection) -> None:
+            if context.settings is not None:
+                quotas.require(connection, context.settings, quotas.BYTES, job.project, sum(made.values()))
+                quotas.require(connection, context.settings, quotas.PIXELS, job.project, quotas.pixels_of(facts))
 
-    try:
-        intakes.accept(context.database, request.intake, facts, record)
-    except RequestError:
-        for name in made:
-            context.storage.delete(layout.intake(job.project, request.intake), name)
-        raise
+        def record(connection: sa.Connection) -> None:
+            allow(connection)
+            for name, length in made.items():
+                uploads.insert_made(connection, identifier=new_id(UPLOAD), project=job.project, intake=request.intake, path=name,
+                                    length=length)
+
+        context.database.transact(allow)  # asked again where it counts
+        place = layout.intake(job.project, request.intake)
+        try:
+            for name in made:
+                context.storage.put(folder / name, place, name)
+            intakes.accept(context.database, request.intake, facts, record)
+        except Exception:
+            now = intakes.find(context.database, request.intake, job.project)
+            if now is None or now["state"] == CHECKING:
+                for name in made:
+                    context.storage.delete(place, name)
+            raise
+
+
+def delete_strays(intake: str, files: StepFiles) -> None:
+    """Delete what lies among the files of an upload that is checking and was never recorded: an import that was killed has left it."""
+    row = intakes.find(files.context.database, intake, files.job.project)
+    if row is None or row["state"] != CHECKING or row["folder"] is not None:
+        return
+    known = {upload["folded"] for upload in uploads.listing(files.context.database, intake, limit=MOST_FILES)}
+    place = layout.intake(files.job.project, intake)
+    for file in files.context.storage.files(place):
+        if folded(file.name) not in known:
+            files.context.storage.delete(place, file.name)
 
 
 @contextmanager
 def _links(intake: str, files: StepFiles) -> Iterator[tuple[Path, frozenset[str]]]:
-    """Yield a folder with links to the uploaded files of a capture, copies where there are no links, and their names.
-
-    What an import of the same capture made that was killed is not among them.
-    """
+    """Yield a folder with links to the uploaded files of a capture, copies where there are no links, and their names."""
     rows = uploads.listing(files.context.database, intake, limit=MOST_FILES)
-    names = frozenset(row["path"] for row in rows if row["path"] != FILE_NAME)
+    names = frozenset(row["path"] for row in rows)
+    if (own := next((row["path"] for row in rows if row["folded"] == FILE_NAME), None)) is not None:
+        raise RequestError(f"{own}: was uploaded and stays as it is: validate the capture, or delete this file to import the others")
     source, root = files.intake_place(intake)
     if root is not None:
         raise RequestError(f"{intake}: is registered, and stays as it is: relit import writes its {FILE_NAME} where it lies")

@@ -82,6 +82,7 @@ def _check(request: jobs.CheckJob, files: StepFiles) -> None:
     from service.captures.check_process import check_in_process
 
     context, project = files.context, files.job.project
+    importing.delete_strays(request.intake, files)
     folder, root = files.intake_place(request.intake)
     facts = check_in_process(folder, environment=not request.intake.startswith(CAPTURE), root=root, max_pixels=context.max_pixels,
                              progress=files.progress)

@@ -9,13 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from service.captures import check_process
 from service.captures.admit import admit_capture, admit_environment
-from service.captures.check_process import check_in_process
+from service.captures.check_process import check_in_process, import_in_process
 from service.errors import RequestError
-from tests.scenes.captures import edit_manifest, make_scene, write_capture
+from service.requests.base.import_choices import ImportChoices
+from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_image
 from tests.service.recording import Recording
 
 SAMPLES = Path(__file__).parents[3] / "samples"
@@ -146,3 +148,22 @@ check_process.main()"""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(check_process, "COMMAND", (sys.executable, "-c", code))
         assert check(tmp_path / "cap")["frames"] == 5
+
+
+@pytest.mark.parametrize(("name", "layout", "content"), [
+    ("dome.lp", "lp", "1\n../outside.png 0 0 1\n"),
+    ("dome.relight", "relightlab", json.dumps({"folder": "nothing", "images": [
+        {"filename": "../outside.png", "direction": {"x": 0, "y": 0, "z": 1}}]}))])
+def test_an_import_does_not_tell_which_files_there_are_elsewhere(tmp_path, name, layout, content):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / name).write_text(content)
+
+    def fault() -> str:
+        with pytest.raises(RequestError) as error:
+            import_in_process(folder, ImportChoices(layout=layout, file=name), (), "dome", max_pixels=PIXELS, progress=Told())
+        return str(error.value)
+
+    missing = fault()
+    write_image(tmp_path / "outside.png", np.zeros((4, 5, 3), np.uint16))
+    assert fault() == missing

@@ -5,7 +5,7 @@ import { byId, element, factText, show, words } from "./element.js";
 import { watch } from "./events.js";
 import { enableForms } from "./form.js";
 import { JobsTable } from "./jobs_table.js";
-import { heldBy, offerSteps } from "./object/next_steps.js";
+import { heldBy, litFacts, offerSteps } from "./object/next_steps.js";
 import { mountPhotographs } from "./object/photographs.js";
 import { removeLater } from "./object/removal.js";
 import { proposalOf } from "./proposal.js";
@@ -29,7 +29,7 @@ async function open() {
   if (capture.state !== "ready") return;
   offer(capture.facts ?? {});
   enableForms(byId("work"), identifier);
-  if ((capture.facts?.frames ?? 0) > 0) await load(look);
+  if ((capture.facts?.frames ?? 0) > 0) await load(() => look(capture.facts));
 }
 
 /** Ask how files are imported that were looked at. */
@@ -65,10 +65,11 @@ function offer(facts) {
   show(byId("work"), true);
 }
 
-async function look() {
+async function look(facts) {
   const step = await chosenStep(identifier);
   const { files } = await openView(identifier, null, step);
   const view = await ViewFile.open(files);
+  if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier);
   show(byId("relight"), view.info.relight !== null && step === null);
   byId("findings").replaceChildren(...view.info.findings.map((finding) => element("li", {}, finding)));
   if (view.info.frames.length === 0) return;

@@ -41,10 +41,10 @@ def uploaded(idle_harness, tmp_path):
     return identifier, names
 
 
-def run(harness, identifier, **settings):
+def run(harness, identifier, choices=CHOICES, **settings):
     context = WorkerContext(harness.database, open_storage(harness.settings), harness.settings.data / "cache", "cpu", 1 << 20,
                             lambda project: (), settings=harness.settings.model_copy(update=settings))
-    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=CHOICES), 1), context)
+    step, = steps_of(Job("job_0123456789abcdefghjk", PROJECT, CheckJob(kind="check", intake=identifier, importing=choices), 1), context)
     step.run(SILENT)
 
 
@@ -86,4 +86,69 @@ def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_ha
     used = sum(row["length"] for row in uploads.listing(idle_harness.database, identifier, limit=100))
     with pytest.raises(RequestError, match=f"quota {limit}"):
         run(idle_harness, identifier, **{limit: {"max_project_bytes": used + 10, "max_project_pixels": 9 * 32 * 32 - 1}[limit]})
+    assert stored(idle_harness, identifier) == (names,) * 2
+
+
+def test_an_import_that_was_killed_after_its_capture_was_ready_changes_nothing_when_it_is_run_again(idle_harness, uploaded):
+    """The capture's own pixels use the quota up, which would refuse it if they were asked for twice."""
+    identifier, names = uploaded
+    run(idle_harness, identifier)
+    made, = idle_harness.settings.data.rglob(f"captures/{identifier}/capture.json")
+    before = intakes.find(idle_harness.database, identifier, PROJECT), made.read_bytes()
+    run(idle_harness, identifier, max_project_pixels=9 * 32 * 32)
+    assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
+    assert (intakes.find(idle_harness.database, identifier, PROJECT), made.read_bytes()) == before
+
+
+def test_a_capture_that_another_run_has_let_be_ready_is_not_asked_for_its_quota(idle_harness, uploaded):
+    identifier, _ = uploaded
+    run(idle_harness, identifier)
+    asked = []
+    intakes.accept(idle_harness.database, identifier, {}, asked.append)
+    assert asked == []
+
+
+def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_harness, uploaded, tmp_path):
+    identifier, names = uploaded
+    own, length = tmp_path / "own.json", 5
+    own.write_text("{" * length)
+    idle_harness.database.transact(lambda connection: uploads.insert_made(
+        connection, identifier=new_id(UPLOAD), project=PROJECT, intake=identifier, path="capture.json", length=length))
+    open_storage(idle_harness.settings).put(own, layout.intake(PROJECT, identifier), "capture.json")
+    with pytest.raises(RequestError, match=r"^capture\.json: was uploaded and stays as it is"):
+        run(idle_harness, identifier, max_project_pixels=1)
+    kept, = idle_harness.settings.data.rglob("capture.json")
+    assert kept.read_text() == "{" * length
+    assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
+
+
+def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness, uploaded, monkeypatch):
+    identifier, names = uploaded
+    put = FolderStorage.put
+
+    def killed(self, *arguments):
+        put(self, *arguments)
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FolderStorage, "put", killed)
+        with pytest.raises(Killed):
+            run(idle_harness, identifier)
+    intakes.refuse(idle_harness.database, identifier, "its worker was lost too often")
+    idle_harness.database.transact(lambda connection: intakes.begin_check(connection, identifier))
+    with pytest.raises(RequestError, match=r"capture\.json"):
+        run(idle_harness, identifier, None)
+    assert stored(idle_harness, identifier) == (names,) * 2
+
+
+def test_an_import_that_fails_in_any_way_takes_what_it_made_away(idle_harness, uploaded, monkeypatch):
+    identifier, names = uploaded
+
+    def broken(*_, **__):
+        raise RuntimeError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(uploads, "insert_made", broken)
+        with pytest.raises(RuntimeError):
+            run(idle_harness, identifier)
     assert stored(idle_harness, identifier) == (names,) * 2

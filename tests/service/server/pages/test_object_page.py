@@ -46,6 +46,20 @@ def test_the_modes_of_an_object_are_those_that_exist_and_stand_in_the_address(sm
     assert download.value.path().read_bytes()[:4] == b"\x76\x2f\x31\x01"
 
 
+def test_a_capture_that_an_earlier_build_has_checked_is_offered_what_its_light_allows(page, solved):
+    """Its facts do not say what lit its frames; its view has their directions."""
+    def earlier(route):
+        answer = route.fetch()
+        capture = answer.json()
+        del capture["facts"]["lit_by"]
+        route.fulfill(response=answer, json=capture)
+
+    page.route(f"**/v1/captures/{solved.capture}", earlier)
+    page.goto(solved.pages["capture"])
+    page.locator("#next [data-kind]:visible").first.wait_for()
+    assert page.locator("#next [data-kind]:visible").all_inner_texts() == ["Make an asset", "Solve normals and materials"]
+
+
 def test_two_solves_are_compared_by_wipe_difference_and_side_by_side(page, made):
     page.goto(f"{made.pages['object']}#mode=compare")
     page.locator("[data-shows=compare] canvas.map").wait_for()

@@ -10,6 +10,11 @@ export function heldBy(facts) {
   return facts.lit_by ?? ["shots", "tiles"].filter((name) => name in facts);
 }
 
+/** Return the facts of a capture; where an earlier build has checked it, which did not note what lit its frames, with the light of its view. */
+export function litFacts(facts, view) {
+  return view.info.frames.some(({ direction }) => direction !== null) ? { lit_by: ["light"], ...facts } : facts;
+}
+
 /**
  * Show the steps that apply to a capture.
  * @param {HTMLElement} box With a button for each step.

@@ -8,7 +8,7 @@ import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
 import { mountAsset } from "./asset.js";
 import { mountLight } from "./light.js";
-import { offerSteps } from "./next_steps.js";
+import { litFacts, offerSteps } from "./next_steps.js";
 import { mountPhotographs } from "./photographs.js";
 import { removeLater } from "./removal.js";
 import { mountResults, viewOf, warningsOf } from "./results.js";
@@ -106,7 +106,7 @@ await load(async () => {
   const step = await chosenStep(identifier);
   const [view, jobs] = await Promise.all([openView(identifier, null, step).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
   const modes = modesOf(view, step, jobs);
-  offerSteps(byId("next"), capture.facts ?? {}, identifier, jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]));
+  offerSteps(byId("next"), litFacts(capture.facts ?? {}, view), identifier, jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]));
   const wanted = { mode: "" };
   address.read(wanted);
   byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name, "aria-pressed": "false",
