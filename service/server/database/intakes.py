@@ -98,7 +98,10 @@ def remove(connection: sa.Connection, identifier: str) -> list[str] | None:
 def _judge(database: Database, identifier: str, allow: Callable[[sa.Connection], None] | None, **values: Any) -> None:
     def work(connection: sa.Connection) -> None:
         checking = intakes.c.id == identifier, intakes.c.state == CHECKING
-        if connection.execute(intakes.update().where(*checking).values(**values)).rowcount == 1 and allow is not None:
-            allow(connection)
+        # locks the row; the intake itself must not count yet where `allow` asks for quotas
+        if connection.execute(intakes.update().where(*checking).values(state=CHECKING)).rowcount == 1:
+            if allow is not None:
+                allow(connection)
+            connection.execute(intakes.update().where(*checking).values(**values))
 
     database.transact(work, patience_s=PATIENCE_S)
