@@ -54,7 +54,9 @@ async function begin(what, name, files, then = "validate") {
   const leaving = (event) => event.preventDefault();
   addEventListener("beforeunload", leaving);
   let told = "";
+  let over = false; // requests under way when an upload is stopped may fail afterwards
   const link = { signal: stop.signal, lost: (isLost) => {
+    if (over) return;
     status.textContent = isLost ? "The server cannot be reached. The upload waits, and goes on by itself." : told;
   } };
   let begun;
@@ -71,6 +73,7 @@ async function begin(what, name, files, then = "validate") {
     await end(what, found, line, status, link);
   } catch (error) {
     if (!(error instanceof Refusal || error instanceof Stopped || error.name === "AbortError")) throw error;
+    over = true;
     bar.remove();
     status.className = "fault";
     status.textContent = error instanceof Refusal ? error.message : "Stopped. Drop the same folder again to continue: what the server has is not sent again.";
