@@ -205,7 +205,7 @@ def main() -> None:
     except MemoryError:
         _write({"error": f"the files take more than {MEMORY_BYTES >> 30} GiB of memory to be checked"})
     except USER_ERRORS as error:  # the user knows the files by the names given, not by their place on the server
-        _write({"error": sentence(error).replace(f"{folder}/", "").replace(str(folder), "the folder")})
+        _write({"error": sentence(error).replace(f"{folder}/", "").replace(str(folder), "the folder" if folder.is_dir() else folder.name)})
     except Exception:
         _write({"fault": traceback.format_exc()[-100_000:]})
     os._exit(0)
