@@ -10,6 +10,7 @@ import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import PICTURES, new_context
+from tests.service.waiting import until
 
 CAPTURES = 1000
 EVIL = '<img src=x onerror="document.title=1"><script>document.title=1</script>'
@@ -122,13 +123,19 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
     card = page.locator(f"[data-id={solved.capture}]")
     card.locator("canvas").wait_for()
     light = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 4 === 0)"
-    seen = {}
-    for side, x in {"left": 0.1, "right": 0.9}.items():
+    seen, pictures = {}, [card.locator("canvas").evaluate(light)]
+
+    def lit_from(x: float) -> list[int] | None:
+        """The picture under the pointer, when it is another one than before; the wall may move, and make the card anew, meanwhile."""
         box = card.locator(".shown").bounding_box()
-        before = card.locator("canvas").evaluate(f"c => ({light})(c).join()")
+        page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.4 * box["height"])
         page.mouse.move(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
-        page.wait_for_function(f"([c, before]) => ({light})(c).join() !== before", arg=[card.locator("canvas").element_handle(), before])
         red = card.locator("canvas").evaluate(light)
+        return None if red in pictures else red
+
+    for side, x in {"left": 0.1, "right": 0.9}.items():
+        red = until(lambda x=x: lit_from(x))
+        pictures.append(red)
         width = round(len(red) ** 0.5)
         seen[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
     assert seen["left"][0] > seen["right"][0] and seen["left"][1] < seen["right"][1]
