@@ -195,7 +195,9 @@ def test_the_home_page_shows_the_sample(browser, owl, solved, sky, tmp_path, sch
     page = new_context(browser, base_url=owl.server.url, viewport={"width": 1280, "height": 720}, color_scheme=scheme).new_page()
     page.goto("/")
     for name in (owl.capture, solved.capture, sky):
+        page.locator(f"[data-id={name}]").scroll_into_view_if_needed()
         page.locator(f"[data-id={name}] canvas").wait_for()
+    page.evaluate("scrollTo(0, 0)")
     path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_home_{scheme}.png"
     page.screenshot(path=path)
     assert path.stat().st_size > 50_000
