@@ -117,12 +117,20 @@ def test_what_is_loading_is_seen_at_once(page):
     page.locator("main .skeleton").first.wait_for()
 
 
+def await_picture(page, identifier: str) -> None:
+    """Wait for the picture of a card, which is loaded when the card is in sight; the wall may make cards anew meanwhile."""
+    page.wait_for_function("""(identifier) => {
+      const card = document.querySelector(`[data-id=${identifier}]`);
+      card?.scrollIntoView();
+      return card?.querySelector("canvas") ?? null;
+    }""", arg=identifier)
+
+
 @pytest.mark.long
 def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, sky):
     page.goto("/")
     card = page.locator(f"[data-id={solved.capture}]")
-    card.scroll_into_view_if_needed()  # pictures are loaded of what is in sight
-    card.locator("canvas").wait_for()
+    await_picture(page, solved.capture)
     light = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 4 === 0)"
     seen, pictures = {}, [card.locator("canvas").evaluate(light)]
 
@@ -140,8 +148,7 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
         width = round(len(red) ** 0.5)
         seen[side] = [sum(value for at, value in enumerate(red) if (at % width < width / 2) == left) for left in (True, False)]
     assert seen["left"][0] > seen["right"][0] and seen["left"][1] < seen["right"][1]
-    page.locator(f"[data-id={sky}]").scroll_into_view_if_needed()
-    page.locator(f"[data-id={sky}] canvas").wait_for()
+    await_picture(page, sky)
     card.get_by_role("link").press("Enter")
     page.wait_for_url(re.compile(f"/{solved.capture}$"))
 
@@ -151,8 +158,7 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
 def test_the_wall_fits_and_has_no_serious_violation(browser, server, solved, sky, width):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": width, "height": 844}).new_page()
     page.goto("/")
-    page.locator(f"[data-id={solved.capture}]").scroll_into_view_if_needed()  # pictures are loaded of what is in sight
-    page.locator(f"[data-id={solved.capture}] canvas").wait_for()
+    await_picture(page, solved.capture)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert violations_in_both_schemes(page) == []
     page.close()
@@ -195,8 +201,7 @@ def test_the_home_page_shows_the_sample(browser, owl, solved, sky, tmp_path, sch
     page = new_context(browser, base_url=owl.server.url, viewport={"width": 1280, "height": 720}, color_scheme=scheme).new_page()
     page.goto("/")
     for name in (owl.capture, solved.capture, sky):
-        page.locator(f"[data-id={name}]").scroll_into_view_if_needed()
-        page.locator(f"[data-id={name}] canvas").wait_for()
+        await_picture(page, name)
     page.evaluate("scrollTo(0, 0)")
     path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_home_{scheme}.png"
     page.screenshot(path=path)
