@@ -18,6 +18,6 @@ class ImportChoices(Options):
     """The word behind relit import."""
     file: Line | None = None
     """The file of the capture that is imported, such as a light list; None: all of them."""
-    options: Annotated[dict[str, Any], Field(default_factory=dict)]
+    options: Annotated[dict[Line, Any], Field(default_factory=dict)]
     """The options of the import by the names of docs/importing.md, with _ for -: {"color_space": "lin_rec709_scene"}. Files are named as
     in the capture."""

@@ -52,8 +52,8 @@ class Stage(Protocol):
 class Run(Strict):
     """A capture that is to be started."""
 
-    name: str
-    plan: str
+    name: Line
+    plan: Line
     preview: bool = False
     retake: tuple[Line, ...] = ()
 
@@ -61,13 +61,13 @@ class Run(Strict):
 class Named(Strict):
     """A capture that is to be shown."""
 
-    name: str
+    name: Line
 
 
 class Step(Strict):
     """What a capture is to be calibrated by: ball or chart."""
 
-    step: str
+    step: Line
 
 
 class Live(Strict):

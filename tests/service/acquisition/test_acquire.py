@@ -295,11 +295,12 @@ def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
         random = np.random.default_rng(2)
         for _ in range(10):
             wanted = stage.released + int(random.integers(1, most + 1))  # the first shows that nothing moved
-            program = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL)
+            with (tmp_path / "said.txt").open("w") as said:
+                program = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=said, stderr=said)
             until(lambda program=program, wanted=wanted: stage.released >= wanted or program.poll() is not None, "no picture",
                   every_s=0.001)
             time.sleep(random.uniform(0, 0.1))
-            assert program.poll() is None, "the capture ended before it was killed"
+            assert program.poll() is None, f"the capture ended before it was killed: {(tmp_path / 'said.txt').read_text()}"
             program.kill()
             program.wait()
         subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)

@@ -86,9 +86,8 @@ def test_nothing_is_drawn_while_nothing_changes(page, solved):
 
 
 @pytest.mark.long
-def test_arrow_keys_move_the_light_of_what_the_first_page_opens(page, solved):
-    page.goto("/")
-    page.wait_for_url("**/light/cap_*")
+def test_arrow_keys_move_the_light(page, solved):
+    page.goto(f"/light/{solved.capture}")
     solved.wait_for_content(page, "light")
     page.get_by_text("Shown through sRGB (linear Rec.709, clipped, no tone mapping)").wait_for()
     before = page.evaluate("() => relit.state().light.direction")
