@@ -105,8 +105,7 @@ class Acquisition:
             self.journal.begin(self._camera.present())
         self._files = CaptureFiles(request.out, self.rig, self.shots, request.color_space, request.saturation)
         self.judge = Judge(self.rig)
-        self.faults: dict[str, list[Fault]] = {}
-        """The faults of each shot's picture, or of its absence, by the key of the shot."""
+        self.faults: dict[str, list[Fault]] = {}  # of each shot's picture, or of its absence, by the key of the shot
         self.retaken: list[Fault] = []  # the faults of pictures that were taken again, and of pictures that came late
         self._own: list[float] = []
         self._receivers: list[Receiver] = []
@@ -174,10 +173,8 @@ class Acquisition:
 
     def _recall(self) -> None:
         """Take note of the pictures that an earlier run has taken."""
-        for shot in self.shots:
-            line = self.journal.taken.get(shot.key)
-            if line is None:
-                continue
+        for shot in [each for each in self.shots if each.key in self.journal.taken]:
+            line = self.journal.taken[shot.key]
             path = self._request.out / line["file"]
             self.faults[shot.key] = [Fault(shot.key, FaultKind(kind), sentence) for kind, sentence in line.get("faults", [])]
             self.judge.accept(shot, images.read_pixels(path), *self._encoding(path), self.faults[shot.key])
@@ -187,7 +184,9 @@ class Acquisition:
         """Take the picture that came after an earlier run had released the camera and before it recorded the picture."""
         released, left = self.journal.released, self._camera.unasked()
         shot = next((shot for shot in self.shots if released is not None and shot.key == released["shot"]), None)
-        if shot is None or released is None or not left or shot.key in self.journal.taken:
+        if shot is None or released is None or len(left) != 1 or shot.key in self.journal.taken:
+            for path in left:  # of several nobody knows which is the shot's; recorded, none is taken for another shot's later
+                self.journal.picture("" if released is None else released["shot"], "unasked", {"source": path.name})
             return
         picture = Picture(left[0], images.read_pixels(left[0]))
         if faults := self.judge.judge(shot, picture.pixels, *self._encoding(picture.path)):
@@ -216,6 +215,7 @@ class Acquisition:
         if stopping.wait(self.plan.settle_s):
             return
         for owed in (1, 0):  # the first to come may be a picture for which a run that was killed had released the camera
+            self.journal.release(shot.key, 0)  # else a run after this one would take its picture for that of an earlier release
             try:
                 picture = self._camera.take(shot.exposure_s)
             except NoPictureError as error:
