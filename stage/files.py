@@ -1,6 +1,7 @@
 """Writing of files and folders whole or not at all: a temporary one beside the target, files flushed to disk, then renamed."""
 
 import os
+import re
 import shutil
 import tempfile
 import threading
@@ -11,6 +12,7 @@ from pathlib import Path
 from stage.errors import storage
 
 _umask_lock = threading.Lock()
+_TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., eight characters of mkstemp, SUFFIX
 
 
 @contextmanager
@@ -41,6 +43,14 @@ def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
             os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove the temporary files of `replacing` that killed processes left in a folder; nobody may be writing there."""
+    with storage("write", folder):
+        for path in folder.glob(".*"):
+            if _TEMPORARY.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

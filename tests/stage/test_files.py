@@ -2,13 +2,19 @@
 
 import os
 import stat
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
+import stage
 from stage.errors import StorageError
-from stage.files import replacing, replacing_folder, write_text
+from stage.files import remove_unfinished, replacing, replacing_folder, write_text
 from tests.scenes.captures import files_in
+
+ROOT = Path(stage.__file__).parents[1]
 
 
 def test_the_temporary_lies_beside_the_target_and_keeps_its_suffix(tmp_path):
@@ -19,6 +25,20 @@ def test_the_temporary_lies_beside_the_target_and_keeps_its_suffix(tmp_path):
         temporary.write_bytes(b"whole")
     assert target.read_bytes() == b"whole"
     assert files_in(tmp_path) == {"new/a.exr"}
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    target = tmp_path / "0001_light.exr"
+    code = f"import os, stage.files\nwith stage.files.replacing({str(target)!r}) as path:\n os.kill(os.getpid(), 9)"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".0001_light.")
+    kept = {"0001_light.exr", ".gitignore", ".hidden.exr", "a.b12345678.exr"}
+    for name in kept:
+        (tmp_path / name).touch()
+    remove_unfinished(tmp_path)
+    remove_unfinished(tmp_path / "none")
+    assert {path.name for path in tmp_path.iterdir()} == kept
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError])

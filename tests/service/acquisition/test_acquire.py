@@ -306,6 +306,7 @@ def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
         subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)
     assert stage.on == set()
     check(tmp_path / "capture", stage, rounds=rounds)
+    assert not list((tmp_path / "capture").glob(".*.exr"))  # half-written when it was killed
     seen = [rgb(path) for path in sorted((tmp_path / "capture").glob("*_light_*.exr"))]  # and each picture is that of its lamp
     assert [np.abs(0.2 * stage.scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == rounds * list(range(LAMPS))
 
