@@ -33,6 +33,7 @@ from service.requests import (
 )
 from service.requests.base.base import Choice, Options, Role
 from service.requests.base.options import build, help_text, options_of, typed, values_of
+from service.requests.compare import CompareRequest
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
 from service.requests.imports import lights
 from service.requests.imports import patterns as pattern_images
@@ -44,7 +45,7 @@ from service.requests.inspect_board import GaugeBoardRequest, InspectBoardReques
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
     "blender-extension": [export.BlenderExtensionRequest],
-    "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
+    "compare": [CompareRequest], "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
     "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
     "gauge-board": [GaugeBoardRequest],
@@ -206,7 +207,7 @@ NO_JOBS = {
     "publish": "makes files for another web server", "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
     "blender-extension": "writes a file for another program of this machine",
-    "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
+    "compare": "reads a design that is no capture", "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
     "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",
     "restore": "is for its operator", "keys": "is for its operator",
