@@ -30,8 +30,8 @@ FEW, SOME, MANY = 800, 3000, 30_000
 BEST = 6
 """The number of poses that are fitted finely."""
 STEPS = 15
-STILL = 1e-8
-"""Steps end when points move by less than this part of the design's size."""
+NEARLY_STILL, STILL = 1e-3, 1e-6
+"""Steps end when points move by less than this part of the reach: of a rough fit, and of the last."""
 RIVAL = 1.5
 """Another pose fits as well if the mean square distance that it leaves is at most this many times that of the best."""
 LARGER, SMALLER = 4.0, 0.02
@@ -99,7 +99,7 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
         rivals = sum(score <= RIVAL * found[0][1] and not is_near(pose, starts[0], middle, 3 * coarse) for pose, score in found[1:])
     fitted = starts[0]
     for reach in (1.5 * coarse, max(0.75 * coarse, reach_m), reach_m):
-        step = _fit(design, scan, drawn[:MANY], fitted, reach, None)
+        step = _fit(design, scan, drawn[:MANY], fitted, reach)
         if step is None:
             raise ScanError(_unlike(design, scan, drawn[:SOME], fitted, reach_m))
         fitted, last = step.pose, step
@@ -151,7 +151,7 @@ def _settle(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.nda
             ) -> tuple[np.ndarray, float]:
     """Return a pose after fits at some reaches, and the mean square distance that it leaves, of at most the last reach each."""
     for reach in reaches:
-        fit = _fit(design, scan, rows, pose, reach, None)
+        fit = _fit(design, scan, rows, pose, reach, still=NEARLY_STILL)
         if fit is None:
             break
         pose = fit.pose
@@ -178,7 +178,8 @@ def _matched(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.nd
     return Offsets(*(each[alike] for each in found)), rows[found.near[alike]]
 
 
-def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float, wanted: Wanted | None) -> _Fit | None:
+def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float, wanted: Wanted | None = None, *,
+         still: float = STILL) -> _Fit | None:
     """Return the pose near another that brings points of a scan onto the design; None if too few can be matched."""
     covariance, held, pivot = np.zeros((6, 6)), 6, np.zeros(3)
     for _ in range(STEPS):
@@ -203,7 +204,7 @@ def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarra
         noise = jacobian * (weight * scan.sigma[points])[:, None]
         covariance, held = inverse @ (noise.T @ noise) @ inverse, int((~told).sum())
         pose = moved(step, pivot, pose)
-        if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < STILL * design.size:
+        if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < still * reach:
             break
     return _Fit(pose, pivot, covariance, held)
 

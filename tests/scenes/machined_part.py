@@ -34,7 +34,8 @@ def machined_part(cols: int = 81, rows: int = 51) -> Part:
     count = len(top)
     index = np.arange(count).reshape(cols, rows)
     a, b, c, d = (corner.ravel() for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    faces = [np.stack(each, axis=1) for each in ((a, b, c), (a, c, d), (count + a, count + c, count + b), (count + a, count + d, count + c))]
+    below = count + np.stack([[a, c, b], [a, d, c]])
+    faces = [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1), *(np.stack(list(each), axis=1) for each in below)]
     for line in (index[:, 0], index[-1, :], index[::-1, -1], index[0, ::-1]):
         i, j = line[:-1], line[1:]
         faces += [np.stack([count + i, count + j, j], axis=1), np.stack([count + i, j, i], axis=1)]
@@ -48,7 +49,8 @@ def cylinder(sides: int = 64, radius: float = 15.0, length: float = 40.0) -> Par
     points = np.concatenate([np.column_stack([ring, np.full(sides, z)]) for z in (0.0, length)] + [[[0, 0, 0], [0, 0, length]]])
     i = np.arange(sides)
     j = (i + 1) % sides
-    faces = [(i, j, sides + j), (i, sides + j, sides + i), (j, i, np.full(sides, 2 * sides)), (sides + i, sides + j, np.full(sides, 2 * sides + 1))]
+    low, high = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
+    faces = [(i, j, sides + j), (i, sides + j, sides + i), (j, i, low), (sides + i, sides + j, high)]
     return Part(points, np.concatenate([np.stack(each, axis=1) for each in faces]))
 
 
@@ -65,7 +67,8 @@ class Scanned(NamedTuple):
     normals: np.ndarray  # [n, 3]
 
 
-def scan_of(part: Part, random: np.random.Generator, count: int = 20_000, pose: np.ndarray | None = None, hidden=None, fault=None) -> Scanned:
+def scan_of(part: Part, random: np.random.Generator, count: int = 20_000, pose: np.ndarray | None = None, hidden=None, fault=None
+            ) -> Scanned:
     """Return points that lie evenly on a part, with noise along its normals.
 
     Args:

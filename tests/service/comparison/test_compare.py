@@ -72,6 +72,7 @@ def test_a_dent_is_found_wherever_the_scan_lies(tmp_path, part):
     assert result.picture_path.stat().st_size > 0 and not result.passed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("depth", [0.0, 0.12])
 def test_verdicts_over_random_scans(tmp_path, part, depth):
     """Of 10 regions within their tolerance none fails, and of 10 with a dent beyond it none passes, at a probability of 5 % for each scan
@@ -90,7 +91,7 @@ def test_σ_covers_the_deviations(tmp_path, part):
     made, design = part
     scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(5), 20_000))
     points = read_ply_points(compare(request(tmp_path, scan, design, align="none")).deviations_path)
-    assert np.median(points.sigma) == pytest.approx(SIGMA_M, rel=1e-3)  # float32
+    assert np.nanmedian(points.sigma) == pytest.approx(SIGMA_M, rel=1e-3)  # float32
     assert compare(request(tmp_path, scan, design, align="none")).rms_m == pytest.approx(SIGMA_M, rel=0.03)  # √(1 / 2n) is .005; edges
     estimated = compare(request(tmp_path, write_scan(tmp_path / "bare.ply", scan_of(made, np.random.default_rng(5), 20_000), None), design,
                                 align="none"))
@@ -115,11 +116,12 @@ def test_a_datum_carries_the_scan(tmp_path, part):
 
 def test_what_the_surface_leaves_open_is_said(tmp_path):
     random = np.random.default_rng(1)
-    rod, plate = cylinder(), Part(np.array([[x, y, z] for x in (-20, 20) for y in (-12, 12) for z in (-3, 3)], float), np.array(
-        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
-    for number, made in enumerate((rod, plate)):
+    corners = np.array([[x, y, z] for x in (-20, 20) for y in (-12, 12) for z in (-3, 3)], float)
+    plate = Part(corners, np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
+    for number, made in enumerate((cylinder(), plate)):
         scan = write_scan(tmp_path / "scan.ply", scan_of(made, random, 10_000, any_pose(random)))
-        result = compare(request(tmp_path, scan, write_stl(tmp_path / "design.stl", made), tolerance_m=(-5e-5, 5e-5)))
+        result = compare(request(tmp_path, scan, write_stl(tmp_path / "design.stl", made), tolerance_m=(-1e-4, 1e-4)))
         placement = reported(result)["placement"]
         assert placement["open_motions"] == (1 if number == 0 else 0) and placement["other_poses"] > 0
         assert any("other poses" in warning for warning in result.warnings)
