@@ -7,7 +7,7 @@ import numpy as np
 
 from kernels import device as devices
 from service.boards.stitching.regions import Verdict
-from service.comparison.deviations import Deviations, deviations_of, patches_of, sigma_of
+from service.comparison.deviations import Deviations, deviations_of, patches_of, sigma_of, standing_on
 from service.comparison.picture import BINS, PICTURE_FILE, colours_of, span_of, write_picture
 from service.comparison.placing import Placement, place
 from service.comparison.regions import REGIONS_FILE, RegionVerdict, decide, inside, table
@@ -87,7 +87,8 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     spacing = _spacing(scan.points)
     patch = PATCH_SPACINGS * spacing if request.smallest_fault_m is None else request.smallest_fault_m / 2
     patches = patches_of(found, design, placement, patch_m=patch, shared_m=request.shared_sigma_m)
-    verdicts, k = decide(regions, patches, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
+    strange = standing_on(design, found, patches, patch_m=patch)
+    verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
                          least_seen=request.least_seen)
     warnings = _warnings(scan, placement, found)
     timings.stage("write", 1)

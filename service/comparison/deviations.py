@@ -12,6 +12,8 @@ BATCH = 1 << 18
 """Points that are looked at together, which bounds the memory."""
 LEAST_POINTS = 4
 """The fewest points of a patch that is judged."""
+NEARBY = 0.25
+"""The part of the design's size within which points that do not lie on it are taken for something that stands on it."""
 
 
 class Deviations(NamedTuple):
@@ -49,6 +51,17 @@ def deviations_of(design: Design, scan: ScannedSurface, placement: Placement, re
     near, distance, across, at, face = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Deviations(placed.astype(np.float32), normals.astype(np.float32), near, distance, at, face,
                       gradient(at, across, placement.pivot).astype(np.float32), scan.sigma[near])
+
+
+def standing_on(design: Design, found: Deviations, patches: Patches, *, patch_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return places of the design [k, 3], metres, and its normals there [k, 3], above or below which enough points for a patch lie that do
+    not belong to it: something else stands there, or the part is not what was designed."""
+    others = np.delete(found.placed, found.near, axis=0).astype(np.float64)
+    there = design.offsets(others, NEARBY * design.size)
+    _, first, count = np.unique(np.floor(there.at / patch_m).astype(np.int64), axis=0, return_index=True, return_counts=True)
+    usual = float(np.median(patches.points)) / 2 if len(patches.points) else 0.0
+    many = first[count >= max(usual, LEAST_POINTS)]
+    return there.at[many], design.normals[there.face[many]]
 
 
 def sigma_of(found: Deviations, placement: Placement, shared_m: float) -> np.ndarray:

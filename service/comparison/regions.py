@@ -42,6 +42,8 @@ class RegionVerdict(NamedTuple):
     seen: float
     """Part of the region that the scan shows."""
     patches: int
+    strange: int
+    """Number of patches above or below which the scan has points that do not belong to the design."""
     area_m2: float
 
 
@@ -56,38 +58,43 @@ def inside(region: ToleranceRegion, points: np.ndarray, normals: np.ndarray, uni
     return found
 
 
-def decide(regions: Sequence[ToleranceRegion], patches: Patches, design: Design, *, unit_m: float, patch_m: float, false_alarm: float,
-           least_seen: float) -> tuple[list[RegionVerdict], float]:
+def decide(regions: Sequence[ToleranceRegion], patches: Patches, strange: tuple[np.ndarray, np.ndarray], design: Design, *,
+           unit_m: float, patch_m: float, false_alarm: float, least_seen: float) -> tuple[list[RegionVerdict], float]:
     """Decide about every region, and return with how many σ.
 
-    A region fails if the mean of any patch is more than k σ outside of a limit, and passes if all are more than k σ inside of both and the
-    scan shows enough of it. k is that of as many one-sided tests as there are patches and limits (Bonferroni's bound).
+    A region fails if the mean of any patch is more than k σ outside of a limit, and passes if all are more than k σ inside of both, the
+    scan shows enough of it, and nothing strange stands on it. k is that of as many one-sided tests as there are patches and limits
+    (Bonferroni's bound).
+
+    Args:
+        strange: places and normals of `deviations.standing_on`.
     """
     of_region = [inside(region, patches.middle, patches.normal, unit_m) for region in regions]
     k = threshold(false_alarm, 2 * max(sum(int(each.sum()) for each in of_region), 1), sides=1)
     tree = cKDTree(_facing_points(patches.middle, patches.normal, patch_m)) if len(patches.middle) else None
-    return [_decide(region, patches, chosen, design, tree, k, unit_m, patch_m, least_seen)
+    return [_decide(region, patches, chosen, int(inside(region, *strange, unit_m).sum()), design, tree, k, unit_m, patch_m, least_seen)
             for region, chosen in zip(regions, of_region, strict=True)], k
 
 
-def _decide(region: ToleranceRegion, patches: Patches, chosen: np.ndarray, design: Design, tree: cKDTree | None, k: float, unit_m: float,
-            patch_m: float, least_seen: float) -> RegionVerdict:
+def _decide(region: ToleranceRegion, patches: Patches, chosen: np.ndarray, strange: int, design: Design, tree: cKDTree | None, k: float,
+            unit_m: float, patch_m: float, least_seen: float) -> RegionVerdict:
     low, high = (limit * unit_m for limit in region.tolerance)
     samples, part = _samples(region, design, unit_m, patch_m)
     seen = 0.0 if tree is None or not len(samples) else float((tree.query(samples)[0] <= BESIDE * patch_m).mean())
     deviation, sigma = patches.deviation[chosen], patches.sigma[chosen]
     if not len(deviation):
-        return RegionVerdict(region.name, Verdict.NOT_INSPECTED, low, high, None, None, None, None, None, seen, 0, part)
+        return RegionVerdict(region.name, Verdict.NOT_INSPECTED, low, high, None, None, None, None, None, seen, 0, strange, part)
     least, most = int(deviation.argmin()), int(deviation.argmax())
     if ((deviation - k * sigma > high) | (deviation + k * sigma < low)).any():
         verdict = Verdict.FAIL
     elif seen < least_seen:
         verdict = Verdict.NOT_INSPECTED
     else:
-        verdict = Verdict.PASS if ((deviation + k * sigma <= high) & (deviation - k * sigma >= low)).all() else Verdict.UNDECIDED
+        within = bool(((deviation + k * sigma <= high) & (deviation - k * sigma >= low)).all())
+        verdict = Verdict.PASS if within and not strange else Verdict.UNDECIDED
     return RegionVerdict(region.name, verdict, low, high, float(np.average(deviation, weights=patches.points[chosen])),
                          float(deviation[least]), float(sigma[least]), float(deviation[most]), float(sigma[most]), seen, len(deviation),
-                         part)
+                         strange, part)
 
 
 def _facing_points(points: np.ndarray, normals: np.ndarray, patch_m: float) -> np.ndarray:

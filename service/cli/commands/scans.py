@@ -74,7 +74,7 @@ def _compare(request: CompareRequest) -> None:
         extremes = "" if region.least_m is None or region.most_m is None else (
             f" {1e3 * region.least_m:+.3g} to {1e3 * region.most_m:+.3g} mm, ± {1e3 * (region.most_sigma_m or 0):.2g}")
         print(f"region   {region.name}: {region.verdict}{extremes}; allowed {1e3 * region.low_m:+.3g} to {1e3 * region.high_m:+.3g}, "
-              f"{region.seen:.0%} seen")
+              f"{region.seen:.0%} seen" + (f", something else on {region.strange} patches" if region.strange else ""))
     if len(result.regions) > MOST_PRINTED:
         print(f"regions  {len(result.regions) - MOST_PRINTED} more are in the table")
     print_warnings(result.warnings)

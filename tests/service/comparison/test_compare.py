@@ -152,6 +152,22 @@ def test_scans_of_something_else_are_refused(tmp_path, part):
     assert not (tmp_path / "out").exists()
 
 
+def test_what_stands_on_a_region_keeps_it_from_passing(tmp_path, part):
+    """A peg of 3 mm across and 12 mm high, whose points do not belong to the design, is less than a hundredth of the top."""
+    made, design = part
+    random = np.random.default_rng(6)
+    peg = scan_of(cylinder(24, 1.5, 12), random, 1500)
+    plain = scan_of(made, random, 40_000, None, below)
+    both = plain._replace(points=np.concatenate([plain.points, peg.points + [0.0, 0.016, 0.008]]),
+                          normals=np.concatenate([plain.normals, peg.normals]))
+    verdicts = []
+    for number, scan in enumerate((plain, both)):
+        path = write_scan(tmp_path / f"{number}.ply", scan)
+        (top,) = compare(request(tmp_path, path, design, align="none", regions=regions(tmp_path, REGIONS[:1]))).regions
+        verdicts.append((str(top.verdict), top.strange > 0))
+    assert verdicts == [("pass", False), ("undecided", True)]
+
+
 @pytest.mark.parametrize(("entry", "field"), [({"tolerance": [1, -1]}, "tolerance"), ({"box": [[0, 0, 0], [1, 0, 1]]}, "box"),
                                               ({"facing": [0, 0, 0]}, "facing"), ({"colour": "red"}, "colour")])
 def test_wrong_regions_are_named(tmp_path, part, entry, field):
