@@ -9,6 +9,7 @@ from kernels.surface.nearest import NearestOnMesh
 from service.scans.fusion.fuse import MESH_FILE
 from service.scans.points.planes import local_planes, robust_scatter
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
+from service.scans.viewpoints import find_viewpoints
 from stage.errors import ResultError
 from stage.formats.triangles import Triangles, read_triangles, without_empty_faces
 
@@ -99,7 +100,8 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
     """Read a scan, whose coordinates are in a unit of so many metres.
 
     Raises:
-        ResultError: it has no normals and no faces that tell which side is outside, or too few points.
+        ResultError: it has too few points, or nothing tells which side of it is outside: faces, normals, or that it was all seen from
+            one place.
     """
     file = path / MESH_FILE if path.is_dir() else path
     if file.suffix.lower() == PLY:
@@ -110,10 +112,9 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         points, normals, sigma = points * unit_m, None, None
     if len(points) < LEAST_SCAN:
         raise ResultError(f"{file}: has {len(points)} points: {LEAST_SCAN} are the fewest that are compared")
-    if normals is None and faces is None:
-        raise ResultError(f"{file}: has neither faces nor normals, so that nothing says which side of its points is outside")
-    outward = _normals_of(points, faces) if normals is None and faces is not None else np.asarray(normals, dtype=np.float64)
-    outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-30)
+    if normals is None:
+        normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
+    outward = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     source = "declared" if sigma_m is not None else "measured" if sigma is not None else "estimated"
     if sigma_m is not None:
         spread = np.full(len(points), sigma_m)
@@ -127,7 +128,16 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
     return ScannedSurface(points, outward, spread, source, faces)
 
 
-def _normals_of(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _estimated_normals(points: np.ndarray, file: Path) -> np.ndarray:
+    """Return normals of points [n, 3] towards the place from which all of them were seen."""
+    found = find_viewpoints([points], [None])
+    if found.place is None:
+        raise ResultError(f"{file}: has neither faces nor normals, and nothing else says which side of its points is outside: "
+                          f"{found.reason}")
+    return local_planes(points.astype(np.float32), origin=found.place[0]).normals.astype(np.float64)
+
+
+def _normals_of_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the normals of vertices [n, 3], those of their faces weighted by area; 0 of a vertex without faces."""
     corners = points[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -59,7 +59,7 @@ class CompareRequest(CompareOptions, DeviceRequest):
     """Compare a scan with the design of the part: its deviations with their σ, and whether regions are within their tolerances."""
 
     scan: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="SCAN")]
-    """The scan: a PLY, STL or OBJ file with faces or normals, or a folder of `relit fuse`."""
+    """The scan: a PLY, STL or OBJ file, or a folder of `relit fuse`."""
     design: Annotated[Path, Role.INPUT]
     """The surface that was wanted: an STL, OBJ or PLY file of triangles. Programs for design export STEP as STL."""
     out: Annotated[Path, Role.OUTPUT]

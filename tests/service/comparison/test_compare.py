@@ -175,9 +175,19 @@ def test_wrong_regions_are_named(tmp_path, part, entry, field):
         compare(request(tmp_path, tmp_path / "none.ply", part[1], regions=regions(tmp_path, [{**REGIONS[0], **entry}])))
 
 
-def test_points_without_sides_are_refused(tmp_path, part):
-    bare = tmp_path / "bare.ply"
-    bare.write_text("ply\nformat ascii 1.0\nelement vertex 200\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-                    + "0 1 2\n" * 200)
+def test_bare_points_have_the_side_from_which_they_were_seen(tmp_path):
+    """The rims of a round body turn away from who saw it; points from all around say nothing."""
+    made = cylinder()
+    design, random = write_stl(tmp_path / "rod.stl", made), np.random.default_rng(8)
+
+    def bare(hidden):
+        points = scan_of(made, random, 20_000, None, hidden).points
+        path = tmp_path / "bare.ply"
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *(f"property float {name}" for name in "xyz")]
+        path.write_bytes("\n".join([*head, "end_header\n"]).encode() + points.astype("<f4").tobytes())
+        return path
+    seen = compare(request(tmp_path, bare(lambda points, normals: normals[:, 0] < 0.1), design, align="none", sigma_m=SIGMA_M))
+    facts = reported(seen)["deviations"]
+    assert facts["compared"] > 0.95 * facts["points"] and seen.rms_m == pytest.approx(SIGMA_M, rel=0.05)
     with pytest.raises(ResultError, match="neither faces nor normals"):
-        compare(request(tmp_path, bare, part[1]))
+        compare(request(tmp_path, bare(None), design))
