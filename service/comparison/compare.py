@@ -15,7 +15,7 @@ from service.comparison.surfaces import Design, Offsets, ScannedSurface, read_de
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
-from service.requests.compare import Alignment, CompareRequest
+from service.requests.register import Alignment, CompareRequest
 from service.scans.points.neighbours import neighbours_are_installed
 from stage.files import replacing, write_text
 from stage.formats.ply import COLOUR, NORMAL, POSITION, header

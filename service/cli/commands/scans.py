@@ -5,8 +5,7 @@ import typer
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.requests.compare import CompareRequest
-from service.requests.register import FuseRequest, RegisterRequest
+from service.requests.register import CompareRequest, FuseRequest, RegisterRequest
 
 MOST_PRINTED = 20
 """Regions that are printed; the table has all."""

@@ -33,7 +33,6 @@ from service.requests import (
 )
 from service.requests.base.base import Choice, Options, Role
 from service.requests.base.options import build, help_text, options_of, typed, values_of
-from service.requests.compare import CompareRequest
 from service.requests.depth import SimulateCwRequest, SimulatePulsedRequest
 from service.requests.imports import lights
 from service.requests.imports import patterns as pattern_images
@@ -45,7 +44,8 @@ from service.requests.inspect_board import GaugeBoardRequest, InspectBoardReques
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
     "blender-extension": [export.BlenderExtensionRequest],
-    "compare": [CompareRequest], "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
+    "compare": [register.CompareRequest], "join": [solve.JoinRequest], "register": [register.RegisterRequest],
+    "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
     "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
     "gauge-board": [GaugeBoardRequest],

@@ -8,7 +8,7 @@ import pytest
 
 from service.comparison.compare import compare
 from service.errors import RequestError
-from service.requests.compare import Alignment, CompareRequest
+from service.requests.register import Alignment, CompareRequest
 from service.scans.points.ply_points import read_ply_faces, read_ply_points
 from stage.errors import ManifestError, ResultError, ScanError
 from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_scan, write_stl
