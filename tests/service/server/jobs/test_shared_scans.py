@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,19 +46,13 @@ def put_registered(made: Harness, names: list[str], views: list[View]) -> Path:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Harness]:
-    """A service with two workers, which serve one test after the other; in the last one of them is killed."""
+    """A service with two workers, which serve one test after the other; the first piece of each job waits for both. In the last test one of
+    them is killed."""
     with harness(tmp_path_factory.mktemp("service"), log_level="debug", takeover_s=0.5) as made:
         for _ in range(WORKERS):
             made.start(PYTHONPATH=SABOTAGE, PIECES="0", TOGETHER=str(made.folder / "together"))
         made.ready(WORKERS)
         yield made
-
-
-@pytest.fixture
-def both(pair: Harness) -> Harness:
-    """The two workers at the beginning of a test; the first piece will wait for both."""
-    shutil.rmtree(pair.folder / "together", ignore_errors=True)
-    return pair
 
 
 @pytest.fixture(scope="module")
@@ -91,30 +84,30 @@ def poses_of(path: Path) -> list[object]:
     return [(scan.name, scan.scan_to_world, scan.pose_covariance) for scan in read_scan_set(path)[1].scans]
 
 
-def test_two_workers_find_the_same_poses_as_one_process(both, depths, alone):
-    job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
-    shared(both, job, WORKERS)
-    assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
-    assert json.loads((both.results(job) / "report.json").read_text())["pairs"] == json.loads(
+def test_two_workers_find_the_same_poses_as_one_process(pair, depths, alone):
+    job = pair.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
+    shared(pair, job, WORKERS)
+    assert poses_of(pair.results(job) / "scan-set.json") == poses_of(alone)
+    assert json.loads((pair.results(job) / "report.json").read_text())["pairs"] == json.loads(
         (alone.parent / "report.json").read_text())["pairs"]
 
 
-def test_two_workers_write_the_same_tiles_as_one_process(both, depths, views, tmp_path):
-    registered = put_registered(both, depths[:4], views)
+def test_two_workers_write_the_same_tiles_as_one_process(pair, depths, views, tmp_path):
+    registered = put_registered(pair, depths[:4], views)
     options = {"tiles": True, "voxel_m": 6e-3}
     expected = fuse(FuseRequest(scan_set=registered, out=tmp_path / "alone", device="cpu", **options)).report_path.parent
-    job = both.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
-    shared(both, job, WORKERS)
+    job = pair.submit(FuseJob(kind="fuse", registered=registered.name, options=FuseOptions(**options)), chunk_frames=8)
+    shared(pair, job, WORKERS)
     tiles = {path.name: path.read_bytes() for path in (expected / "tiles").glob("*.ply")}
-    assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (both.results(job) / "tiles").glob("*.ply")} == tiles
-    assert (both.results(job) / "site.usda").exists()
+    assert len(tiles) > 1 and {path.name: path.read_bytes() for path in (pair.results(job) / "tiles").glob("*.ply")} == tiles
+    assert (pair.results(job) / "site.usda").exists()
 
 
-def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(both, depths, alone):
-    job = both.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
-    holder, _ = both_at_work(both, job)
-    os.kill(both.pid_of(holder), signal.SIGKILL)
-    row = both.ended(job)
+def test_the_scans_and_pairs_of_a_killed_worker_are_done_by_another(pair, depths, alone):
+    job = pair.submit(RegisterJob(kind="register", depths=tuple(depths)), chunk_frames=8)
+    holder, _ = both_at_work(pair, job)
+    os.kill(pair.pid_of(holder), signal.SIGKILL)
+    row = pair.ended(job)
     assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None) and row["worker"] != holder
-    assert poses_of(both.results(job) / "scan-set.json") == poses_of(alone)
-    no_pieces(both, job)
+    assert poses_of(pair.results(job) / "scan-set.json") == poses_of(alone)
+    no_pieces(pair, job)

@@ -1,7 +1,6 @@
 """One job by several workers: the same files as those of one, whoever is killed, and nothing left behind."""
 
 import os
-import shutil
 import signal
 from collections.abc import Callable
 from functools import cache
@@ -60,9 +59,8 @@ def pair(capture, tmp_path_factory):
 
 @pytest.fixture
 def both(pair):
-    """The two workers at the beginning of a test; the first piece will wait for both."""
+    """The two workers at the beginning of a test; the first piece of each job waits for both."""
     pair.until(lambda: sum(pair.is_alive(row["id"]) for row in workers.seen_lately(pair.database)) == WORKERS, "two workers there")
-    shutil.rmtree(together(pair), ignore_errors=True)
     return pair
 
 
@@ -73,7 +71,7 @@ def start(made) -> None:
 
 
 def together(made) -> Path:
-    """The folder in which each worker leaves a file when it has begun a piece: the first piece waits for both."""
+    """The folder in which each worker leaves a file, in a folder of the job, when it has begun a piece."""
     return made.folder / "together"
 
 
@@ -83,7 +81,7 @@ def begin(made, capture: Path, method: str) -> str:
 
 def both_at_work(made, job: str) -> tuple[str, str]:
     """The worker that has the job, and the one that helps, when each has begun a piece and neither waits for the other any more."""
-    made.until(lambda: len(begun(made, job)) == WORKERS == len(list(together(made).glob("*"))), "shared")
+    made.until(lambda: len(begun(made, job)) == WORKERS == len(list((together(made) / job).glob("*"))), "shared")
     holder = made.holder(job)
     return holder, next(worker for worker in begun(made, job) if worker != holder)
 
@@ -134,7 +132,6 @@ def test_a_cancelled_solve_ends_at_both_workers_and_leaves_nothing(both, capture
     both.until(lambda: {"step stopped", "help stopped"} <= set(events_of(both, job, "step stopped", "help stopped")), "stopped")
     no_pieces(both, job)
     assert both.row(job)["state"] == jobs.CANCELLED
-    shutil.rmtree(together(both))  # the first piece waits for both once more
     other = begin(both, capture, "lambert")  # both are free again
     assert both.ended(other)["state"] == jobs.SUCCEEDED
     both.until(lambda: len(begun(both, other)) == WORKERS, "shared")

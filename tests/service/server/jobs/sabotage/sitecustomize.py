@@ -5,7 +5,8 @@ long  half a second in jobs of 300 frames and more, and a tenth in those of 60 a
       tests from the processor
 
 With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
-has begun one: TOGETHER is the folder in which each leaves a file.
+has begun one of the same job, so that neither does all of them before the other has come: TOGETHER is the folder in which each leaves a
+file, in a folder of the job.
 
 Only the process of a worker is changed: the others that begin with it, which watch it, do no jobs and are not kept waiting for its modules.
 """
@@ -68,10 +69,10 @@ if is_worker and "PIECES" in os.environ:
     def claim_together(self, name):
         taken = claim(self, name)
         if taken:
-            together.mkdir(exist_ok=True)
-            (together / self._context.worker).touch()
-            deadline = time.monotonic() + 60
-            while len(list(together.iterdir())) < 2 and time.monotonic() < deadline:
+            begun = together / self._job.id
+            begun.mkdir(parents=True, exist_ok=True)
+            (begun / self._context.worker).touch()
+            while len(list(begun.iterdir())) < 2:
                 time.sleep(0.05)
         return taken
 
