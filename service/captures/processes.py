@@ -4,7 +4,7 @@ import os
 import resource
 import sys
 
-from stage.colour.colour_spaces import VARIABLE, location
+from stage.colour.location import VARIABLE, location
 
 KEPT = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TMPDIR", "LD_LIBRARY_PATH", VARIABLE)
 """Variables of the environment that such a process inherits."""

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stage.colour.colour_spaces import VARIABLE
+from stage.colour.location import VARIABLE
 
 OcioOption = Annotated[str | None, typer.Option(
     "--ocio", metavar="FILE|ocio://…", show_default=False,

@@ -19,8 +19,8 @@ from service.reporting.provenance import choices
 from service.requests.light.frame_range import numbered
 from service.requests.light.picture_options import FrameMatte, Layer
 from service.requests.relight import RelightRequest
-from stage.colour.colour_spaces import BUILT_IN, location
 from stage.colour.configuration import current
+from stage.colour.location import BUILT_IN, location
 from stage.errors import StageError, StorageError
 from stage.formats import exr, exr_checksum
 from stage.stack import fingerprint

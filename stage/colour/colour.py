@@ -8,8 +8,9 @@ from functools import cache
 import numpy as np
 import OpenImageIO as oiio
 
-from stage.colour.colour_spaces import Review, channels_apart, is_linear, linear_space, location
+from stage.colour.colour_spaces import Review, channels_apart, is_linear, linear_space
 from stage.colour.configuration import current
+from stage.colour.location import location
 from stage.errors import ColourError
 from stage.formats.images import fractions
 

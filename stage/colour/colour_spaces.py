@@ -5,7 +5,6 @@ The names listed here are those of the Color Interop Forum; others are those of 
 without loading one.
 """
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -13,14 +12,9 @@ from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, Field
 
+from stage.colour.location import location
 from stage.model import Line
 
-VARIABLE = "OCIO"
-"""The variable of the environment that names an OpenColorIO configuration, as in other programs."""
-BUILT_IN = "ocio://default"
-"""The newest ACES configuration for computer graphics that is built into the library."""
-STUDIO = "ocio://studio-config-latest"
-"""The built-in configuration with the spaces of cameras."""
 NAMES = (
     "lin_rec709_scene", "lin_ap1_scene", "lin_ap0_scene", "lin_rec2020_scene", "lin_p3d65_scene", "lin_adobergb_scene",
     "srgb_texture", "srgb_rec709_scene", "g22_rec709_scene", "g18_rec709_scene", "srgb_p3d65_scene", "g22_adobergb_scene",
@@ -48,12 +42,6 @@ _LINEAR_OF: dict[str, str] = {
 
 
 _AS_GIVEN: ContextVar[bool] = ContextVar("_AS_GIVEN", default=False)
-
-
-def location() -> str:
-    """Return where the configuration of this process lies: the absolute path of a file, or ocio:// and a built-in name."""
-    place = os.environ.get(VARIABLE) or BUILT_IN
-    return place if place.startswith("ocio://") else os.path.abspath(place)
 
 
 def is_linear(space: str) -> bool:

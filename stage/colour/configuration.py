@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
-from stage.colour.colour_spaces import BUILT_IN, NAMES, STUDIO, VARIABLE, location
+from stage.colour.colour_spaces import NAMES
+from stage.colour.location import BUILT_IN, STUDIO, VARIABLE, location
 from stage.errors import ColourError
 
 INTERCHANGE, ACES = "aces_interchange", "lin_ap0_scene"

@@ -18,8 +18,9 @@ import numpy as np
 from stage.capture.capture import Capture
 from stage.capture.light import OffLight
 from stage.capture.manifest import Frame
-from stage.colour.colour_spaces import BUILT_IN, is_linear, location
+from stage.colour.colour_spaces import is_linear
 from stage.colour.configuration import current
+from stage.colour.location import BUILT_IN, location
 from stage.errors import ManifestError, storage
 from stage.files import replacing
 from stage.motion.tracking import Tracking

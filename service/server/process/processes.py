@@ -12,7 +12,7 @@ from service.server.database.engine import Database, open_database
 from service.server.database.schema import is_current
 from service.server.jobs.supervisor import Supervisor
 from service.server.process import devices
-from stage.colour.colour_spaces import VARIABLE, location
+from stage.colour.location import VARIABLE, location
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
 PRIVATE = 0o027

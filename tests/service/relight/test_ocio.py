@@ -11,8 +11,9 @@ from service.errors import RequestError
 from service.requests.answers import JobView
 from service.requests.jobs import RelightJob
 from stage.colour.colour import linearise, rgb_matrix
-from stage.colour.colour_spaces import STUDIO, VARIABLE, linear_space
+from stage.colour.colour_spaces import linear_space
 from stage.colour.configuration import used
+from stage.colour.location import STUDIO, VARIABLE
 from stage.formats import exr
 from tests.reference.colour import ACES_TO_ACESCG, ACES_TO_REC709, AWG4_TO_ACES, logc4_to_linear
 from tests.scenes.captures import edit_frame, edit_manifest, make_scene, rgb, write_capture, write_image

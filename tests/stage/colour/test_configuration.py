@@ -5,9 +5,10 @@ import pytest
 from pydantic import TypeAdapter
 
 from stage.colour.colour import convert, linearise, rgb_matrix, through_view
-from stage.colour.colour_spaces import STUDIO, VARIABLE, LightSpaceName, Review, channels_apart, is_linear, linear_space
+from stage.colour.colour_spaces import LightSpaceName, Review, channels_apart, is_linear, linear_space
 from stage.colour.configuration import current, used
 from stage.colour.environment_maps import read_environment
+from stage.colour.location import STUDIO, VARIABLE
 from stage.errors import ColourError
 from stage.formats import exr
 from tests.reference.colour import ACES_TO_ACESCG, ACES_TO_REC709, AWG4_TO_ACES, logc4_to_linear, slog3_to_linear
