@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,9 +21,6 @@ from tests.service.waiting import until
 
 FREE = {"min_free_bytes": "0", "requests_per_second": "10000", "request_burst": "10000"}
 """Settings of a server that tests ask often, whatever space the disk has left."""
-FIRST_LOOK_S, LAST_LOOK_S = 0.05, 0.5
-"""Seconds between two looks at something, at first and after some seconds: a look takes five thousandths of a second of a core, here and
-in the server."""
 HERE = Path(__file__).resolve().parent
 SABOTAGE = os.pathsep.join([str(HERE / "server" / "jobs" / "sabotage"), str(HERE.parents[1])])
 """PYTHONPATH of processes whose workers do with frames what the variable SABOTAGE says; it has this checkout's `service` too."""
@@ -79,21 +75,23 @@ class Server:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         return httpx2.Client(base_url=self.url, headers=headers, timeout=60)
 
-    def wait(self, client: httpx2.Client, path: str, until: tuple[str, ...], timeout_s: float = 120.0) -> dict:
+    def wait(self, client: httpx2.Client, path: str, states: tuple[str, ...], timeout_s: float = 120.0) -> dict:
         """Look at something until its state is one of these."""
-        began = time.monotonic()
-        deadline = began + timeout_s
-        while True:
+
+        def look() -> dict | None:
             found = client.get(path).raise_for_status().json()
-            if found["state"] in until:
-                return found
-            assert time.monotonic() < deadline, f"{path} is still {found['state']}: {self.log.read_text()[-4000:]}"
-            time.sleep(min(FIRST_LOOK_S + (time.monotonic() - began) / 8, LAST_LOOK_S))
+            return found if found["state"] in states else None
+
+        try:
+            return until(look, f"{path} is not {states} within {timeout_s:g} s", within_s=timeout_s)
+        except AssertionError as error:
+            error.add_note(self.log.read_text()[-4000:])
+            raise
 
 
 @contextmanager
 def serving(folder: Path, *options: str, descriptors: int | None = None, sabotage: str | None = None, **settings: str) -> Iterator[Server]:
-    """Start a server, and end it.
+    """Start a server, and kill it at last.
 
     `settings` beside FREE, without RELIT_ and as text; options of `relit serve` beside --data and --port; files that it may have open at
     most; what its workers do with frames, as jobs/sabotage tells.
@@ -124,10 +122,10 @@ def serving(folder: Path, *options: str, descriptors: int | None = None, sabotag
         until(answers, "the server does not answer", every_s=0.05)
         yield server
     finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-            try:
+        if "--set" in options:  # it ends the commands that it has started
+            process.terminate()
+            with suppress(subprocess.TimeoutExpired):
                 process.wait(90)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its workers too, which would finish their steps first
+        process.wait()

@@ -10,14 +10,21 @@ from typing import TypeVar
 T = TypeVar("T")
 PATIENCE_S = 60.0
 """Far beyond what anything takes, so that a slow machine fails no test."""
+FIRST_LOOK_S, LAST_LOOK_S = 0.02, 0.25
+"""Seconds between two looks at something, at first and after some seconds."""
 
 
-def until(look: Callable[[], T], what: str = "nothing came", *, within_s: float = PATIENCE_S, every_s: float = 0.02) -> T:
-    """Look again and again until there is something, and return it."""
-    deadline = time.monotonic() + within_s
+def until(look: Callable[[], T], what: str = "nothing came", *, within_s: float = PATIENCE_S, every_s: float | None = None) -> T:
+    """Look again and again until there is something, and return it.
+
+    Without `every_s` it looks the less often the longer it has waited: a look takes thousandths of a second of a core, here and often in a
+    server as well.
+    """
+    began = time.monotonic()
     while not (found := look()):
-        assert time.monotonic() < deadline, what
-        time.sleep(every_s)
+        waited = time.monotonic() - began
+        assert waited < within_s, what
+        time.sleep(every_s or min(FIRST_LOOK_S + waited / 16, LAST_LOOK_S))
     return found
 
 

@@ -90,7 +90,7 @@ class Harness:
         assert row is not None
         return row
 
-    def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float = 0.05) -> Any:
+    def until(self, true: Callable[[], Any], what: str, *, within_s: float = WAIT_S, every_s: float | None = None) -> Any:
         """Wait for something, and return it."""
         try:
             return until(true, f"not {what} within {within_s:g} s", within_s=within_s, every_s=every_s)

@@ -81,7 +81,7 @@ def begin(made, capture: Path, method: str) -> str:
 
 def both_at_work(made, job: str) -> tuple[str, str]:
     """The worker that has the job, and the one that helps, when each has begun a piece and neither waits for the other any more."""
-    made.until(lambda: len(begun(made, job)) == WORKERS == len(list((together(made) / job).glob("*"))), "shared")
+    made.until(lambda: len(begun(made, job)) == WORKERS == len(list((together(made) / job).glob("*"))), "shared", every_s=0.05)
     holder = made.holder(job)
     return holder, next(worker for worker in begun(made, job) if worker != holder)
 
