@@ -88,7 +88,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "pye57", "rawpy"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2", "laspy", "pye57", "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):

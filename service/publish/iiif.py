@@ -25,7 +25,8 @@ from stage.files import write_text
 from stage.results.light_basis import numbers
 
 MANIFEST_FILE = "manifest.json"
-FACTS = {"relit:version": "Version", "relit:inputs": "Inputs", "relit:ocio": "Colour configuration"}
+FACTS = {"relit:version": "Version", "relit:inputs": "Inputs", "relit:ocio": "Colour configuration",
+         "relit:ocio_cache_id": "OpenColorIO cache id"}
 """The entries of the provenance that the manifest has, and their labels."""
 SMALL_SIDE = 1024
 """The longest side of images that are there whole."""

@@ -52,7 +52,7 @@ def test_the_manifest_names_pictures_that_are_there(published):
     assert manifest["requiredStatement"]["value"] == {"none": ["A museum"]}
     facts = {entry["label"]["en"][0]: entry["value"]["none"][0] for entry in manifest["metadata"]}
     assert facts == {"Capture": "cap", "Lights": "5", "Version": __version__, "Inputs": facts["Inputs"],
-                     "Colour configuration": current().label}
+                     "Colour configuration": current().label, "OpenColorIO cache id": current().cache_id}
     identifiers, labels = [manifest["id"]], []
     for canvas in manifest["items"]:
         [size] = canvas["service"]
