@@ -15,15 +15,17 @@ from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.results.maps import MAPS_FILE, SurfaceMaps
 from stage.stack.correction import Correction
+from stage.transforms import fibonacci_sphere
 from tests.clients.blender import in_blender
 from tests.clients.scenes import directions, uneven
 from tests.clients.test_conventions import CAMERAS, ball
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import edit_frame, write_exr
 from tests.scenes.surroundings import capture_of, write_frames
 from tests.service.owl import OWL
 
 pytestmark = pytest.mark.long
 
+DOME_LIGHTS = 64
 OWL_LIGHTS = (44, 31)
 """The light of the owl that is nearest to the view axis, and one 20 degrees from it."""
 
@@ -226,6 +228,14 @@ settings(mesh="lod1")
 found["no variants"] = refused(bpy.ops.relit.import_asset)
 settings(mesh="mesh", capture=given["other"], asset=str(folder / "asset.usdz"))
 found["another capture"] = refused(bpy.ops.relit.import_asset)
+
+# photographs of the same ball under a dome, relit under the world of which Blender's render is there already
+environment.HEIGHT = 64
+settings(capture=given["dome"], out=str(folder / "lit"), asset=str(folder / "asset.usda"))
+bpy.ops.relit.import_asset()
+bpy.context.scene.frame_start = bpy.context.scene.frame_end = 1
+settings(light="ENVIRONMENT", method="RELIGHT", guided=False)
+bpy.ops.relit.relight()
 """
 
 
@@ -234,13 +244,23 @@ def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
     for suffix in (".usdz", ".glb"):
         export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / f"asset{suffix}", name="Ball"))
     capture_of(tmp_path / "other", a_ball.camera.model_copy(update={"focal_px": (50.0, 50.0)}), [{"type": "off"}])
-    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other")
+    dome = fibonacci_sphere(DOME_LIGHTS)
+    capture_of(tmp_path / "dome", a_ball.camera, [{"type": "distant", "direction": list(each), "irradiance": [3, 3, 3]} for each in dome],
+               color_space="lin_rec709_scene")
+    for index, each in enumerate(dome):
+        shading = np.maximum(a_ball.normal.astype(float) @ each, 0)[..., None]
+        write_exr(tmp_path / "dome" / f"{index:03d}.exr", 3 / np.pi * a_ball.diffuse_albedo * shading * a_ball.mask[..., None])
+        edit_frame(tmp_path / "dome", index, image=f"{index:03d}.exr")
+    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other", dome=tmp_path / "dome")
     assert found["captured"] == [True, "CAPTURED"]
     d, omega = directions(64)
     cosine = np.maximum(np.einsum("rcx,hwx->rchw", a_ball.normal.astype(float), d), 0)
     truth = a_ball.diffuse_albedo / np.pi * np.einsum("rchw,hwk,hw->rck", cosine, uneven(), omega)
     inside = binary_erosion(a_ball.mask, np.ones((3, 3)))
     assert compare(picture(tmp_path / "environment.exr")[..., :3], truth, inside, scaled=False).rmse < 0.05  # noise of 256 paths
+    relit, rendered = (picture(tmp_path / name)[..., :3] for name in ("lit/relit_frames/frame.0001.exr", "environment.exr"))
+    # a fifth of a steradian for each light of the dome, and the noise of Blender's 256 paths
+    assert compare(relit, rendered, inside, scaled=False).rmse < 0.05
     written = {name: exr.read(tmp_path / "worlds" / f"{name}.exr")[0] for name in ("world", "world.0003", "world.0004")}
     maps = {name: np.stack([found[channel] for channel in "RGB"], axis=-1).reshape(64, 4, 128, 4, 3).mean(axis=(1, 3))
             for name, found in written.items()}
