@@ -117,7 +117,7 @@ def homography(pose: Pose, size: tuple[int, int], grid: tuple[int, int], pitch: 
 
 
 def picture(colours: np.ndarray, pose: Pose, *, size: tuple[int, int] = (640, 480), grid: tuple[int, int] = (6, 4), pitch: float = PITCH,
-            patch: float = PATCH, border: float = 0.035, samples: int = 3, seed: int = 0, beside: Sequence[Rectangle] = ()) -> Picture:
+            patch: float = PATCH, border: float = 0.035, samples: int = 2, seed: int = 0, beside: Sequence[Rectangle] = ()) -> Picture:
     """Return the picture of a chart whose patches reflect `colours` [patches, 3], without noise, each pixel the mean of samples²."""
     width, height = size
     form = homography(pose, size, grid, pitch)

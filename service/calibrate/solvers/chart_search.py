@@ -13,6 +13,8 @@ from service.calibrate.solvers.chart_reference import GRIDS
 from stage.errors import CalibrationError
 
 KINDS = {24: cv2.mcc.MCC24, 140: cv2.mcc.SG140}
+ALIKE = 0.2
+"""Parts of the size of a chart by which corners differ that are cut once."""
 CUTS = (0.5, 0.25, 0.75)
 """Where across a found chart the picture is cut off to look for another: parts of the way from edge to edge."""
 MOST_CHARTS = 3
@@ -58,7 +60,8 @@ def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for shown in pictures:
         for corners in _detected(shown, patches):
-            found.append((shown, corners))
+            if all(np.abs(corners - other).max() > ALIKE * np.ptp(corners, axis=0).max() for _, other in found):
+                found.append((shown, corners))
             yield (corners + 0.5) * max(step, 1.0)
     if not found:
         raise CalibrationError("no chart is found in the picture: give the centres of its corner patches as --corners")
