@@ -32,7 +32,8 @@ def measure(folder: Path, kind: PublishedAs) -> dict[str, float]:
     used = resource.getrusage(resource.RUSAGE_SELF)
     shutil.rmtree(out)
     shutil.rmtree(folder / "cache", ignore_errors=True)
-    return {"seconds": seconds, "cpu_seconds": used.ru_utime + used.ru_stime, "peak_gib": peak_gib(), "files": found.files, "gb": found.size / 1e9}
+    return {"seconds": seconds, "cpu_seconds": used.ru_utime + used.ru_stime, "peak_gib": peak_gib(), "files": found.files,
+            "gb": found.size / 1e9}
 
 
 def main() -> None:

@@ -3,7 +3,8 @@
     python -m benchmarks.clients.panel --picture docs/blender.png
 
 solves the shipped owl by the operators of the panel, renders it under captured lights, and prints the RMSE of each render over the mean of
-its photograph: all pixels of the mask, no factor of brightness. The same of relit frames under its environment as the world, and the render.
+its photograph: all pixels of the mask, no factor of brightness. It does the same with relit frames under the owl's environment as the world
+of the scene, and Blender's render under it.
 """
 
 import argparse

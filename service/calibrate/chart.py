@@ -156,8 +156,8 @@ def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipp
     if best is None:
         raise faults[0]
     if best.agreeing < LEAST * len(chart.names):
-        raise CalibrationError(f"{best.agreeing} of {len(chart.names)} patches of what looks like the chart have its colours: give the centres "
-                               "of its corner patches as --corners, or cover other patches beside it")
+        raise CalibrationError(f"{best.agreeing} of {len(chart.names)} patches of what looks like the chart have its colours: give the "
+                               "centres of its corner patches as --corners, or cover other patches beside it")
     return best
 
 

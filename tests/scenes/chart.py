@@ -13,7 +13,7 @@ from tests.scenes.captures import write_exr, write_manifest
 PITCH, PATCH = 47.0, 40.0
 """Millimetres from patch to patch, and the side of one, of the printed chart of 24."""
 PASSPORT_PATCH = 0.71
-"""The side of a patch of a ColorChecker Passport Photo 2 over their spacing: 100 / 141 in the template of colour-checker-detection 0.2.3."""
+"""The side of a patch of a ColorChecker Passport over their spacing: 100 / 141 in the template of colour-checker-detection 0.2.3."""
 
 
 WHITE_D50 = np.array([0.96422, 1.0, 0.82521])

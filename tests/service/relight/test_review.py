@@ -94,7 +94,7 @@ def test_a_look_of_a_studios_configuration_is_in_the_sheet(relit, capture, tmp_p
 
 @pytest.mark.parametrize(("command", "place"), [("relight", "minimal"), ("shade", "minimal"), ("relight", "ocio://default")])
 def test_display_frames_are_the_frames_through_the_view_and_the_look(relit, capture, tmp_path, command, place):
-    """The minimal configuration in closed form: the look's half of the light, to the power of 1 / 2.5; the other by OpenColorIO's processor."""
+    """The minimal configuration in closed form: the look's half of the light, to the power of 1 / 2.5; the other by OpenColorIO."""
     plain = place == "minimal"
     options = ("--ocio", minimal(tmp_path / "house.ocio"), "--view", "Wall/Plain", "--look", "cold") if plain else (
         "--view", "Display P3 - Display/Un-tone-mapped")
@@ -125,7 +125,8 @@ def test_display_frames_are_the_frames_through_the_view_and_the_look(relit, capt
 
 @pytest.mark.parametrize(("command", "options", "words"), [
     ("relight", ("--look", "warm", "--sheet", "s.png"), "--look: warm is no look of the OpenColorIO configuration ocio://default: give"),
-    ("relight", ("--look", "ACES 1.3 Reference Gamut Compression"), "is for the picture of --sheet or --display: give --sheet or --display too"),
+    ("relight", ("--look", "ACES 1.3 Reference Gamut Compression"),
+     "is for the picture of --sheet or --display: give --sheet or --display too"),
     ("relight", ("--display", "a.png"), "--display a.png: the file name needs one run of # for the frame number, such as frame.####.png"),
     ("relight", ("--display", "a.#.exr"), "--display a.#.exr: frames are PNG here: end the name in .png"),
     ("info", ("--view", "Nice", "--picture", "i.png"), "--view: Nice is no view of the OpenColorIO configuration ocio://default: give"),
