@@ -16,7 +16,7 @@ HOME = Path(__file__).resolve().parents[1]
 ROOTS = ("stage", "kernels", "service")
 PRODUCTS = tuple(f"service.{name}" for name in (
     "solve", "depth", "boards", "relight", "calibrate", "light_estimation", "basis", "captures", "demo", "export", "viewing", "joining",
-    "scans", "sequences", "sharing", "play", "twin", "drive", "rigs", "acquisition", "publish"))
+    "scans", "sequences", "sharing", "play", "twin", "drive", "rigs", "acquisition", "publish", "comparison"))
 """Where stage and kernels meet: captures go in, results come out."""
 WRITERS = ("service.asset",)
 """Meshes and textures of solved maps, and the formats that they are written in."""

@@ -1,17 +1,21 @@
-"""relit register and fuse: the poses of many scans of one object, and the surface of all."""
+"""relit register, fuse and compare: the poses of many scans of one object, the surface of all, and its deviations from a design."""
 
 import typer
 
 from service.cli.printing import print_warnings
 from service.cli.progress import with_bar
 from service.cli.request_commands import local_command
-from service.requests.register import FuseRequest, RegisterRequest
+from service.requests.register import CompareRequest, FuseRequest, RegisterRequest
+
+MOST_PRINTED = 20
+"""Regions that are printed; the table has all."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "register", _register)
     local_command(app, "fuse", _fuse)
+    local_command(app, "compare", _compare)
 
 
 def _register(request: RegisterRequest) -> None:
@@ -49,3 +53,29 @@ def _fuse(request: FuseRequest) -> None:
         print(f"holes    {holes['count']}, {1e3 * holes['open_length_m']:.4g} mm around; {holes['closed_share']:.1%} of the surface is "
               "there")
     print_warnings(result.warnings)
+
+
+def _compare(request: CompareRequest) -> None:
+    from service.comparison.compare import compare
+
+    result = with_bar(compare, request)
+    print(f"scan     {result.deviations_path}")
+    print(f"picture  {result.picture_path}")
+    print(f"report   {result.report_path}")
+    if result.regions_path is not None:
+        print(f"regions  {result.regions_path}")
+    print(f"placed   to {1e3 * result.placement_sigma_m:.3g} mm (σ along the surface's normal)")
+    print(f"deviates {1e3 * result.median_m:+.3g} mm in the median, {1e3 * result.rms_m:.3g} mm RMS; σ of a point "
+          f"{1e3 * result.sigma_m:.3g} mm")
+    if result.regions:
+        print(f"faults   of {1e3 * result.smallest_fault_m:.3g} mm across and more are looked for")
+    for region in result.regions[:MOST_PRINTED]:
+        extremes = "" if region.least_m is None or region.most_m is None else (
+            f" {1e3 * region.least_m:+.3g} to {1e3 * region.most_m:+.3g} mm, ± {1e3 * (region.most_sigma_m or 0):.2g}")
+        print(f"region   {region.name}: {region.verdict}{extremes}; allowed {1e3 * region.low_m:+.3g} to {1e3 * region.high_m:+.3g}, "
+              f"{region.seen:.0%} seen" + (f", something else on {region.strange} patches" if region.strange else ""))
+    if len(result.regions) > MOST_PRINTED:
+        print(f"regions  {len(result.regions) - MOST_PRINTED} more are in the table")
+    print_warnings(result.warnings)
+    if not result.passed:
+        raise typer.Exit(1)

@@ -12,6 +12,7 @@ TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2"
          "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 SIGMA, CONFIDENCE = "sigma", "confidence"
+LIST, CORNERS = "list ", ("vertex_indices", "vertex_index")
 MOST_POINTS = 2**31
 
 
@@ -29,7 +30,7 @@ class _Element(NamedTuple):
     name: str
     entries: int
     properties: list[tuple[str, str]]
-    """Name and type of each; the type of a list is `list`."""
+    """Name and type of each; the type of a list is LIST and the types of its length and its entries."""
 
 
 def read_ply_points(path: Path) -> PlyPoints:
@@ -42,7 +43,7 @@ def read_ply_points(path: Path) -> PlyPoints:
         Turk, "The PLY Polygon File Format", 1994.
     """
     with storage("read", path), open(path, "rb") as stream:
-        order, elements, start = _header(stream, path)
+        order, elements, _, start = _header(stream, path)
         stream.seek(start)
         values = _ascii(stream, elements, path) if order == "ascii" else _binary(stream, FORMATS[order], elements, path)
     missing = [name for name in POSITION if name not in values]
@@ -66,8 +67,44 @@ def read_ply_points(path: Path) -> PlyPoints:
                      None if confidence is None else confidence[:, 0].astype(np.float32))
 
 
-def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
-    """Return the format, the elements, and the position behind the header."""
+def read_ply_faces(path: Path, vertices: int) -> np.ndarray | None:
+    """Return the faces of a PLY file whose vertices they follow, [F, 3] int64 numbers of vertices, or None if it has none.
+
+    Args:
+        vertices: number of vertices that were read.
+
+    Raises:
+        ResultError: it has faces that are no triangles, or of vertices that are not there or were left out.
+    """
+    with storage("read", path), open(path, "rb") as stream:
+        order, elements, further, start = _header(stream, path)
+        if not further or not further[0].entries:
+            return None
+        face = further[0]
+        lists = [(name, kind) for name, kind in face.properties if kind.startswith(LIST)]
+        if face.name != "face" or len(face.properties) != 1 or len(lists) != 1 or lists[0][0] not in CORNERS:
+            raise ResultError(f"{path}: {face.name}, its element behind the vertices, is no plain list of the vertices of faces")
+        stream.seek(start)
+        if order == "ascii":
+            for _ in range(sum(element.entries for element in elements)):
+                stream.readline()
+            table = np.array([line.split()[:4] for line in stream.read().splitlines()[:face.entries]], dtype=object)
+            corners = table.astype(np.int64) if table.ndim == 2 else np.zeros((0, 4), dtype=np.int64)
+        else:
+            for element in elements:
+                stream.seek(element.entries * sum(np.dtype(TYPES[kind]).itemsize for _, kind in element.properties), 1)
+            count, index = (FORMATS[order] + TYPES[kind] for kind in lists[0][1].split()[1:])
+            values = np.fromfile(stream, dtype=[("count", count), ("at", index, 3)], count=face.entries)
+            corners = np.column_stack([values["count"], values["at"]]).astype(np.int64)
+    if len(corners) != face.entries or (corners[:, 0] != 3).any():
+        raise ResultError(f"{path}: its {face.entries} faces are no triangles, or it is truncated")
+    if corners[:, 1:].min() < 0 or corners[:, 1:].max() >= elements[-1].entries or vertices != elements[-1].entries:
+        raise ResultError(f"{path}: has a face of a vertex that is not there, or vertices whose coordinates are not finite")
+    return corners[:, 1:]
+
+
+def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], list[_Element], int]:
+    """Return the format, the elements up to the vertices, those behind them, and the position behind the header."""
     raw = stream.read(MAX_HEADER)
     end = raw.find(b"end_header")
     behind = raw.find(b"\n", end) + 1
@@ -81,8 +118,8 @@ def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
                 order = name
             case ["element", name, count] if count.isdecimal() and int(count) <= MOST_POINTS:
                 elements.append(_Element(name, int(count), []))
-            case ["property", "list", _, _, name] if elements:
-                elements[-1].properties.append((name, "list"))
+            case ["property", "list", count, kind, name] if elements and count in TYPES and kind in TYPES:
+                elements[-1].properties.append((name, f"{LIST}{count} {kind}"))
             case ["property", kind, name] if elements and kind in TYPES:
                 elements[-1].properties.append((name, kind))
             case [("comment" | "obj_info"), *_] | []:
@@ -94,9 +131,9 @@ def _header(stream: BinaryIO, path: Path) -> tuple[str, list[_Element], int]:
     place = next((index for index, element in enumerate(elements) if element.name == "vertex"), None)
     if place is None or elements[place].entries == 0:
         raise ResultError(f"{path}: has no vertices")
-    if any(kind == "list" for element in elements[:place + 1] for _, kind in element.properties):
+    if any(kind.startswith(LIST) for element in elements[:place + 1] for _, kind in element.properties):
         raise ResultError(f"{path}: has lists before the end of its vertices: write the vertices first, without lists")
-    return order, elements[:place + 1], behind
+    return order, elements[:place + 1], elements[place + 1:], behind
 
 
 def _binary(stream: BinaryIO, order: str, elements: list[_Element], path: Path) -> dict[str, np.ndarray]:

@@ -44,7 +44,8 @@ from service.requests.inspect_board import GaugeBoardRequest, InspectBoardReques
 COMMANDS: dict[str, list[type[Options]]] = {
     "solve": [solve.SolveRequest], "export": [export.ExportRequest], "inspect": [export.InspectRequest],
     "blender-extension": [export.BlenderExtensionRequest],
-    "join": [solve.JoinRequest], "register": [register.RegisterRequest], "fuse": [register.FuseRequest],
+    "compare": [register.CompareRequest], "join": [solve.JoinRequest], "register": [register.RegisterRequest],
+    "fuse": [register.FuseRequest],
     "depth": [depth.DepthRequest], "scan": [depth.ScanRequest],
     "separate": [depth.SeparateRequest], "inspect-board": [InspectBoardRequest],
     "gauge-board": [GaugeBoardRequest],
@@ -206,6 +207,7 @@ NO_JOBS = {
     "publish": "makes files for another web server", "capture": "switches lamps and releases a camera of this machine",
     "play": "drives lamps in the network of this machine", "twin": "listens in the network of this machine",
     "blender-extension": "writes a file for another program of this machine",
+    "compare": "reads a design that is no capture",
     "info": "prints", "inspect": "prints", "doctor": "prints", "jobs": "asks the service", "hooks": "asks the service",
     "submit": "asks the service",
     "serve": "is the service", "worker": "is the service", "audit": "is for its operator", "backup": "is for its operator",

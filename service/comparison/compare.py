@@ -1,0 +1,201 @@
+"""Compare a scan with its design: read → place → deviations → verdicts → deviations.ply, regions.csv, comparison.png, report.json."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kernels import device as devices
+from service.boards.stitching.regions import Verdict
+from service.comparison.deviations import Deviations, deviations_of, patches_of, sigma_of, standing_on
+from service.comparison.picture import BINS, PICTURE_FILE, colours_of, span_of, write_picture
+from service.comparison.placing import Placement, place
+from service.comparison.regions import REGIONS_FILE, RegionVerdict, decide, inside, table
+from service.comparison.surfaces import Design, Offsets, ScannedSurface, read_design, read_scanned
+from service.errors import RequestError
+from service.reporting.progress import Progress, Timings
+from service.reporting.provenance import REPORT_FILE, report
+from service.requests.register import Alignment, CompareRequest
+from service.scans.points.neighbours import neighbours_are_installed
+from stage.files import replacing, write_text
+from stage.formats.ply import COLOUR, NORMAL, POSITION, header
+from stage.sets.scan_set import UNITS_M
+from stage.sets.tolerance_regions import ToleranceRegion, read_tolerances
+from stage.stack import fingerprint
+
+DEVIATIONS_FILE = "deviations.ply"
+REACH = 0.02
+"""The part of the design's size within which points belong to it."""
+PATCH_SPACINGS = 4.0
+"""Side of a patch in distances of neighbouring points: it holds some sixteen."""
+SPACING_POINTS = 2000
+"""Points whose distances to their neighbours are looked at."""
+WHOLE = "whole surface"
+FAR = 0.1
+"""Part of the scan that does not belong to the design from which it is said."""
+
+
+class CompareResult(NamedTuple):
+    """The files of a comparison and its findings."""
+
+    deviations_path: Path
+    picture_path: Path
+    report_path: Path
+    regions_path: Path | None
+    """None: nothing was judged."""
+    median_m: float
+    rms_m: float
+    """Median and root mean square of the deviations."""
+    sigma_m: float
+    """Median of their σ."""
+    placement_sigma_m: float
+    """Largest standard deviation of the place of the surface by that of the pose."""
+    smallest_fault_m: float
+    """Side of the smallest fault that was looked for."""
+    regions: tuple[RegionVerdict, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all regions are within their tolerances."""
+        return all(region.verdict is Verdict.PASS for region in self.regions)
+
+
+def compare(request: CompareRequest, progress: Progress | None = None) -> CompareResult:
+    """Lay a scan on its design, and say by how much it deviates, how sure that is, and which regions are within their tolerances.
+
+    Raises:
+        RequestError: small_gicp is not installed.
+        ScanError: the scan cannot be laid on the design.
+        StageError: a file is wrong, damaged or missing.
+        StorageError: the results cannot be written.
+    """
+    if not neighbours_are_installed():
+        raise RequestError("a scan is laid on its design with small_gicp, which is not installed: pip install 'relit[scans]'")
+    timings = Timings(progress)
+    timings.stage("read", 1)
+    regions, unit_m = _regions(request)
+    device = devices.resolve(request.device)
+    design = read_design(request.design, UNITS_M[request.design_unit], device=device)
+    scan = read_scanned(request.scan, UNITS_M[request.scan_unit], request.sigma_m)
+    reach = request.reach_m or REACH * design.size
+    timings.stage("place", 1)
+    placement = _place(request, design, scan, reach, regions, unit_m)
+    timings.stage("deviations", 1)
+    found = deviations_of(design, scan, placement, reach)
+    sigma = sigma_of(found, placement, request.shared_sigma_m)
+    spacing = _spacing(scan.points)
+    patch = PATCH_SPACINGS * spacing if request.smallest_fault_m is None else request.smallest_fault_m / 2
+    patches = patches_of(found, design, placement, patch_m=patch, shared_m=request.shared_sigma_m)
+    strange = standing_on(design, found, patches, patch_m=patch)
+    verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
+                         least_seen=request.least_seen)
+    warnings = _warnings(scan, placement, found)
+    timings.stage("write", 1)
+    span = span_of(found)
+    colours = colours_of(found, span)
+    deviations_path, picture_path, report_path = (request.out / name for name in (DEVIATIONS_FILE, PICTURE_FILE, REPORT_FILE))
+    _write_ply(deviations_path, scan, found, sigma, colours)
+    write_picture(picture_path, found, colours, span, spacing)
+    regions_path = request.out / REGIONS_FILE if verdicts else None
+    if regions_path is not None:
+        write_text(regions_path, table(verdicts))
+    write_text(report_path, report(
+        request, inputs={"scan": _input(request.scan), "design": _input(request.design)}, device=devices.describe(device),
+        timings_s=timings.close(), placement=_placement_facts(placement), deviations=_facts(found, sigma, len(scan.points), span),
+        sigma_source=scan.sigma_source, reach_m=reach, smallest_fault_m=2 * patch, patches=len(patches.deviation),
+        decided_at_sigma=round(k, 3), regions=[region._asdict() for region in verdicts], warnings=warnings))
+    return CompareResult(deviations_path, picture_path, report_path, regions_path, float(np.median(found.distance)),
+                         float(np.sqrt(np.mean(found.distance**2))), float(np.median(sigma)), placement.sigma_m, 2 * patch,
+                         tuple(verdicts), tuple(warnings))
+
+
+def _regions(request: CompareRequest) -> tuple[list[ToleranceRegion], float]:
+    """Return the regions that are judged, and the unit of their boxes and limits in metres."""
+    regions: list[ToleranceRegion] = []
+    unit_m = 1.0
+    if request.regions is not None:
+        tolerances = read_tolerances(request.regions)
+        regions, unit_m = list(tolerances.regions), UNITS_M[tolerances.unit]
+    if request.tolerance_m is not None:
+        low, high = request.tolerance_m
+        regions.append(ToleranceRegion(name=WHOLE, tolerance=(low / unit_m, high / unit_m)))
+    return regions, unit_m
+
+
+def _place(request: CompareRequest, design: Design, scan: ScannedSurface, reach: float, regions: list[ToleranceRegion], unit_m: float
+           ) -> Placement:
+    datums = [region for region in regions if region.datum]
+    if request.align is Alignment.NONE:
+        if datums:
+            raise RequestError(f"--align none: the scan stays where it is, but region {datums[0].name} is a datum: leave one of them out")
+        return Placement(np.eye(4), design.points.mean(axis=0), np.zeros((6, 6)), 0, 0, 0.0)
+
+    def of_datum(found: Offsets) -> np.ndarray:
+        return np.any([inside(region, found.at, design.normals[found.face], unit_m) for region in datums], axis=0)
+
+    return place(design, scan, search=request.align is Alignment.SEARCH, reach_m=reach, datum=of_datum if datums else None)
+
+
+def _spacing(points: np.ndarray) -> float:
+    """Return the median distance of a point to its fourth neighbour, which on a square grid is one step."""
+    from scipy.spatial import cKDTree
+
+    chosen = points[np.random.default_rng(0).permutation(len(points))[:SPACING_POINTS]]
+    return float(np.median(cKDTree(points).query(chosen, k=5)[0][:, 4]))
+
+
+def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations) -> list[str]:
+    warnings = []
+    if placement.rivals:
+        warnings.append(f"{placement.rivals} other poses fit about as well, as of a part that looks the same when it is turned: regions "
+                        "may be those of another side; place the scan roughly, and give --align refine")
+    if placement.held:
+        warnings.append(f"the surface leaves {placement.held} of 6 motions of the scan open, as that of a cylinder about its axis: they "
+                        "stay as they are, and what is shifted along the surface is not seen")
+    if (far := 1 - len(found.near) / len(scan.points)) > FAR:
+        warnings.append(f"{far:.0%} of the scan lie farther from the design than --reach-m, or face another way, and are not compared: a "
+                        "fixture, or a larger fault")
+    if scan.sigma_source == "estimated":
+        warnings.append("the file of the scan has no σ: it is taken from the scatter of the points, without errors that neighbours share: "
+                        "give --shared-sigma-m")
+    return warnings
+
+
+def _input(path: Path) -> dict[str, Any]:
+    return {"path": str(path)} if path.is_dir() else {"path": str(path), "content": fingerprint.digest(path)}
+
+
+def _placement_facts(placement: Placement) -> dict[str, Any]:
+    return {"design_from_scan": placement.pose.tolist(), "pivot_m": placement.pivot.tolist(), "covariance": placement.covariance.tolist(),
+            "sigma_m": placement.sigma_m, "other_poses": placement.rivals, "open_motions": placement.held}
+
+
+def _facts(found: Deviations, sigma: np.ndarray, points: int, span: float) -> dict[str, Any]:
+    low, median, high = np.percentile(found.distance, (2.5, 50, 97.5))
+    count, edges = np.histogram(found.distance, bins=BINS, range=(-span, span))
+    return {"points": points, "compared": len(found.near), "mean_m": float(found.distance.mean()), "median_m": float(median),
+            "rms_m": float(np.sqrt(np.mean(found.distance**2))), "least_m": float(found.distance.min()),
+            "most_m": float(found.distance.max()), "p2_5_m": float(low), "p97_5_m": float(high), "sigma_median_m": float(np.median(sigma)),
+            "histogram": {"edges_m": edges.tolist(), "points": count.tolist(), "below": int((found.distance < -span).sum()),
+                          "above": int((found.distance > span).sum())}}
+
+
+def _write_ply(path: Path, scan: ScannedSurface, found: Deviations, sigma: np.ndarray, colours: np.ndarray) -> None:
+    """Write the placed scan with its deviations and their σ, NaN where a point does not belong to the design."""
+    kind = np.dtype([*((name, "<f4") for name in (*POSITION, *NORMAL, "deviation", "sigma")), *((name, "u1") for name in COLOUR)])
+    values = np.empty(len(scan.points), dtype=kind)
+    for names, columns in ((POSITION, found.placed), (NORMAL, found.normals), (COLOUR, np.rint(255 * colours))):
+        for column, name in enumerate(names):
+            values[name] = columns[:, column]
+    for name, known in (("deviation", found.distance), ("sigma", sigma)):
+        values[name] = np.nan
+        values[name][found.near] = known
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        comments = ("deviations from a design by relit compare", "coordinates in metres, in the frame of the design")
+        stream.write(header(kind, len(values), comments, faces=None if scan.faces is None else len(scan.faces)))
+        values.tofile(stream)
+        if scan.faces is not None:
+            entries = np.empty(len(scan.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+            entries["count"], entries["corners"] = 3, scan.faces
+            entries.tofile(stream)

@@ -1,0 +1,144 @@
+"""The two surfaces of a comparison: the scan as points with normals, and the design as triangles in which nearest points are searched."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.surface.nearest import NearestOnMesh
+from service.scans.fusion.fuse import MESH_FILE
+from service.scans.points.planes import local_planes, robust_scatter
+from service.scans.points.ply_points import read_ply_faces, read_ply_points
+from service.scans.viewpoints import find_viewpoints
+from stage.errors import ResultError
+from stage.formats.triangles import Triangles, read_triangles, without_empty_faces
+
+PLY = ".ply"
+ON_SURFACE = 1e-6
+"""Points nearer than this part of the design's size lie on it: which way they are off is told by the face alone."""
+LEAST_SCAN = 100
+"""The fewest points of a scan that is compared."""
+
+
+class ScannedSurface(NamedTuple):
+    """The points of a scan in its own frame, metres."""
+
+    points: np.ndarray  # [n, 3] float64
+    normals: np.ndarray  # [n, 3] float64, unit, outward
+    sigma: np.ndarray  # [n] float64, standard deviation across the surface
+    sigma_source: str
+    """`measured` (in the file), `declared` (an option) or `estimated` (from the scatter around local planes)."""
+    faces: np.ndarray | None  # [f, 3] int; None: it is a set of points
+
+    @property
+    def size(self) -> float:
+        """The diagonal of the box around the points, metres."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+
+
+class Offsets(NamedTuple):
+    """Points against the design: what is nearest to each, within reach."""
+
+    near: np.ndarray  # [m] int64: the points within reach
+    distance: np.ndarray  # [m] float64 metres, positive outside of the design
+    across: np.ndarray  # [m, 3] float64: unit vector along which the distance counts, outward
+    at: np.ndarray  # [m, 3] float64 metres: the nearest points of the design
+    face: np.ndarray  # [m] int32
+
+
+class Design:
+    """The design of a part, metres."""
+
+    def __init__(self, mesh: Triangles, *, device: str) -> None:
+        self.points, self.faces = mesh
+        corners = self.points[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normals, axis=1)
+        self.normals: np.ndarray = normals / length[:, None]
+        self.areas: np.ndarray = length / 2
+        self.size: float = float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        self._corners, self._search = corners, NearestOnMesh(self.points, self.faces, device=device)
+
+    def sample(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return points [count, 3] that lie evenly on the surface, always the same, and the faces [count] that they lie on."""
+        random = np.random.default_rng(0)
+        total = np.cumsum(self.areas)
+        face = np.searchsorted(total, (np.arange(count) + random.random(count)) / count * total[-1]).clip(max=len(total) - 1)
+        one, other = random.random((2, count))
+        root = np.sqrt(one)
+        share = np.stack([1 - root, root * (1 - other), root * other], axis=1)
+        return np.einsum("nk,nki->ni", share, self._corners[face]), face
+
+    def offsets(self, points: np.ndarray, within: float) -> Offsets:
+        """Return where points [n, 3] in the frame of the design lie against it, those that are nearer than `within` metres."""
+        found = self._search.search(points, within)
+        near = np.flatnonzero(found.face >= 0)
+        face = found.face[near]
+        at = np.einsum("nk,nki->ni", found.share[near], self._corners[face])
+        apart = points[near] - at
+        far = np.linalg.norm(apart, axis=1)
+        sign = np.where(found.outside[near], 1.0, -1.0)
+        inside = far > ON_SURFACE * self.size
+        across = np.where(inside[:, None], apart * (sign / np.maximum(far, 1e-300))[:, None], self.normals[face])
+        return Offsets(near, np.where(inside, sign * far, (apart * self.normals[face]).sum(axis=1)), across, at, face)
+
+
+def read_design(path: Path, unit_m: float, *, device: str) -> Design:
+    """Read the design of a part, whose coordinates are in a unit of so many metres."""
+    if path.suffix.lower() == PLY:
+        points = read_ply_points(path).points
+        faces = read_ply_faces(path, len(points))
+        if faces is None:
+            raise ResultError(f"{path}: has no faces: a design is a surface")
+        mesh = without_empty_faces(points, faces, path)
+    else:
+        mesh = read_triangles(path)
+    return Design(mesh._replace(points=mesh.points * unit_m), device=device)
+
+
+def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSurface:
+    """Read a scan, whose coordinates are in a unit of so many metres.
+
+    Raises:
+        ResultError: it has too few points, or nothing tells which side of it is outside: faces, normals, or that it was all seen from
+            one place.
+    """
+    file = path / MESH_FILE if path.is_dir() else path
+    if file.suffix.lower() == PLY:
+        ply = read_ply_points(file)
+        points, normals, sigma, faces = ply.points * unit_m, ply.normals, ply.sigma, read_ply_faces(file, len(ply.points))
+    else:
+        points, faces = read_triangles(file)
+        points, normals, sigma = points * unit_m, None, None
+    if len(points) < LEAST_SCAN:
+        raise ResultError(f"{file}: has {len(points)} points: {LEAST_SCAN} are the fewest that are compared")
+    if normals is None:
+        normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
+    outward = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    source = "declared" if sigma_m is not None else "measured" if sigma is not None else "estimated"
+    if sigma_m is not None:
+        spread = np.full(len(points), sigma_m)
+    elif sigma is not None:
+        spread = sigma * unit_m
+    else:
+        scatter = robust_scatter(local_planes(points.astype(np.float32), origin=points.mean(axis=0)))
+        if not np.isfinite(scatter):
+            raise ResultError(f"{file}: its {len(points)} points are too few or too far apart to tell their σ: give --sigma-m")
+        spread = np.full(len(points), scatter)
+    return ScannedSurface(points, outward, spread, source, faces)
+
+
+def _estimated_normals(points: np.ndarray, file: Path) -> np.ndarray:
+    """Return normals of points [n, 3] towards the place from which all of them were seen."""
+    found = find_viewpoints([points], [None])
+    if found.place is None:
+        raise ResultError(f"{file}: has neither faces nor normals, and nothing else says which side of its points is outside: "
+                          f"{found.reason}")
+    return local_planes(points.astype(np.float32), origin=found.place[0]).normals.astype(np.float64)
+
+
+def _normals_of_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the normals of vertices [n, 3], those of their faces weighted by area; 0 of a vertex without faces."""
+    corners = points[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.stack([np.bincount(faces.reshape(-1), np.repeat(column, 3), minlength=len(points)) for column in across.T], axis=1)

@@ -1,0 +1,193 @@
+"""Scans with known faults and poses against their designs."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from service.comparison.compare import compare
+from service.errors import RequestError
+from service.requests.register import Alignment, CompareRequest
+from service.scans.points.ply_points import read_ply_faces, read_ply_points
+from stage.errors import ManifestError, ResultError, ScanError
+from tests.scenes.machined_part import SIGMA_M, Part, any_pose, cylinder, machined_part, scan_of, write_scan, write_stl
+
+REGIONS = [{"name": "top", "facing": [0, 0, 1], "tolerance": [-0.08, 0.08]},
+           {"name": "boss", "box": [[0, -10, 9], [30, 20, 30]], "tolerance": [-0.08, 0.08]},
+           {"name": "below", "facing": [0, 0, -1], "tolerance": [-0.08, 0.08]},
+           {"name": "as noisy as tight", "facing": [1, 0, 0], "tolerance": [-0.01, 0.01]}]
+
+
+def below(points, normals):
+    return normals[:, 2] < -0.9
+
+
+def dent(points, normals, depth=0.15, radius=4.0):
+    return np.where((np.hypot(points[:, 0] + 10, points[:, 1] - 15) < radius) & (normals[:, 2] > 0.9), -depth, 0)
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory) -> tuple[Part, object]:
+    made = machined_part()
+    return made, write_stl(tmp_path_factory.mktemp("design") / "part.stl", made)
+
+
+def regions(folder, entries=REGIONS):
+    path = folder / "tolerances.json"
+    path.write_text(json.dumps({"schema": "relit.tolerances/1", "unit": "mm", "regions": entries}))
+    return path
+
+
+def request(folder, scan, design, **given) -> CompareRequest:
+    return CompareRequest(scan=scan, design=design, out=folder / "out", device="cpu", **given)
+
+
+def reported(result) -> dict:
+    return json.loads(result.report_path.read_text())
+
+
+def test_a_dent_is_found_wherever_the_scan_lies(tmp_path, part):
+    made, design = part
+    random = np.random.default_rng(3)
+    pose = any_pose(random)
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, random, 40_000, pose, below, dent))
+    result = compare(request(tmp_path, scan, design, regions=regions(tmp_path)))
+    verdicts = {region.name: region for region in result.regions}
+    assert {name: str(each.verdict) for name, each in verdicts.items()} == {
+        "top": "fail", "boss": "pass", "below": "not inspected", "as noisy as tight": "undecided"}
+    # the mean of a patch within the dent: sixteen points of the noise, whose smallest of some hundred is 2.5 σ off
+    assert verdicts["top"].least_m == pytest.approx(-1.5e-4, abs=3 * SIGMA_M / 4)
+    assert verdicts["below"].seen < 0.2 and min(verdicts[name].seen for name in ("top", "boss")) > 0.99
+    placement = reported(result)["placement"]
+    motion = np.array(placement["design_from_scan"]) @ pose
+    turn = np.array([motion[2, 1] - motion[1, 2], motion[0, 2] - motion[2, 0], motion[1, 0] - motion[0, 1]]) / 2
+    pivot, covariance = np.array(placement["pivot_m"]), np.array(placement["covariance"])
+    off = np.concatenate([turn, motion[:3, :3] @ pivot + motion[:3, 3] - pivot])
+    assert off @ np.linalg.solve(covariance, off) < 27.9  # χ² of six numbers at 1e-4
+    assert (placement["other_poses"], placement["open_motions"]) == (0, 0)
+    points = read_ply_points(result.deviations_path)
+    assert points.colours is not None and len(points.points) == reported(result)["deviations"]["points"]
+    assert [row["verdict"] for row in csv.DictReader(result.regions_path.open())] == [region.verdict for region in result.regions]
+    assert result.picture_path.stat().st_size > 0 and not result.passed
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("depth", [0.0, 0.12])
+def test_verdicts_over_random_scans(tmp_path, part, depth):
+    """Of 10 regions within their tolerance none fails, and of 10 with a dent beyond it none passes, at a probability of 5 % for each scan
+    of any wrong one."""
+    made, design = part
+    wrong = 0
+    for seed in range(10):
+        scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(seed), 20_000, None, below,
+                                                         lambda *of: dent(*of, depth=depth, radius=6.0)))
+        (top,) = compare(request(tmp_path, scan, design, regions=regions(tmp_path, REGIONS[:1]), align=Alignment.REFINE)).regions
+        wrong += top.verdict == ("fail" if depth == 0 else "pass")
+    assert wrong <= 2  # binomial: three and more of ten at 5 % are seen in 1 % of such tests
+
+
+def test_σ_covers_the_deviations(tmp_path, part):
+    made, design = part
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(5), 20_000))
+    points = read_ply_points(compare(request(tmp_path, scan, design, align="none")).deviations_path)
+    assert np.nanmedian(points.sigma) == pytest.approx(SIGMA_M, rel=1e-3)  # float32
+    assert compare(request(tmp_path, scan, design, align="none")).rms_m == pytest.approx(SIGMA_M, rel=0.03)  # √(1 / 2n) is .005; edges
+    estimated = compare(request(tmp_path, write_scan(tmp_path / "bare.ply", scan_of(made, np.random.default_rng(5), 20_000), None), design,
+                                align="none"))
+    assert reported(estimated)["sigma_source"] == "estimated" and "shared-sigma" in " ".join(estimated.warnings)
+
+
+def test_a_datum_carries_the_scan(tmp_path, part):
+    """The boss stands .05 mm too high: laid on the plate alone, all of it shows there; laid by all, the plate takes a part of it."""
+    made, design = part
+
+    def raised(points, normals):
+        return np.where((points[:, 2] > 21) & (normals[:, 2] > 0.9), 0.05, 0)
+
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(2), 30_000, None, None, raised))
+    given = [{"name": "plate", "facing": [0, 0, -1], "tolerance": [-1, 1], "datum": True},
+             {"name": "boss", "box": [[0, -10, 21], [30, 20, 30]], "facing": [0, 0, 1], "tolerance": [-1, 1]}]
+    result = compare(request(tmp_path, scan, design, regions=regions(tmp_path, given), align="refine"))
+    plate, boss = result.regions
+    assert boss.mean_m == pytest.approx(5e-5, abs=4 * SIGMA_M / np.sqrt(500)) and abs(plate.mean_m) < 4 * SIGMA_M / np.sqrt(5000)
+    assert reported(result)["placement"]["open_motions"] == 3  # a plane leaves two shifts and a turn open
+
+
+def test_what_the_surface_leaves_open_is_said(tmp_path):
+    random = np.random.default_rng(1)
+    corners = np.array([[x, y, z] for x in (-20, 20) for y in (-12, 12) for z in (-3, 3)], float)
+    plate = Part(corners, np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
+    for number, made in enumerate((cylinder(), plate)):
+        scan = write_scan(tmp_path / "scan.ply", scan_of(made, random, 10_000, any_pose(random)))
+        result = compare(request(tmp_path, scan, write_stl(tmp_path / "design.stl", made), tolerance_m=(-1e-4, 1e-4)))
+        placement = reported(result)["placement"]
+        assert placement["open_motions"] == (1 if number == 0 else 0) and placement["other_poses"] > 0
+        assert any("other poses" in warning for warning in result.warnings)
+        assert result.rms_m == pytest.approx(SIGMA_M, rel=0.1) and result.passed  # any of these poses fits
+
+
+def test_meshes_are_compared_with_their_faces(tmp_path, part):
+    made, design = part
+    scan = write_stl(tmp_path / "scan.stl", made)
+    result = compare(request(tmp_path, scan, design, scan_unit="mm", align="none", sigma_m=1e-5))
+    assert result.rms_m < 1e-8  # float32 of a mesh of 80 mm
+    assert len(read_ply_faces(result.deviations_path, len(read_ply_points(result.deviations_path).points))) == len(made.faces)
+    again = compare(request(tmp_path, result.deviations_path, result.deviations_path, design_unit="m", align="none", sigma_m=1e-5))
+    assert again.rms_m < 1e-8
+
+
+def test_scans_of_something_else_are_refused(tmp_path, part):
+    made, design = part
+    random = np.random.default_rng(4)
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, random, 5000, any_pose(random)))
+    with pytest.raises(ScanError, match="--scan-unit"):
+        compare(request(tmp_path, scan, design, scan_unit="mm"))
+    other = write_stl(tmp_path / "other.stl", cylinder(radius=20, length=90))
+    with pytest.raises(ScanError, match="does not lie on the design"):
+        compare(request(tmp_path, scan, other))
+    with pytest.raises(RequestError, match="datum"):
+        compare(request(tmp_path, scan, design, align="none", regions=regions(tmp_path, [{**REGIONS[0], "datum": True}])))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_stands_on_a_region_keeps_it_from_passing(tmp_path, part):
+    """A peg of 3 mm across and 12 mm high, whose points do not belong to the design, is less than a hundredth of the top."""
+    made, design = part
+    random = np.random.default_rng(6)
+    peg = scan_of(cylinder(24, 1.5, 12), random, 1500)
+    plain = scan_of(made, random, 40_000, None, below)
+    both = plain._replace(points=np.concatenate([plain.points, peg.points + [0.0, 0.016, 0.008]]),
+                          normals=np.concatenate([plain.normals, peg.normals]))
+    verdicts = []
+    for number, scan in enumerate((plain, both)):
+        path = write_scan(tmp_path / f"{number}.ply", scan)
+        (top,) = compare(request(tmp_path, path, design, align="none", regions=regions(tmp_path, REGIONS[:1]))).regions
+        verdicts.append((str(top.verdict), top.strange > 0))
+    assert verdicts == [("pass", False), ("undecided", True)]
+
+
+@pytest.mark.parametrize(("entry", "field"), [({"tolerance": [1, -1]}, "tolerance"), ({"box": [[0, 0, 0], [1, 0, 1]]}, "box"),
+                                              ({"facing": [0, 0, 0]}, "facing"), ({"colour": "red"}, "colour")])
+def test_wrong_regions_are_named(tmp_path, part, entry, field):
+    with pytest.raises(ManifestError, match=rf"regions\[0\].*{field}"):
+        compare(request(tmp_path, tmp_path / "none.ply", part[1], regions=regions(tmp_path, [{**REGIONS[0], **entry}])))
+
+
+def test_bare_points_have_the_side_from_which_they_were_seen(tmp_path):
+    """The rims of a round body turn away from who saw it; points from all around say nothing."""
+    made = cylinder()
+    design, random = write_stl(tmp_path / "rod.stl", made), np.random.default_rng(8)
+
+    def bare(hidden):
+        points = scan_of(made, random, 20_000, None, hidden).points
+        path = tmp_path / "bare.ply"
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *(f"property float {name}" for name in "xyz")]
+        path.write_bytes("\n".join([*head, "end_header\n"]).encode() + points.astype("<f4").tobytes())
+        return path
+    seen = compare(request(tmp_path, bare(lambda points, normals: normals[:, 0] < 0.1), design, align="none", sigma_m=SIGMA_M))
+    facts = reported(seen)["deviations"]
+    assert facts["compared"] > 0.95 * facts["points"] and seen.rms_m == pytest.approx(SIGMA_M, rel=0.05)
+    with pytest.raises(ResultError, match="neither faces nor normals"):
+        compare(request(tmp_path, bare(None), design))
