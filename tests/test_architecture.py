@@ -88,7 +88,7 @@ def test_the_imports_are_read():
 
 
 @pytest.mark.parametrize(("layer", "allowed"), [
-    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "cv2", "laspy", "pye57", "rawpy"}),
+    ("stage", {"stage", "numpy", "scipy", "pydantic", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2", "laspy", "pye57", "rawpy"}),
     ("kernels", {"kernels", "numpy", "warp"}),
 ])
 def test_a_layer_imports_only_its_own_libraries(layer, allowed):
@@ -241,8 +241,8 @@ def test_no_cycles():
 
 @pytest.mark.parametrize("arguments", [["--help"], ["solve", "--help"], ["relight", "--help"]])
 def test_the_command_line_starts_without_heavy_libraries(arguments):
-    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib", "fast_simplification", "laspy",
-             "rawpy", "small_gicp", "xatlas")
+    heavy = ("warp", "pxr", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "numpy", "scipy", "cv2", "MaterialX", "pygltflib",
+             "fast_simplification", "laspy", "rawpy", "small_gicp", "xatlas")
     code = ("import sys, service.cli.main\n"
             f"sys.argv[1:] = {arguments!r}\n"
             "try: service.cli.main.main()\n"
@@ -260,8 +260,8 @@ def test_images_are_read_without_opencv():
 
 def test_the_client_starts_without_heavy_libraries():
     """A pipeline's interpreter loads no server, database, image library or device, even when it makes a client and a job."""
-    heavy = ("fastapi", "starlette", "dbos", "uvicorn", "sqlalchemy", "numpy", "warp", "OpenEXR", "OpenImageIO", "cv2", "pxr", "typer",
-             "kernels", "service.server", "service.solve", "stage.formats.images", "stage.capture.capture")
+    heavy = ("fastapi", "starlette", "dbos", "uvicorn", "sqlalchemy", "numpy", "warp", "OpenEXR", "OpenImageIO", "PyOpenColorIO", "cv2",
+             "pxr", "typer", "kernels", "service.server", "service.solve", "stage.formats.images", "stage.capture.capture")
     code = ("import sys; from service.client import Client; from service.requests.jobs import SolveJob; Client().close(); "
             f"print([name for name in {heavy!r} if name in sys.modules])")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=HOME, timeout=60, check=True)

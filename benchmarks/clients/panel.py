@@ -3,7 +3,8 @@
     python -m benchmarks.clients.panel --picture docs/blender.png
 
 solves the shipped owl by the operators of the panel, renders it under captured lights, and prints the RMSE of each render over the mean of
-its photograph: all pixels of the mask, no factor of brightness.
+its photograph: all pixels of the mask, no factor of brightness. It does the same with relit frames under the owl's environment as the world
+of the scene, and Blender's render under it.
 """
 
 import argparse
@@ -66,7 +67,7 @@ print("FOUND" + json.dumps(found))
 """
 PICTURE = """
 from mathutils import Vector
-settings(capture=given["capture"], levels=0)
+settings(capture=given["capture"], levels=0, sky=given["capture"] + "/environment.exr")
 bpy.ops.relit.solve()
 scene = bpy.context.scene
 for index in given["lights"]:
@@ -83,6 +84,16 @@ for kind, energy, axis in (("SUN", 3, (x, -z, y)), ("SUN", 0.4, (-0.7, -0.6, 0.2
     lamp.rotation_mode, lamp.rotation_quaternion = "QUATERNION", Vector(axis).to_track_quat("Z", "Y")
 scene.frame_start = scene.frame_end = 1
 render(f"{given['folder']}/between.exr", 64)
+bpy.ops.relit.relight()
+
+settings(light="ENVIRONMENT")
+scene.frame_start = scene.frame_end = 2
+for each in [each for each in scene.objects if "relit_card" in each]:
+    bpy.data.objects.remove(each)
+render(f"{given['folder']}/world.exr", 64)
+bpy.ops.relit.relight()
+scene.frame_start = scene.frame_end = 3
+settings(guided=False)
 bpy.ops.relit.relight()
 """
 SHOWN = 31
@@ -141,8 +152,11 @@ def main() -> None:
             print(f"light {index:2d}, {np.degrees(np.arccos(lights[index][2])):2.0f} degrees from the view axis: {error:.3f}")
             if index == SHOWN:
                 shown = [photograph, picture(folder / f"{index}.exr")[..., :3]]
-        relit = folder / "owl_relit" / "relit_frames" / "frame.0001.exr"
-        shown += [picture(path)[..., :3] for path in (relit, folder / "between.exr")]
+        frames, world = folder / "owl_relit" / "relit_frames", picture(folder / "world.exr")[..., :3]
+        for number, words in ((2, "photographs and maps"), (3, "photographs alone")):
+            error = compare(picture(frames / f"frame.{number:04d}.exr")[..., :3], world, mask, scaled=False).rmse
+            print(f"relit under the world, {words}, from Blender's render: {error:.3f}")
+        shown += [picture(path)[..., :3] for path in (frames / "frame.0001.exr", folder / "between.exr")]
         if given.picture is not None:
             sheet = np.hstack([np.clip(each, 0, None)[20:-20, 60:-60] for each in shown]) * 1.6
             encoded = np.where(sheet <= 0.0031308, 12.92 * sheet, 1.055 * np.maximum(sheet, 1e-9) ** (1 / 2.4) - 0.055)

@@ -11,7 +11,7 @@ from service.calibrate.results import color_matrix, digits, manifest_to_write, w
 from service.calibrate.solvers.chart_colors import ChartColors, PatchReadings, combine, orient, read_patches, solve_colors
 from service.calibrate.solvers.chart_patches import PatchPlaces, place_patches
 from service.calibrate.solvers.chart_reference import ChartReference, built_in, read_reference
-from service.calibrate.solvers.chart_search import find_chart, refine_corners
+from service.calibrate.solvers.chart_search import find_charts, refine_corners
 from service.calibrate.solvers.cielab import xyz_from_linear
 from service.calibrate.solvers.light_kinds import LightKind, kinds_of, matching_kind
 from service.reporting.progress import Progress, Timings
@@ -25,6 +25,10 @@ from stage.formats.camera_raw import path_is_raw
 from stage.stack.correction import Correction
 
 PATCHES = {ChartKind.CLASSIC: 24, ChartKind.SG: 140}
+SURE = 0.9
+"""The part of the patches that have the colours of the chart where no other place is looked for."""
+LEAST = 0.6
+"""The part of the patches that must have them: a place that is off by a row has half of them."""
 MOST_SEARCHED = 16
 """The most frames whose mean is searched for the chart; of more, evenly spaced ones are."""
 COLOURED = 0.02
@@ -75,15 +79,13 @@ def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> 
     correction = Correction.of(replace(source, manifest=manifest.with_colors(None)), full_scale=True)
     try:
         mean, clipped = _mean(correction, sorted(index for kind in kinds for index in kind.frames), timings)
-        corners = find_chart(mean, patches) if request.corners is None else np.reshape(request.corners, (4, 2))
-        place_patches(chart.names, chart.grid, corners, source.camera.resolution)  # checks them
-        corners = refine_corners(mean, corners, chart.grid)
         xyz_from_rgb = xyz_from_linear(space)
         reference = chart.xyz @ np.linalg.inv(xyz_from_rgb).T
-        places = place_patches(chart.names, chart.grid, corners, source.camera.resolution)
-        order, turned = orient(read_patches(places, patches, mean[places.box], clipped[places.box]), reference, chart.grid)
+        found_at = _found(chart, reference, mean, clipped) if request.corners is None else _placed(
+            np.reshape(request.corners, (4, 2)), chart, reference, mean, clipped)
     except CalibrationError as error:
         raise CalibrationError(f"{source.folder}: {error}") from error
+    corners, places, order, turned, _ = found_at
     found: list[KindColors] = []
     timings.stage("frames", sum(len(kind.frames) for kind in kinds))
     for kind in kinds:
@@ -106,6 +108,57 @@ def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> 
         "corners": [digits(corner) for corner in corners], "kinds": [_entry(each, chart, manifest) for each in found],
         "warnings": list(warnings)})
     return ChartCalibration(manifest_path, report, picture, tuple(found), corners, warnings)
+
+
+class _Placed(NamedTuple):
+    """A place of the chart, as the picture shows it."""
+
+    corners: np.ndarray
+    places: PatchPlaces
+    order: np.ndarray
+    """The order of patches in which the chart shows its colours."""
+    turned: np.ndarray
+    """The order of the corners."""
+    agreeing: int
+    """The number of patches with the colours of the chart."""
+
+
+def _placed(corners: np.ndarray, chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipped: np.ndarray) -> _Placed:
+    """Return the chart at a place, which the outlines of its patches refine.
+
+    Raises:
+        CalibrationError: the corners span no chart, or there are other colours.
+    """
+    place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])  # checks them
+    corners = refine_corners(mean, corners, chart.grid)
+    places = place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])
+    return _Placed(corners, places, *orient(read_patches(places, len(chart.names), mean[places.box], clipped[places.box]), reference,
+                                            chart.grid))
+
+
+def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipped: np.ndarray) -> _Placed:
+    """Return the chart where most of its patches have its colours, of all places that are proposed.
+
+    Raises:
+        CalibrationError: there is none; says what is wrong with the first.
+    """
+    faults: list[CalibrationError] = []
+    best: _Placed | None = None
+    for corners in find_charts(mean, len(chart.names)):
+        try:
+            found = _placed(corners, chart, reference, mean, clipped)
+        except CalibrationError as error:
+            faults.append(error)
+            continue
+        best = found if best is None or found.agreeing > best.agreeing else best
+        if best.agreeing >= SURE * len(chart.names):
+            break
+    if best is None:
+        raise faults[0]
+    if best.agreeing < LEAST * len(chart.names):
+        raise CalibrationError(f"{best.agreeing} of {len(chart.names)} patches of what looks like the chart have its colours: give the "
+                               "centres of its corner patches as --corners, or cover other patches beside it")
+    return best
 
 
 def _check_cameras(source: Capture, target: Capture) -> None:

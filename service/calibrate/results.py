@@ -10,7 +10,7 @@ import numpy as np
 from service.calibrate.solvers.apply import LitFrame, SingleLight, check_same_setup, lit_frames, with_lights
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import requested, versions, with_names
+from service.reporting.provenance import reported_versions, requested, with_names
 from service.requests.base.base import Options
 from service.requests.calibrate import FramesRequest, LightsRequest, ResponseRequest, SaturationRequest
 from stage.capture.capture import Capture
@@ -139,7 +139,7 @@ def write_results(kind: str, request: Options, manifest: Manifest, manifest_path
 def write_report(kind: str, request: Options, folder: Path, section: dict[str, Any]) -> Path:
     """Write calibration.json into a folder, with the sections of other commands that it held; return its path."""
     path = folder / CALIBRATION_FILE
-    data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": versions()}}
+    data = {"schema": SCHEMA, **_earlier(path), kind: {"options": requested(request), **section, "versions": reported_versions()}}
     write_text(path, with_names(json.dumps(data, indent=2) + "\n"))
     return path
 

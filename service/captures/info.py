@@ -60,7 +60,7 @@ class _FrameLevel(NamedTuple):
 
 def inspect(request: InfoRequest, progress: Progress | None = None) -> Inspection:
     """Decode and check every frame of a capture."""
-    request.require_picture("--picture", request.picture)
+    request.require_picture(picture=request.picture)
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture, request.pixels)
@@ -158,7 +158,7 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
     yield "camera", f"{camera.projection}, {camera.width}x{camera.height}, {scale}"
     working = linear_space(manifest.color_space)
     yield "colour", manifest.color_space + ("" if working == manifest.color_space else f", worked on in {working}")
-    yield "colours of", current().label
+    yield "colours of", f"{current().label}, cache id {current().cache_id}"
     with suppress(StageError):
         orientation = images.read_header(capture.file(manifest.frames[0].image)).orientation
         if orientation != UPRIGHT:

@@ -4,6 +4,7 @@ Source: IIIF Presentation API 3.0; IIIF Image API 3.0, compliance level 0; the p
 """
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +26,8 @@ from stage.files import write_text
 from stage.results.light_basis import numbers
 
 MANIFEST_FILE = "manifest.json"
-FACTS = {"relit:version": "Version", "relit:inputs": "Inputs", "relit:ocio": "Colour configuration"}
+FACTS = {"relit:version": "Version", "relit:inputs": "Inputs", "relit:ocio": "Colour configuration",
+         "relit:ocio_cache_id": "OpenColorIO cache id"}
 """The entries of the provenance that the manifest has, and their labels."""
 SMALL_SIDE = 1024
 """The longest side of images that are there whole."""
@@ -186,7 +188,10 @@ def _manifest(images: _Images, canvases: list[tuple[str, list[_Picture]]], sourc
 
 
 def _target(canvas: str, note: Annotation) -> Any:
-    """Return the place of an annotation on a canvas."""
+    """Return the place of an annotation on a canvas, in whole pixels: points from 1 on, as the schema of IIIF's validator has them, and the
+    pixels that a rectangle touches, as Media Fragments have them."""
     if note.width == note.height == 0:
-        return {"type": "SpecificResource", "source": canvas, "selector": {"type": "PointSelector", "x": note.x, "y": note.y}}
-    return f"{canvas}#xywh={note.x:g},{note.y:g},{note.width:g},{note.height:g}"
+        point = {"x": max(1, round(note.x)), "y": max(1, round(note.y))}
+        return {"type": "SpecificResource", "source": canvas, "selector": {"type": "PointSelector", **point}}
+    x, y = math.floor(note.x), math.floor(note.y)
+    return f"{canvas}#xywh={x},{y},{math.ceil(note.x + note.width) - x},{math.ceil(note.y + note.height) - y}"

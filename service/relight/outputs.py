@@ -42,14 +42,19 @@ RESOLVED = {
 """Choices of a request that the hash of a frame contains in another form, and that form. Every other choice is in it as it is."""
 
 
-def frame_path(pattern: str, number: int) -> Path:
-    """Return the file that a frame is written to: of the pattern, whose name has one run of # and ends in .exr."""
+def frame_path(pattern: str, number: int, *, option: str = "--out", ending: str = ".exr") -> Path:
+    """Return the file that a frame is written to: of the pattern of an option, whose name has one run of # and a certain ending."""
     folder, name = os.path.split(pattern)
     if len(re.findall(r"#+", name)) != 1 or "#" in folder:
-        raise RequestError(f"--out {pattern}: the file name needs one run of # for the frame number, such as frame.####.exr")
-    if not name.lower().endswith(".exr"):
-        raise RequestError(f"--out {pattern}: frames are OpenEXR: end the name in .exr")
+        raise RequestError(f"{option} {pattern}: the file name needs one run of # for the frame number, such as frame.####{ending}")
+    if not name.lower().endswith(ending):
+        raise RequestError(f"{option} {pattern}: frames are {'OpenEXR' if ending == '.exr' else 'PNG here'}: end the name in {ending}")
     return Path(folder) / numbered(name, number)
+
+
+def display_path(pattern: str, number: int) -> Path:
+    """Return the file of a frame as a display shows it."""
+    return frame_path(pattern, number, option="--display", ending=".png")
 
 
 def check_outputs(outputs: Sequence[tuple[str, Path]], inputs: Iterable[Path]) -> None:

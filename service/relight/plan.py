@@ -9,7 +9,7 @@ from service.relight.attributes import FRAMES_PER_SECOND
 from service.relight.environments import Environments
 from service.relight.groups import group_names
 from service.relight.layers import check_layers, maps_file
-from service.relight.outputs import check_outputs, frame_path
+from service.relight.outputs import check_outputs, display_path, frame_path
 from service.relight.schedule import ScheduledFrame, schedule
 from service.relight.time_steps import capture_files, time_steps
 from service.requests.light.frame_range import frame_numbers, part_of
@@ -71,7 +71,9 @@ def make_plan(request: RelightRequest) -> Plan:
     made = range(numbers[0], numbers[-1] + 1) if request.only is None else part_of(numbers, request.only)
     outputs = [(f"--out {request.out}", path) for path in paths]
     check_layers(request, request.maps)
-    request.require_picture("--sheet", request.sheet)
+    request.require_picture(sheet=request.sheet, display=request.display)
+    if request.display is not None:
+        outputs += [(f"--display {request.display}", display_path(request.display, number)) for number in numbers]
     if request.sheet is not None:
         if request.only is not None:
             raise RequestError(f"--sheet {request.sheet} shows the whole range, --only {request.only} makes a part of it: give one of them")

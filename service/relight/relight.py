@@ -23,9 +23,9 @@ from service.relight.layers import frame_matte, read_maps, still_layers
 from service.relight.lighting import CaptureLighting, FrameLight, ModelUse
 from service.relight.nuke import write_nuke_script
 from service.relight.opened_capture import OpenedCapture, open_capture
-from service.relight.outputs import REQUEST_ATTRIBUTE, frame_hashes, is_complete
+from service.relight.outputs import REQUEST_ATTRIBUTE, display_path, frame_hashes, is_complete
 from service.relight.plan import Plan, PlannedFrame, make_plan
-from service.relight.sheet import contact_sheet
+from service.relight.sheet import contact_sheet, display_frame
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import metadata, report
@@ -100,6 +100,11 @@ def relight(request: RelightRequest, progress: Progress | None = None) -> Religh
     if plan.environments is not None:
         findings.negative |= plan.environments.clipped or {}
     paths = tuple(frame.path for frame in plan.frames)
+    if request.display is not None:
+        timings.stage("display", len(paths))
+        for done, frame in enumerate(plan.frames, start=1):
+            display_frame(display_path(request.display, frame.scheduled.number), frame.path, request.review)
+            timings.advance(done)
     if request.sheet is not None:
         timings.stage("sheet", 1)
         contact_sheet(request.sheet, paths, request.review)

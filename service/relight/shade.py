@@ -24,6 +24,7 @@ from service.relight.lighting import CaptureLighting, ModelUse
 from service.relight.model_light import NearLight, light_samples, near_lights
 from service.relight.outputs import check_outputs
 from service.relight.schedule import UPRIGHT, ScheduledFrame, TurnedEnvironment
+from service.relight.sheet import display_frame
 from service.relight.surface_model import SurfaceModel
 from service.relight.time_steps import capture_files
 from service.relight.write import FrameFile, FrameFormat, FrameWriter
@@ -92,6 +93,8 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
     with FrameWriter(lambda _: timings.advance(1)) as writer:
         writer.put([FrameFile(request.out, 2.0**request.exposure, facts)], frame[None], form,
                    {Layer.SPECULAR: specular[None]} if form.parts else {})
+    if request.display is not None:
+        display_frame(request.display, request.out, request.review)
     timings.close()
     negative = {**({} if environments is None else environments.clipped or {}), **({} if capture is None else capture.clipped)}
     return ShadeResult(request.out, maps.camera.metric, writer.written.clipped, (*warnings, *clipping_sentences(negative)))
@@ -111,7 +114,13 @@ def check(request: ShadeRequest) -> Path:
         raise RequestError(f"--aov {Layer.LIGHTS} is a layer of relit frames: make one picture for each light, or use `relit relight`")
     check_layers(request, request.maps)
     path = result_file(request.maps, MAPS_FILE, command="relit solve")
-    check_outputs([(f"--out {request.out}", request.out)], [path, *([request.environment] if request.environment else []),
+    request.require_picture(display=request.display)
+    outputs = [(f"--out {request.out}", request.out)]
+    if request.display is not None:
+        if request.display.suffix.lower() != ".png":
+            raise RequestError(f"--display {request.display}: is a PNG: end the name in .png")
+        outputs.append((f"--display {request.display}", request.display))
+    check_outputs(outputs, [path, *([request.environment] if request.environment else []),
                                                             *(capture_files(request.capture) if request.capture else ())])
     if request.environment is not None:
         Environments(request.environment).check([1])

@@ -1,4 +1,4 @@
-"""Sheets of pictures for review: frames through a display transform, side by side with titles, as one PNG."""
+"""Pictures for review: frames through a display transform, each as a PNG, or side by side with titles on a sheet."""
 
 import math
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ import OpenImageIO as oiio
 
 from stage.colour.colour import pixels_of, through_view
 from stage.colour.colour_spaces import Review
+from stage.colour.configuration import current
 from stage.files import replacing
 from stage.formats import exr
 from stage.formats.images import write_png
@@ -40,6 +41,15 @@ def contact_sheet(path: Path, frames: Sequence[Path], review: Review = AS_EVER) 
         tiles.append((frame.stem, display(fit(pixels, FRAME_TILE, kernel="triangle"), space, review)))
     across = max(1, math.ceil(math.sqrt(len(tiles) * FRAME_TILE / max(tiles[0][1].shape[1], 1) * 16 / 9)))  # as wide as a screen
     write_sheet(path, [tiles[begin : begin + across] for begin in range(0, len(tiles), across)], height=FRAME_TILE)
+
+
+def display_frame(path: Path, frame: Path, review: Review) -> None:
+    """Write a PNG of 8 bits of an EXR frame as a display shows it through a view of OpenColorIO, at the exposure that it was made with."""
+    pixels, space = read_frame(frame)
+    shown = np.rint(255 * np.clip(through_view(pixels, space, review), 0, 1)).astype(np.uint8)
+    view = current().view(review.view)
+    with replacing(path) as temporary:
+        write_png(temporary, shown, srgb=view is None or "srgb" in view[0].lower())  # other displays have no name in the file
 
 
 def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:

@@ -16,11 +16,12 @@ from stage.colour.configuration import current
 from stage.errors import ResultError
 from stage.stack.ingest import LAYOUT
 
-REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencv-python-headless", "usd-core")
+REPORTED = ("relit", "warp-lang", "numpy", "OpenEXR", "OpenImageIO", "opencolorio", "opencv-python-headless", "usd-core")
 """The distributions whose versions a report names."""
 REPORT_FILE = "report.json"
-COLOURS = "OpenColorIO configuration"
-"""The entry of a report with the name of the configuration of colours, and the version or the hash that tells its content."""
+COLOURS, CACHE_ID = "OpenColorIO configuration", "OpenColorIO cache id"
+"""The entries of a report with the name of the configuration of colours and the version or the hash that tells its content, and with the
+cache id that OpenColorIO gives it."""
 HASHING = "relit:hashing"
 """Attribute of maps with the version of the stack cache by which `relit:inputs` was hashed: each version hashes otherwise."""
 
@@ -41,9 +42,15 @@ def versions() -> dict[str, str]:
     return found | {COLOURS: current().label}
 
 
+def reported_versions() -> dict[str, str]:
+    """Return the versions as reports have them: with OpenColorIO's cache id, which differs between folders with the same configuration."""
+    return versions() | {CACHE_ID: current().cache_id}
+
+
 def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0,
              contents: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return string attributes for result files. They are equal for two runs on the same inputs, wherever those are made.
+    """Return string attributes for result files. They are equal for two runs on the same inputs, wherever those are
+    made; OpenColorIO's cache id is that of a configuration in one place.
 
     Args:
         inputs: content hash of the images.
@@ -56,7 +63,8 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
         options["method"] = str(method)
     options.update(contents or {})
     found = {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
-             "relit:options": json.dumps(options, sort_keys=True), "relit:ocio": current().label}
+             "relit:options": json.dumps(options, sort_keys=True), "relit:ocio": current().label,
+             "relit:ocio_cache_id": current().cache_id}
     if near_lights:
         found["relit:lights"] = f"{near_lights} near lights taken as distant, as the object's centre sees them"
     return found
@@ -104,7 +112,7 @@ def requested(request: Options) -> dict[str, Any]:
 def report(request: Options, *, inputs: Mapping[str, Any], **sections: Any) -> str:
     """Return the text of a report.json: inputs, options, the other sections in the order given, and software versions."""
     text = json.dumps({"schema": "relit.report/1", "inputs": inputs, "options": requested(request), **sections,
-                       "versions": versions()}, indent=2) + "\n"
+                       "versions": reported_versions()}, indent=2) + "\n"
     return with_names(text)
 
 

@@ -55,6 +55,8 @@ class RelightRequest(ReviewOptions, RelightOptions, Request):
     as the captured images confirm the model. For a sequence, a folder with one such folder for each capture, of the same name."""
     overwrite: Annotated[bool, Role.RUN] = False
     """Make every frame again. Without it, frames are kept that an earlier run made from the same inputs and options."""
+    display: Annotated[Line | None, Role.RUN, Spelling(metavar="FILE.####.png")] = None
+    """Write each frame as a display shows it too, as PNG of 8 bits, as `view` and `look` say."""
     sheet: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
     """Write a contact sheet of the frames, for review, as `view` and `look` say."""
     nuke: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.nk")] = None

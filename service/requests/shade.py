@@ -6,6 +6,7 @@ from typing import Annotated, Any, NamedTuple, Self
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from service.requests.base.base import PixelOptions, Request, Role, Spelling
+from service.requests.base.review import ReviewOptions
 from service.requests.light.picture_options import PictureOptions
 from stage.model import Finite, FirstFault
 
@@ -133,7 +134,7 @@ class ShadeOptions(PictureOptions, PixelOptions):
     """Degrees by which the environment is turned, about +y from +z towards +x."""
 
 
-class ShadeRequest(ShadeOptions, Request):
+class ShadeRequest(ReviewOptions, ShadeOptions, Request):
     """A picture of solved maps under near lights, area lights and an environment, with cast shadows."""
 
     maps: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="DIR")]
@@ -144,3 +145,5 @@ class ShadeRequest(ShadeOptions, Request):
     """Lat-long environment map, .exr or .hdr."""
     capture: Annotated[Path | None, Role.INPUT, Spelling(metavar="CAPTURE")] = None
     """The capture of these maps: its images add what a model of the maps lacks, such as interreflection."""
+    display: Annotated[Path | None, Role.RUN, Spelling(metavar="FILE.png")] = None
+    """Write the picture as a display shows it too, as PNG of 8 bits, as `view` and `look` say."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from service.errors import RequestError
 from service.reporting.progress import Progress
-from service.reporting.provenance import REPORT_FILE, requested, versions, with_names
+from service.reporting.provenance import REPORT_FILE, reported_versions, requested, with_names
 from service.requests.base.base import Request
 from stage.capture.capture import Capture
 from stage.capture.manifest import FILE_NAME
@@ -58,7 +58,7 @@ def capture_digest(folder: Path, request: Request, shared: object) -> str:
     names = sorted({name for _, name in capture.files()})
     hashes = Fingerprints(capture.folder, (request.cache or capture.folder / CACHE_FOLDER) / "files.json").of(names)
     content = {"files": [hashes[name] for name in names], "names": names, "manifest": digest(capture.folder / FILE_NAME),
-               "options": {name: value for name, value in requested(request).items() if name != "capture"}, "versions": versions(),
+               "options": {name: value for name, value in requested(request).items() if name != "capture"}, "versions": reported_versions(),
                "shared": shared}
     text = with_names(json.dumps(content, sort_keys=True, default=str))  # folders of a service differ from machine to machine
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()

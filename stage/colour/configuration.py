@@ -78,6 +78,11 @@ class Configuration(NamedTuple):
         """The label without the version or the hash."""
         return self.label.split(" ")[0]
 
+    @property
+    def cache_id(self) -> str:
+        """The cache id that OpenColorIO gives the configuration: a hash of its text, and one of its folder and its variables."""
+        return _cache_id(self.location, self.label)
+
     def steps(self, source: str, target: str) -> list[tuple[str, str, str]]:
         """Return the conversions that lead from one space to another: a configuration's location and two names of it each.
 
@@ -235,6 +240,14 @@ def _declared(found: Configuration, name: str) -> str:
     """Return a space's name of the Color Interop Forum where the configuration knows the space by it, else the name itself."""
     identifier = oiio.ColorConfig(found.location).get_color_interop_id(name)
     return identifier if identifier and found.find(identifier) == name else name
+
+
+@cache
+def _cache_id(place: str, label: str) -> str:
+    """Return the cache id of a configuration; the label tells its content."""
+    import PyOpenColorIO  # a second copy of the library, which no pixel goes through: OpenImageIO does not tell the cache id of its own
+
+    return str(PyOpenColorIO.Config.CreateFromFile(place).getCacheID())
 
 
 @cache

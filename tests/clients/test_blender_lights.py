@@ -1,8 +1,5 @@
 """Blender and Relit mean the same light: captured lights, exported lights and worlds, and cards, each against pictures that are known."""
 
-import json
-import shutil
-
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
@@ -11,82 +8,18 @@ from benchmarks.clients.comparison import compare
 from benchmarks.clients.panel import picture
 from service.export.export import export
 from service.requests.export import ExportRequest
-from stage.capture.capture import Capture
 from stage.formats import exr
 from stage.results.maps import MAPS_FILE, SurfaceMaps
-from stage.stack.correction import Correction
+from stage.transforms import fibonacci_sphere
 from tests.clients.blender import in_blender
 from tests.clients.scenes import directions, uneven
 from tests.clients.test_conventions import CAMERAS, ball
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import edit_frame, write_exr
 from tests.scenes.surroundings import capture_of, write_frames
-from tests.service.owl import OWL
 
 pytestmark = pytest.mark.long
 
-OWL_LIGHTS = (44, 31)
-"""The light of the owl that is nearest to the view axis, and one 20 degrees from it."""
-
-
-THE_OWL = """
-from mathutils import Vector
-settings(capture=given["capture"], levels=1)
-bpy.ops.relit.solve()
-scene, chosen = bpy.context.scene, bpy.context.scene.relit
-found["light"], found["resolution"] = chosen.light_index, (scene.render.resolution_x, scene.render.resolution_y)
-render(given["folder"] + "/owl.exr", 24)
-def held():
-    return [len(each) for each in (bpy.data.scenes, bpy.data.objects, bpy.data.collections)]
-
-before = held()
-settings(mesh="lod4")
-found["no level"] = refused(bpy.ops.relit.import_asset)
-found["left"] = before == held()
-settings(mesh="lod1", look="specular")
-bpy.ops.relit.import_asset(new_scene=False)
-found["meshes"] = sorted(len(each.data.polygons) for each in scene.objects if each.type == "MESH")
-found["materials"] = sorted(slot.name for each in scene.objects for slot in each.material_slots)
-
-# a sun of the scene that goes from one captured light to another
-bpy.ops.relit.import_asset(new_scene=True)
-scene = bpy.context.scene
-settings(mesh="mesh", look="metallic", light="SCENE", guided=False)
-sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
-sun.data.energy, sun.data.angle, sun.rotation_mode = 3, 0, "QUATERNION"
-scene.collection.objects.link(sun)
-for frame, (x, y, z) in zip((2, 4), given["directions"]):
-    sun.rotation_quaternion = Vector((x, -z, y)).to_track_quat("Z", "Y")
-    sun.keyframe_insert("rotation_quaternion", frame=frame)
-scene.frame_start, scene.frame_end = 2, 4
-bpy.ops.relit.relight()
-bpy.data.objects.remove(sun)
-for each in scene.objects:
-    each.hide_render = each.type == "MESH" and "relit_card" not in each
-scene.frame_set(4)
-render(given["folder"] + "/card.exr", 1)
-"""
-
-
-def test_the_owl_from_the_panel_looks_like_its_photographs(tmp_path):
-    """Error of the rendered asset: RMSE over the photograph's mean, all pixels of the mask, no factor of brightness; the bar is .15."""
-    folder = shutil.copytree(OWL, tmp_path / "owl", ignore=shutil.ignore_patterns(".relit"))
-    capture = Capture.open(folder)
-    correction, mask, sources = Correction.of(capture), capture.mask(), list(capture.sources())
-    photographs = [correction.apply(sources[index]).pixels for index in OWL_LIGHTS]
-    lights = [frame["light"]["direction"] for frame in json.loads((folder / "capture.json").read_text())["frames"]]
-    found = in_blender(THE_OWL, tmp_path, capture=folder, directions=[lights[index] for index in OWL_LIGHTS])
-    assert found["light"] == OWL_LIGHTS[0] and found["resolution"] == [320, 320]
-    assert compare(picture(tmp_path / "owl.exr")[..., :3], photographs[0], mask, scaled=False).rmse < 0.15
-    assert found["no level"].startswith("asset.usda has no mesh 'lod4'") and found["left"]
-    assert found["meshes"][0] < 0.6 * found["meshes"][1] and any("Specular" in name for name in found["materials"])
-    for number, photograph in zip((2, 4), photographs, strict=True):
-        frame = picture(tmp_path / "owl_relit" / "relit_frames" / f"frame.{number:04d}.exr")
-        # a captured light gives its photograph; Blender keeps directions in float32, of whose 1e-7 the weights make less than a percent
-        assert compare(frame[..., :3], photograph, mask, scaled=False).rmse < 0.01
-    card = picture(tmp_path / "card.exr")
-    assert np.abs(card - frame).max() < 0.02 * frame.max()  # Cycles' filter of 1.5 pixels blurs it
-"""A card is the frame; the last one, since the sequence is shown at frame 4."""
-
+DOME_LIGHTS = 64
 
 NEAR = """
 import importlib, os
@@ -190,7 +123,7 @@ WORLD = """
 import importlib
 environment = importlib.import_module(NAME + ".environment")
 from pathlib import Path
-folder = Path(given["folder"])
+folder, environment.HEIGHT = Path(given["folder"]), 128
 settings(capture=given["capture"], out=str(folder), asset=str(folder / "asset.usda"))
 bpy.ops.relit.import_asset()
 scene = bpy.context.scene
@@ -226,6 +159,14 @@ settings(mesh="lod1")
 found["no variants"] = refused(bpy.ops.relit.import_asset)
 settings(mesh="mesh", capture=given["other"], asset=str(folder / "asset.usdz"))
 found["another capture"] = refused(bpy.ops.relit.import_asset)
+
+# photographs of the same ball under a dome, relit under the world of which Blender's render is there already
+environment.HEIGHT = 64
+settings(capture=given["dome"], out=str(folder / "lit"), asset=str(folder / "asset.usda"))
+bpy.ops.relit.import_asset()
+bpy.context.scene.frame_start = bpy.context.scene.frame_end = 1
+settings(light="ENVIRONMENT", method="RELIGHT", guided=False)
+bpy.ops.relit.relight()
 """
 
 
@@ -234,15 +175,25 @@ def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
     for suffix in (".usdz", ".glb"):
         export(ExportRequest(maps=tmp_path / "maps", out=tmp_path / f"asset{suffix}", name="Ball"))
     capture_of(tmp_path / "other", a_ball.camera.model_copy(update={"focal_px": (50.0, 50.0)}), [{"type": "off"}])
-    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other")
+    dome = fibonacci_sphere(DOME_LIGHTS)
+    capture_of(tmp_path / "dome", a_ball.camera, [{"type": "distant", "direction": list(each), "irradiance": [3, 3, 3]} for each in dome],
+               color_space="lin_rec709_scene")
+    for index, each in enumerate(dome):
+        shading = np.maximum(a_ball.normal.astype(float) @ each, 0)[..., None]
+        write_exr(tmp_path / "dome" / f"{index:03d}.exr", 3 / np.pi * a_ball.diffuse_albedo * shading * a_ball.mask[..., None])
+        edit_frame(tmp_path / "dome", index, image=f"{index:03d}.exr")
+    found = in_blender(WORLD, tmp_path, capture=tmp_path / "capture", other=tmp_path / "other", dome=tmp_path / "dome")
     assert found["captured"] == [True, "CAPTURED"]
     d, omega = directions(64)
     cosine = np.maximum(np.einsum("rcx,hwx->rchw", a_ball.normal.astype(float), d), 0)
     truth = a_ball.diffuse_albedo / np.pi * np.einsum("rchw,hwk,hw->rck", cosine, uneven(), omega)
     inside = binary_erosion(a_ball.mask, np.ones((3, 3)))
     assert compare(picture(tmp_path / "environment.exr")[..., :3], truth, inside, scaled=False).rmse < 0.05  # noise of 256 paths
+    relit, rendered = (picture(tmp_path / name)[..., :3] for name in ("lit/relit_frames/frame.0001.exr", "environment.exr"))
+    # a fifth of a steradian for each light of the dome, and the noise of Blender's 256 paths
+    assert compare(relit, rendered, inside, scaled=False).rmse < 0.05
     written = {name: exr.read(tmp_path / "worlds" / f"{name}.exr")[0] for name in ("world", "world.0003", "world.0004")}
-    maps = {name: np.stack([found[channel] for channel in "RGB"], axis=-1).reshape(64, 4, 128, 4, 3).mean(axis=(1, 3))
+    maps = {name: np.stack([found[channel] for channel in "RGB"], axis=-1).reshape(64, 2, 128, 2, 3).mean(axis=(1, 3))
             for name, found in written.items()}
     # Blender interpolates between the texels of 2.8 degrees, and between the top and the bottom row
     np.testing.assert_allclose(maps["world"][1:-1], uneven()[1:-1], rtol=0.05)

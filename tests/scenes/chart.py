@@ -1,6 +1,7 @@
 """A colour chart in perspective before a background, as a camera of known colours sees it: the pixels, and where the patches are."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,8 @@ from tests.scenes.captures import write_exr, write_manifest
 
 PITCH, PATCH = 47.0, 40.0
 """Millimetres from patch to patch, and the side of one, of the printed chart of 24."""
+PASSPORT_PATCH = 0.71
+"""The side of a patch of a ColorChecker Passport over their spacing: 100 / 141 in the template of colour-checker-detection 0.2.3."""
 
 
 WHITE_D50 = np.array([0.96422, 1.0, 0.82521])
@@ -57,6 +60,28 @@ def reflectances(patches: int = 24) -> np.ndarray:
     return xyz @ D65_FROM_D50.T @ REC709_FROM_XYZ.T
 
 
+class Rectangle(NamedTuple):
+    """A patch beside the chart, in spacings of the chart from the centre of its first patch."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    colour: np.ndarray
+
+
+def other_page() -> list[Rectangle]:
+    """The page of an open Passport above its 24 patches: eight hues, tints of grey in two rows of five, and eight greys, on a dark card."""
+    turn = 2 * np.pi * np.arange(8)[:, None] / 8
+    hues = 0.4 + 0.35 * np.cos(turn - np.array([0, 2.1, 4.2]))
+    tints = 0.6 + 0.05 * np.linspace(-1, 1, 10)[:, None] * np.array([1, 0, -1])
+    greys = np.repeat(np.array([0.03, 0.036, 0.045, 0.055, 0.46, 0.58, 0.73, 0.9])[:, None], 3, axis=1)
+    rows = ((hues, 0.0, 8), (tints[:5], 0.78, 5), (tints[5:], 1.76, 5), (greys, 2.54, 8))
+    patches = [Rectangle(-0.1 + (column + 0.5) * 5.2 / count, y - 3.4, 0.8 * 5.2 / count, 0.56, colour)
+               for colours, y, count in rows for column, colour in enumerate(colours)]
+    return [Rectangle(2.5, -2.13, 6.24, 3.3, np.full(3, 0.035)), *patches]
+
+
 def poses(count: int) -> list[Pose]:
     """Poses of a chart that is tilted by up to 40 degrees in every direction, turned, moved and nearer or farther."""
     random = np.random.default_rng(1)
@@ -92,7 +117,7 @@ def homography(pose: Pose, size: tuple[int, int], grid: tuple[int, int], pitch: 
 
 
 def picture(colours: np.ndarray, pose: Pose, *, size: tuple[int, int] = (640, 480), grid: tuple[int, int] = (6, 4), pitch: float = PITCH,
-            patch: float = PATCH, border: float = 0.035, samples: int = 3, seed: int = 0) -> Picture:
+            patch: float = PATCH, border: float = 0.035, samples: int = 2, seed: int = 0, beside: Sequence[Rectangle] = ()) -> Picture:
     """Return the picture of a chart whose patches reflect `colours` [patches, 3], without noise, each pixel the mean of samples²."""
     width, height = size
     form = homography(pose, size, grid, pitch)
@@ -108,6 +133,8 @@ def picture(colours: np.ndarray, pose: Pose, *, size: tuple[int, int] = (640, 48
     random = np.random.default_rng(seed)
     texture = cv2.resize(random.uniform(0.05, 0.6, (13, 17, 3)), (width * samples, height * samples), interpolation=cv2.INTER_CUBIC)
     seen = np.clip(texture, 0.02, 1).reshape(-1, 3)
+    for each in beside:
+        seen[(np.abs(x - each.x) < each.width / 2) & (np.abs(y - each.y) < each.height / 2)] = each.colour
     seen[on_card] = border
     index = (np.clip(row, 0, grid[1] - 1) * grid[0] + np.clip(column, 0, grid[0] - 1)).astype(int)
     seen[on_patch] = colours[index[on_patch]]

@@ -129,8 +129,9 @@ def combine(frames: list[PatchReadings]) -> PatchReadings:
     return PatchReadings(mean, np.median([frame.sigma / each for frame, each in zip(kept, scale, strict=True)], axis=0), refused)
 
 
-def orient(readings: PatchReadings, reference: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the order of patches in which a chart shows its colours, and the order of its corners, for it may be turned or mirrored.
+def orient(readings: PatchReadings, reference: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the order of patches in which a chart shows its colours, and the order of its corners, for it may be turned or mirrored, and
+    how many patches have the colours of the chart.
 
     Raises:
         CalibrationError: the patches have the colours of the chart in no order, or differ in fewer than three colours.
@@ -138,15 +139,16 @@ def orient(readings: PatchReadings, reference: np.ndarray, grid: tuple[int, int]
     columns, rows = grid
     index = np.arange(columns * rows).reshape(rows, columns)
     orders = [index.ravel(), index[::-1, ::-1].ravel(), index[:, ::-1].ravel(), index[::-1].ravel()]
-    angles = []
+    angles, agreeing = [], []
     for order in orders:
         _, angle, seen = _homography(readings.ordered(order), reference)
         angles.append(float(np.median(angle[seen])))
+        agreeing.append(int((angle[seen] < MOST_ANGLE).sum()))
     best = int(np.argmin(angles))
     if angles[best] > MOST_ANGLE:
         raise CalibrationError(f"the patches have not the colours of the chart: half of them are off by {angles[best]:.0f} degrees or "
                                "more: check --chart, --corners, --reflectances and that the light is white")
-    return orders[best], np.array([[0, 1, 2, 3], [2, 3, 0, 1], [1, 0, 3, 2], [3, 2, 1, 0]])[best]
+    return orders[best], np.array([[0, 1, 2, 3], [2, 3, 0, 1], [1, 0, 3, 2], [3, 2, 1, 0]])[best], agreeing[best]
 
 
 def solve_colors(readings: PatchReadings, chart: ChartReference, xyz_from_rgb: np.ndarray, earlier: np.ndarray) -> ChartColors:

@@ -4,6 +4,8 @@ Source: OpenCV's module mcc without its neural network, which groups quadrilater
     chart.
 """
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
@@ -11,6 +13,12 @@ from service.calibrate.solvers.chart_reference import GRIDS
 from stage.errors import CalibrationError
 
 KINDS = {24: cv2.mcc.MCC24, 140: cv2.mcc.SG140}
+ALIKE = 0.2
+"""Parts of the size of a chart by which corners differ that are cut once."""
+CUTS = (0.5, 0.25, 0.75)
+"""Where across a found chart the picture is cut off to look for another: parts of the way from edge to edge."""
+MOST_CHARTS = 3
+"""The most charts that are proposed in one picture."""
 LONGEST = 1600
 """The longest side of the picture that is searched, pixels."""
 WHITE_PERCENTILES = (99.5, 97.0, 88.0)
@@ -27,34 +35,55 @@ FARTHEST = 0.3
 """The farthest that a corner moves as it is refined, in spacings of patches."""
 
 
-def find_chart(picture: np.ndarray, patches: int) -> np.ndarray:
-    """Return the centres of the corner patches of the chart in a picture.
+def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
+    """Yield the centres of the corner patches of what may be the chart in a picture, the likeliest first.
+
+    The detector takes patches that lie beside a chart in the same spacing, as those of the other page of an open Passport, for some of
+    its own. So what it finds is followed by what it finds where the picture is cut off across each of these.
 
     Args:
         picture: [rows, cols, 3] float32, scene-linear.
         patches: 24 or 140, those of the chart.
 
-    Returns:
+    Yields:
         [4, 2] float64 pixels (u, v), the centre of the first being (0.5, 0.5): the first patch, the last of the first row, the last of the
         chart, the first of the last row, as OpenCV takes the chart to stand.
 
     Raises:
-        CalibrationError: no chart is found.
+        CalibrationError: nothing is found.
     """
     step = max(picture.shape[:2]) / LONGEST
     small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
+    brightest = small.max(axis=-1)
+    pictures = [np.ascontiguousarray((255 * np.clip(small / max(float(np.percentile(brightest, percentile)), 1e-9), 0, 1) ** (1 / 2.2)
+                                      ).astype(np.uint8)[..., ::-1]) for percentile in WHITE_PERCENTILES]
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    for shown in pictures:
+        for corners in _detected(shown, patches):
+            if all(np.abs(corners - other).max() > ALIKE * np.ptp(corners, axis=0).max() for _, other in found):
+                found.append((shown, corners))
+            yield (corners + 0.5) * max(step, 1.0)
+    if not found:
+        raise CalibrationError("no chart is found in the picture: give the centres of its corner patches as --corners")
+    for shown, corners in found:
+        for ends in np.mean([corners, np.roll(corners, -1, axis=0)], axis=0).astype(np.float32)[[[0, 2], [2, 0], [1, 3], [3, 1]]]:
+            (u, v), (rows, cols) = ends[1] - ends[0], np.indices(shown.shape[:2])
+            along = ((cols - ends[0, 0]) * u + (rows - ends[0, 1]) * v) / (u * u + v * v)
+            for share in CUTS:
+                for part in _detected(np.where((along > share)[..., None], np.uint8(0), shown), patches):
+                    yield (part + 0.5) * max(step, 1.0)
+
+
+def _detected(shown: np.ndarray, patches: int) -> Iterator[np.ndarray]:
+    """Yield the centres of corner patches [4, 2] that OpenCV finds in a picture as a display shows it, the likeliest first."""
     detector = cv2.mcc.CCheckerDetector.create()
     detector.setUseDnnModel(False)
     detector.setColorChartType(KINDS[patches])
-    for percentile in WHITE_PERCENTILES:
-        white = max(float(np.percentile(small.max(axis=-1), percentile)), 1e-9)
-        shown = (255 * np.clip(small / white, 0, 1) ** (1 / 2.2)).astype(np.uint8)[..., ::-1]
-        if detector.process(np.ascontiguousarray(shown), 1):
-            outlines = np.array(detector.getBestColorChecker().getColorCharts()).reshape(-1, 4, 2)
-            centres = (outlines.mean(axis=1) + 0.5) * max(step, 1.0)
-            columns = GRIDS[patches][0]
-            return centres[[0, columns - 1, patches - 1, patches - columns]].astype(np.float64)
-    raise CalibrationError("no chart is found in the picture: give the centres of its corner patches as --corners")
+    if detector.process(shown, MOST_CHARTS):
+        columns = GRIDS[patches][0]
+        for chart in sorted(detector.getListColorChecker(), key=lambda each: each.getCost()):
+            centres = np.array(chart.getColorCharts(), np.float64).reshape(-1, 4, 2).mean(axis=1)
+            yield centres[[0, columns - 1, patches - 1, patches - columns]]
 
 
 def refine_corners(picture: np.ndarray, corners: np.ndarray, grid: tuple[int, int]) -> np.ndarray:

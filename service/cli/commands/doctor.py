@@ -26,10 +26,10 @@ def doctor(only: DoctorDevice = None, data: DataOption = None, config: ConfigOpt
     import tempfile
 
     from service import __version__
-    from service.reporting.provenance import versions
+    from service.reporting.provenance import reported_versions
 
     faults = []
-    for name, value in versions().items():
+    for name, value in reported_versions().items():
         print(f"{name:<12} {value}")
         if value == "not installed":
             faults.append(f"{name} is not installed")

@@ -27,6 +27,8 @@ def _relight(request: RelightRequest, progress: ProgressOption = ProgressStyle.B
     if result.skipped:
         rest = "; the others are made" if result.skipped < len(result.frames) else ""
         print(f"skipped  {result.skipped} of {len(result.frames)} frames were there already, made by an equal run{rest}")
+    if request.display is not None:
+        print(f"display  {request.display}")
     if request.sheet is not None:
         print(f"sheet    {request.sheet}")
     if request.nuke is not None:
@@ -48,6 +50,8 @@ def _shade(request: ShadeRequest, progress: ProgressOption = ProgressStyle.BAR) 
     with progress_in(progress) as bar:
         result = shade(request, bar)
     print(f"picture  {result.path}")
+    if request.display is not None:
+        print(f"display  {request.display}")
     if not result.metric:
         print("scale    the maps have none: places of lights are taken in pixels")
     if result.clipped:

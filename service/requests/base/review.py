@@ -40,10 +40,11 @@ class ReviewOptions(Options):
         """Return the view and the looks."""
         return Review(self.view, self.look)
 
-    def require_picture(self, flag: str, path: object) -> None:
-        """Raise RequestError if there is a view or a look, and no picture, which an option would ask for."""
+    def require_picture(self, **paths: object) -> None:
+        """Raise RequestError if there is a view or a look, and none of the pictures, which options would ask for."""
         from service.errors import RequestError  # which loads more than a client needs
 
+        flags = " or ".join(f"--{name}" for name in paths)
         for name, given in self.review._asdict().items():
-            if given is not None and path is None:
-                raise RequestError(f"--{name} {given}: is for the picture of {flag}: give {flag} too")
+            if given is not None and not any(paths.values()):
+                raise RequestError(f"--{name} {given}: is for the picture of {flags}: give {flags} too")

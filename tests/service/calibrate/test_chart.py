@@ -16,10 +16,12 @@ from tests.scenes.captures import edit_manifest, write_image
 from tests.scenes.chart import (
     CAMERA,
     D65_FROM_D50,
+    PASSPORT_PATCH,
     REC709_FROM_XYZ,
     WHITE_D50,
     Picture,
     Pose,
+    other_page,
     picture,
     poses,
     reflectances,
@@ -237,6 +239,15 @@ def test_charts_with_other_gaps_are_found(gap, tmp_path):
     shown = picture(seen(), POSE, patch=47 * gap)
     found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))
     assert np.abs(found.corners - shown.corners).max() < 0.5 and np.nanmean(found.kinds[0].colors.after) < 1
+
+
+@pytest.mark.parametrize("pose", poses(20)[6::6])
+def test_the_24_patches_of_an_open_passport_are_found_beside_its_other_page(pose, tmp_path):
+    page = [each._replace(colour=EXPOSURE * CAMERA @ each.colour) for each in other_page()]
+    shown = picture(seen(), pose._replace(y=pose.y + 70, distance=800), patch=47 * PASSPORT_PATCH, beside=page)
+    found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))
+    assert np.abs(found.corners - shown.corners).max() < 0.5 and np.nanmean(found.kinds[0].colors.after) < 1
+    assert difference(Capture.open(tmp_path / "cap").manifest.color_matrix).mean() < 0.6
 
 
 @pytest.mark.long

@@ -17,8 +17,8 @@ SIZE = 1100
 PIXEL_M = 25e-6
 NOTES = {"type": "AnnotationPage", "items": [
     {"type": "Annotation", "body": {"type": "TextualBody", "value": "a crack"},
-     "target": {"selector": {"type": "FragmentSelector", "value": "xywh=10,20,30,40"}}},
-    {"type": "Annotation", "body": "a point", "target": {"selector": {"type": "PointSelector", "x": 300, "y": 299.5}}},
+     "target": {"selector": {"type": "FragmentSelector", "value": "xywh=10.5,20,29.25,39.5"}}},
+    {"type": "Annotation", "body": "a point", "target": {"selector": {"type": "PointSelector", "x": 0.25, "y": 299.6}}},
     {"type": "Annotation", "body": {"value": "a corner"}, "target": "https://elsewhere/canvas#xywh=0,0,5,5"}]}
 
 
@@ -52,7 +52,7 @@ def test_the_manifest_names_pictures_that_are_there(published):
     assert manifest["requiredStatement"]["value"] == {"none": ["A museum"]}
     facts = {entry["label"]["en"][0]: entry["value"]["none"][0] for entry in manifest["metadata"]}
     assert facts == {"Capture": "cap", "Lights": "5", "Version": __version__, "Inputs": facts["Inputs"],
-                     "Colour configuration": current().label}
+                     "Colour configuration": current().label, "OpenColorIO cache id": current().cache_id}
     identifiers, labels = [manifest["id"]], []
     for canvas in manifest["items"]:
         [size] = canvas["service"]
@@ -74,12 +74,13 @@ def test_the_manifest_names_pictures_that_are_there(published):
 
 
 def test_notes_are_on_each_canvas(published):
+    """In whole pixels: IIIF's validator takes points from 1 on, Media Fragments take no others for rectangles."""
     manifest = json.loads((published / "manifest.json").read_text())
     for canvas in manifest["items"]:
         [page] = canvas["annotations"]
         crack, point, corner = page["items"]
         assert crack["body"]["value"] == "a crack" and crack["target"] == f"{canvas['id']}#xywh=10,20,30,40"
-        assert point["target"]["selector"] == {"type": "PointSelector", "x": 300.0, "y": 299.5}
+        assert point["target"]["selector"] == {"type": "PointSelector", "x": 1, "y": 300}
         assert corner["target"] == f"{canvas['id']}#xywh=0,0,5,5"
 
 

@@ -1,6 +1,7 @@
 """relit publish --as iiif: what IIIF's own validators find.
 
-That of the Image API runs its tests of level 0 against a server of files. Of the schema of the Presentation API, iiif-prezi3 has models.
+That of the Image API runs its tests of level 0 against a server of files. That of the Presentation API is in no registry: iiif-prezi3 has
+models of its schema. What these do not ask and the validator does is asked here, in words of our own.
 """
 
 import json
@@ -64,6 +65,13 @@ def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):
     read = iiif_prezi3.Manifest.model_validate(manifest)
     assert [len(canvas.items[0].items[0].body.items) for canvas in read.items] == [9, 2]
     assert len(read.items[0].annotations[0].items) == 2
+    identifiers = [each["id"] for canvas in manifest["items"] for each in (
+        canvas, *(page for name in ("items", "annotations") for page in canvas[name]),
+        *(note for name in ("items", "annotations") for page in canvas[name] for note in page["items"]))]
+    assert len({manifest["id"], *identifiers}) == 1 + len(identifiers)
+    points = [note["target"]["selector"] for canvas in manifest["items"] for note in canvas["annotations"][0]["items"]
+              if "selector" in note["target"]]
+    assert len(points) == 2 and all(type(each[axis]) is int and each[axis] > 0 for each in points for axis in "xy")
     schema = jsonschema.Draft202012Validator(iiif_prezi3.Manifest.model_json_schema())
     assert [error.message for error in schema.iter_errors(manifest)] == []
     for fault in ({"items": [{"type": "Canvas"}]}, {"label": "of no language"}, {"type": "Collection"}, {"id": 3}):

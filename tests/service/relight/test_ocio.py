@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import OpenImageIO as oiio
+import PyOpenColorIO
 import pytest
 
 from service.captures.check_process import check_in_process
@@ -51,9 +51,11 @@ def test_logc4_in_and_acescg_out(relit, logged, tmp_path):
     _, metadata = exr.read(tmp_path / "f" / "a.1.exr")
     label = json.loads((tmp_path / "r.json").read_text())["versions"]["OpenColorIO configuration"]
     assert label.startswith(f"{STUDIO} OpenColorIO ") and metadata["relit:ocio"] == label
+    cache_id = PyOpenColorIO.Config.CreateFromFile(STUDIO).getCacheID()
+    assert metadata["relit:ocio_cache_id"] == cache_id == json.loads((tmp_path / "r.json").read_text())["versions"]["OpenColorIO cache id"]
     assert metadata["colorInteropID"] == "lin_ap1_scene"
     shown = relit.done("info", folder, "--ocio", STUDIO).out
-    assert "ARRI LogC4, worked on in ocio:lin_awg4_scene" in shown and label in shown
+    assert "ARRI LogC4, worked on in ocio:lin_awg4_scene" in shown and f"{label}, cache id {cache_id}" in shown
 
 
 @pytest.mark.parametrize(("place", "space"), [
@@ -67,9 +69,10 @@ def test_frames_are_what_the_processor_of_opencolorio_makes_of_the_images(relit,
     folder, fractions = logged
     place = minimal(tmp_path / "house.ocio") if place == "minimal" else place
     edit_manifest(folder, color_space=space)
-    recorded = oiio.ImageBuf(np.ascontiguousarray(fractions[0], np.float32))
     target = "house aces" if "house" in space else "ACEScg"
-    processed = np.asarray(oiio.ImageBufAlgo.colorconvert(recorded, space, target, colorconfig=place).get_pixels(oiio.FLOAT)).astype(float)
+    pixels = np.array(fractions[0], np.float32)
+    PyOpenColorIO.Config.CreateFromFile(place).getProcessor(space, target).getDefaultCPUProcessor().applyRGB(pixels)
+    processed = pixels.astype(float)
     if target == "house aces":
         processed = processed @ ACES_TO_ACESCG.T
     with used(place):
@@ -104,7 +107,7 @@ def test_a_configuration_is_part_of_what_frames_and_caches_are_known_by(relit, l
     (("--color-space", "ACESgc", "--ocio", STUDIO), "--color-space: ACESgc is no colour space of the OpenColorIO configuration"),
     (("--color-space", "ACEScct", "--ocio", STUDIO), "--color-space: is ACEScct: give a scene-linear colour space"),
     (("--view", "Nice", "--sheet", "s.png", "--ocio", STUDIO), "--view: Nice is no view of"),
-    (("--view", "Un-tone-mapped", "--ocio", STUDIO), "give --sheet too"),
+    (("--view", "Un-tone-mapped", "--ocio", STUDIO), "give --sheet or --display too"),
     ((), f"color_space: ARRI LogC4 is no colour space of the OpenColorIO configuration ocio://default: {STUDIO} has ARRI LogC4"),
 ])
 def test_what_is_wrong_is_one_sentence(relit, logged, tmp_path, options, words):

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import PyOpenColorIO
 import pytest
 
 from service.acquisition.meter import zebra
@@ -16,7 +17,7 @@ from stage.colour.colour_spaces import Review
 from stage.formats import images
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
-from tests.scenes.captures import make_scene, write_capture, write_exr
+from tests.scenes.captures import make_scene, rgb, write_capture, write_exr
 from tests.scenes.chart import picture, shoot
 from tests.scenes.patched_rigs import write_rig_file
 from tests.scenes.rigs import write_rig
@@ -91,9 +92,44 @@ def test_a_look_of_a_studios_configuration_is_in_the_sheet(relit, capture, tmp_p
     assert np.median(cold[changed] / plain[changed]) == pytest.approx(0.5**0.4, rel=0.01)
 
 
+@pytest.mark.parametrize(("command", "place"), [("relight", "minimal"), ("shade", "minimal"), ("relight", "ocio://default")])
+def test_display_frames_are_the_frames_through_the_view_and_the_look(relit, capture, tmp_path, command, place):
+    """The minimal configuration in closed form: the look's half of the light, to the power of 1 / 2.5; the other by OpenColorIO."""
+    plain = place == "minimal"
+    options = ("--ocio", minimal(tmp_path / "house.ocio"), "--view", "Wall/Plain", "--look", "cold") if plain else (
+        "--view", "Display P3 - Display/Un-tone-mapped")
+    if command == "relight":
+        image = Capture.open(capture).manifest.frames[0].image
+        (tmp_path / "keys.json").write_text(json.dumps(KEYS).replace("000.exr", image))
+        made = ("relight", capture, "--keys", tmp_path / "keys.json", "--out", tmp_path / "f" / "a.#.exr", "--frames", "1-2",
+                "--color-space", "hl" if plain else "ACEScg", "--display", tmp_path / "shown" / "a.##.png")
+        pairs = [(tmp_path / "f" / f"a.{number}.exr", tmp_path / "shown" / f"a.0{number}.png") for number in (1, 2)]
+    else:
+        relit.done("solve", capture, "--out", tmp_path / "maps", "--method", "lambert")
+        made = ("shade", tmp_path / "maps", "--light", "0,0,50,3000,2000,1000", "--out", tmp_path / "a.exr", "--color-space", "hl",
+                "--display", tmp_path / "a.png")
+        pairs = [(tmp_path / "a.exr", tmp_path / "a.png")]
+    assert "display " in relit.done(*made, *options).out
+    (tmp_path / "shown" / "a.01.png").unlink(missing_ok=True)
+    relit.done(*made, *options)  # of frames that are there already too
+    for frame, shown in pairs:
+        linear = rgb(frame).astype(np.float32)
+        if plain:
+            wanted = np.clip(linear / 2, 0, None) ** 0.4
+        else:
+            wanted = linear.copy()
+            view = PyOpenColorIO.DisplayViewTransform(src="ACEScg", display="Display P3 - Display", view="Un-tone-mapped")
+            PyOpenColorIO.Config.CreateFromFile(place).getProcessor(view).getDefaultCPUProcessor().applyRGB(wanted)
+        np.testing.assert_allclose(images.read_pixels(shown), np.clip(wanted, 0, 1), atol=0.51 / 255 + 1e-4)  # 8 bits; OpenColorIO's powers
+        assert linear.max() > 0.1
+
+
 @pytest.mark.parametrize(("command", "options", "words"), [
     ("relight", ("--look", "warm", "--sheet", "s.png"), "--look: warm is no look of the OpenColorIO configuration ocio://default: give"),
-    ("relight", ("--look", "ACES 1.3 Reference Gamut Compression"), "is for the picture of --sheet: give --sheet too"),
+    ("relight", ("--look", "ACES 1.3 Reference Gamut Compression"),
+     "is for the picture of --sheet or --display: give --sheet or --display too"),
+    ("relight", ("--display", "a.png"), "--display a.png: the file name needs one run of # for the frame number, such as frame.####.png"),
+    ("relight", ("--display", "a.#.exr"), "--display a.#.exr: frames are PNG here: end the name in .png"),
     ("info", ("--view", "Nice", "--picture", "i.png"), "--view: Nice is no view of the OpenColorIO configuration ocio://default: give"),
     ("info", ("--view", "Un-tone-mapped"), "is for the picture of --picture: give --picture too")])
 def test_what_is_wrong_is_one_sentence(relit, capture, tmp_path, command, options, words):

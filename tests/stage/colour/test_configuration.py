@@ -1,6 +1,8 @@
 """Configurations of colours: a minimal one in closed form, the built-in studio configuration by the formulas of the makers, and errors."""
 
 import numpy as np
+import OpenImageIO as oiio
+import PyOpenColorIO
 import pytest
 from pydantic import TypeAdapter
 
@@ -142,6 +144,18 @@ def test_the_label_changes_with_the_content_and_its_tables(tmp_path):
         table.write_text(table.read_text().replace("1\n}", curve))
         labels.append(_label_of(text))
     assert len(set(labels)) == 5 and all(label.startswith("a.ocio sha256:") for label in labels)
+
+
+@pytest.mark.parametrize("place", ["ocio://default", STUDIO, "minimal"])
+def test_the_cache_id_is_that_of_opencolorio(tmp_path, place):
+    """The library that tells it reads the same configuration as the one within OpenImageIO, which converts."""
+    place = minimal(tmp_path / "house.ocio") if place == "minimal" else place
+    with used(place):
+        read = PyOpenColorIO.Config.CreateFromFile(place)
+        assert current().cache_id == read.getCacheID()
+        of_all = read.getColorSpaceNames(PyOpenColorIO.SEARCH_REFERENCE_SPACE_ALL, PyOpenColorIO.COLORSPACE_ALL)  # inactive ones too
+        assert set(of_all) == set(oiio.ColorConfig(place).getColorSpaceNames())
+    assert PyOpenColorIO.GetVersion().split(".")[:2] == oiio.get_string_attribute("opencolorio_version").split(".")[:2]
 
 
 def _label_of(path):
