@@ -1,5 +1,5 @@
-"""Three phase frames alone under a projector that bends waves: σ holds the error, and a sentence says so. The scene and its images are those
-of tests/scenes/depth.py."""
+"""Three phase frames alone under a projector that bends waves: σ holds the error, and a sentence says so. The scene and its images are
+those of tests/scenes/depth.py."""
 
 import json
 
