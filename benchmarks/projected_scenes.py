@@ -84,6 +84,8 @@ class World:
     samples: int = 4
     """Samples along each side of a camera pixel."""
     gamma: float = 1.0
+    mixed: float = 0.0
+    """Part of the next pattern in each frame, as a camera records that is not synchronised."""
     read_noise: float = 0.003
     electrons: float = 10000.0
     """At full scale."""
@@ -230,7 +232,9 @@ def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarra
     frames = np.empty((len(patterns), height, width))
     column, row = (np.floor(place * FINE).astype(int) for place in (light.u, light.v))
     for number, pattern in enumerate(patterns):
-        shown = _focus(draw(pattern, world.rig.projector).astype(np.float64) ** world.gamma, world.blur_px)
+        following = patterns[(number + 1) % len(patterns)]
+        light_of, then = (draw(each, world.rig.projector).astype(np.float64) ** world.gamma for each in (pattern, following))
+        shown = _focus((1 - world.mixed) * light_of + world.mixed * then, world.blur_px)
         recorded = np.bincount(light.pixel, light.weight * shown[row, column], width * height) * world.light
         recorded += light.ambient * world.ambient
         recorded = rng.poisson(recorded * world.electrons) / world.electrons + rng.normal(0, world.read_noise, recorded.shape)

@@ -100,17 +100,18 @@ def row(trial: Trial) -> str:
 
 
 def renewed(before: str, rows: list[str]) -> str:
-    """Return the page with the rows of some trials replaced, each with the sentence under it; what has no row yet is left out."""
+    """Return the page with the rows of some trials replaced, each with the sentence under it; new ones follow the last of them."""
     found = {row.split("|")[1]: row for row in rows}
     lines: list[str] = []
-    inside = False  # a trial whose old sentence goes
+    inside, last = False, len(before.split("\n"))  # whether a trial's old sentence goes; the line behind the last row
     for line in before.split("\n"):
         name = line.split("|")[1] if line.startswith("| ") else ""
         if inside and name.startswith(" *"):
             continue
         inside = name in found
         lines.append(found.pop(name) if inside else line)
-    return "\n".join(lines)
+        last = len(lines) if inside else last
+    return "\n".join([*lines[:last], *found.values(), *lines[last:]])
 
 
 def picture(trials: list[Trial]) -> np.ndarray:

@@ -6,9 +6,10 @@ to the surface to the sensor, second returns from a facing wall, and a wave that
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from service.requests.depth import DepthRequest
 
 ROWS, COLS, RAYS, FOCAL_PX = 90, 120, 3, 95.0
 LIGHT_M_S = 299_792_458.0
+FOG_STEP_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,10 @@ class Case:
     """Third harmonic of the light, relative to the first."""
     bounced: float = 0.0
     """Light by way of a wall 1.1 m aside, relative to the direct light, near the floor."""
+    fog: float = 0.0
+    """Scattering coefficient of a fog that begins 0.3 m before the camera, 1/m."""
+    misread: Callable[[dict[str, Any]], dict[str, Any]] = dict
+    """What is declared in place of the entry of a frame."""
 
 
 CASES = (
@@ -47,6 +53,13 @@ CASES = (
     Case("cw, source aside, not declared", in_model=False, source=(0.06, 0.02, 0.0), declared=False),
     Case("cw, wiggling not calibrated", in_model=False, third=0.06),
     Case("cw, light bounced near the floor", in_model=False, bounced=0.25),
+    Case("cw, phases declared backwards", in_model=False, misread=lambda entry: entry | {
+        "reference_phase_rad": -entry["reference_phase_rad"] % (2 * np.pi)}),
+    Case("cw, 60 MHz declared as 62", in_model=False, misread=lambda entry: entry | {
+        "modulation_hz": {60e6: 62e6}.get(entry["modulation_hz"], entry["modulation_hz"])}),
+    Case("cw, two frequencies exchanged", in_model=False, hz=(40e6, 70e6), misread=lambda entry: entry | {
+        "modulation_hz": 110e6 - entry["modulation_hz"]}),
+    Case("cw, fog of 0.05 / m", in_model=False, fog=0.05),
 )
 
 
@@ -90,6 +103,11 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, list[dict[str, obje
     if case.bounced:
         height = points[..., 1] + 1.0
         ways.append((range_m + leg + 1.1, case.bounced * strength * np.exp(-height / 0.3)))
+    if case.fog:
+        ways = [(path, light * np.exp(-case.fog * path)) for path, light in ways]
+        for at in np.arange(0.3, 6.0, FOG_STEP_M):
+            scattered = case.electrons * case.fog / 4 * np.exp(-2 * case.fog * at) / at**2 * FOG_STEP_M
+            ways.append((np.full_like(leg, 2 * at), scattered * (at < range_m)))
     images, entries = [], []
     for hz in case.hz:
         for step in range(case.phases):
@@ -100,8 +118,8 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, list[dict[str, obje
                 mean = mean + light * (1 + np.cos(turn) + case.third * np.cos(3 * turn))
             pixel = np.maximum(mean, 0).reshape(ROWS, RAYS, COLS, RAYS).mean(axis=(1, 3))
             images.append(random.poisson(pixel) + random.normal(0, 6, pixel.shape))
-            entries.append({"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta,
-                            **({"source_m": case.source} if case.declared and any(case.source) else {})})
+            entries.append(case.misread({"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta,
+                                         **({"source_m": case.source} if case.declared and any(case.source) else {})}))
     truth = np.median(range_m.reshape(ROWS, RAYS, COLS, RAYS).transpose(0, 2, 1, 3).reshape(ROWS, COLS, -1), axis=-1)
     return np.array(images), entries, truth
 

@@ -79,6 +79,11 @@ def trials(data: Path | None) -> Iterator[Trial]:
                    camera_from_projector=(rig.pose @ turn).tolist(), focal_px=[rig.projector_focal * zoom] * 2)
     for name, (patterns, change) in wrong().items():
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
+    one = phase_patterns("column", (WIDTH,), 3)
+    yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), one, light)
+    yield _run(f"phase {WIDTH}, 3 steps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), one, light)
+    for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3)):
+        yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES[name], light)
 
 
 def _turn(first: int, second: int, degrees: float) -> np.ndarray:

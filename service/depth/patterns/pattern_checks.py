@@ -14,6 +14,7 @@ from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.readings import Readings
+from service.depth.patterns.swing import exponent_of_swing
 from stage.capture.camera import Camera
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import StageError
@@ -253,8 +254,10 @@ def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, proj
                      device: str) -> float:
     """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
     grey = sample.grey[list(code.frames)].astype(np.float64)
-    if len(code.frames) < 5:
-        return 1.0  # offset, amplitude and place leave one reading over at most
+    if len(code.frames) < 5:  # offset, amplitude and place leave one reading over at most
+        whole = sample.mask.ravel() if sample.saturated is None else sample.mask.ravel() & ~sample.saturated[list(code.frames)].any(axis=0)
+        alone = len(set(code.periods_px)) == 1
+        return exponent_of_swing(grey[:, whole], code.shifts, code.periods_px[0], EXPONENTS, noise) if alone else 1.0
     variance = noise.read**2 + noise.gain * np.maximum(grey.mean(axis=0), 0)
     misfit = {}
     for exponent in EXPONENTS:

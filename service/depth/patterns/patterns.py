@@ -19,6 +19,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import contradiction
+from service.depth.patterns.levels import check_levels
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
 from service.errors import RequestError
@@ -159,7 +160,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
-    wrong = wrong or check_codes(sample, codes.collected, shown, noise)
+    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, noise)
     if wrong is not None:
         return [wrong], codes
     if shown.response is None:

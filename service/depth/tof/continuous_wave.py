@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import warp as wp
 
 from kernels.errors import ArrayError
-from kernels.status import ESTIMATED, Status
+from kernels.status import ESTIMATED, SOLVED, Status
 from kernels.tof.continuous.continuous import ENTRIES, LEAST_PHASES, Correlation, Noise, decode, sample_harmonics, straighten, weights
 from kernels.tof.continuous.decide import AGREEMENT_RAD, DECIDED, UNCALIBRATED_RAD, Ranges, decide
 from kernels.tof.continuous.disagreement import widen
@@ -18,6 +19,7 @@ from kernels.tof.continuous.pool import pool
 from kernels.tof.continuous.steps import cover_steps
 from kernels.tof.continuous.unwrap import unwrap, vote
 from service.depth.base.solution import RangeImage
+from service.depth.tof.phase_checks import DOUBTED, Phases, misread_direction, misread_frequencies
 from service.requests.depth import TofOptions
 from stage.tof.calibration import TofCalibration
 from stage.tof.light_time import SPEED_OF_LIGHT
@@ -141,8 +143,12 @@ def _fit(level: np.ndarray, squared: np.ndarray) -> Noise:
 POOLED = 0.5
 """Factor on the probability of the wrap of a pixel that was decoded with its dark neighbours: whether it is on their surface, its own light
 does not tell."""
+NO_SIGNAL = (Status.UNSOLVED, Status.LOW_MODULATION, Status.SATURATED)
+"""Statuses of pixels whose phases say nothing."""
 MOST_OF_SCENE = 0.5
 """Part of the pixels from which a disagreement of the frequencies is told of."""
+SCATTERED_RAD = 0.1
+"""Median disagreement of the frequencies beyond noise above which no range is believed: a third harmonic of 8 % bends phases by no more."""
 
 
 def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
@@ -169,15 +175,15 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     straight = [hz for hz in found.modulation_hz.tolist() if calibration.of_frequency(hz) is not None]
     agreement = AGREEMENT_RAD if len(straight) == len(found.modulation_hz) else UNCALIBRATED_RAD
 
-    def ranges_of(phases: Correlation) -> Ranges:
-        hypotheses = unwrap(phases, nearest_m=nearest, farthest_m=farthest, light_speed=SPEED_OF_LIGHT)
+    def ranges_of(phases: Correlation, most_m: float = farthest) -> Ranges:
+        hypotheses = unwrap(phases, nearest_m=nearest, farthest_m=most_m, light_speed=SPEED_OF_LIGHT)
         if options.vote:
             hypotheses = vote(hypotheses, rows, cols)
         return decide(phases, hypotheses, light_speed=SPEED_OF_LIGHT, agreement_rad=agreement)
 
     pixels = rows * cols
     ranges = ranges_of(found)
-    status = ranges.status.numpy()[:pixels]
+    status = first_status = ranges.status.numpy()[:pixels]
     widened = widen(found, ranges, rows, cols, light_speed=SPEED_OF_LIGHT)
     further = widened.further.numpy()[:pixels]
     if further.any():
@@ -187,6 +193,26 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     spacing_m = common_range_m(frames.modulation_hz.max(), SPEED_OF_LIGHT)
     sigma = cover_steps(ranges, found.amplitude, rows, cols, spacing_m=spacing_m).numpy()[:pixels]
     confidence = ranges.confidence.numpy()[:pixels] * np.where(reach > 0, POOLED, 1).astype(np.float32)
+    lit = usable.reshape(-1) & ~np.isin(first_status, NO_SIGNAL)
+    declared = float(((first_status == Status.OK) & (further == 0))[lit].mean()) if lit.any() else 1.0
+
+    def agreeing(other: Phases) -> float:
+        phases = _with_phases(found, other)
+        first = ranges_of(phases, min(farthest, nearest + common_range_m(other.hz, SPEED_OF_LIGHT)))
+        more = widen(phases, first, rows, cols, light_speed=SPEED_OF_LIGHT).further.numpy()[:pixels]
+        return float(((first.status.numpy()[:pixels] == Status.OK) & (more == 0))[lit].mean())
+
+    phase, spread = (array.numpy()[:, :pixels].reshape(-1, rows, cols) for array in (found.phase, found.sigma))
+    size_rad = np.inf
+    wrong = misread_frequencies(Phases(phase, spread, found.modulation_hz), declared, agreeing) if lit.any() else None
+    sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
+    if wrong is None:
+        wrong = misread_direction(ranges.range.numpy()[:pixels].reshape(rows, cols),
+                                  found.amplitude.numpy()[-1, :pixels].reshape(rows, cols), sure)
+    if wrong is None:
+        size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
+    if wrong is not None and size_rad > SCATTERED_RAD:
+        confidence = confidence * DOUBTED
     facts = {
         "modulation_hz": found.modulation_hz.tolist(),
         "images": len(frames.images),
@@ -200,20 +226,33 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     }
     return RangeImage("time of flight, continuous wave", ranges.range.numpy()[:pixels], sigma,
                     found.amplitude.numpy()[:, :pixels].mean(axis=0), confidence, status, facts, DECIDED,
-                    _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz)))
+                    () if wrong is None else (wrong,))
 
 
-def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[str, ...]:
-    """Return a sentence if the frequencies disagree by more than noise (`further`, τ² of `widen`) over most of the scene."""
+def _with_phases(found: Correlation, other: Phases) -> Correlation:
+    """Return the phases of a whole image as `unwrap` takes them: under other frequencies, or running the other way."""
+    arrays = []
+    for before, after in ((found.phase, other.phase), (found.sigma, other.sigma)):
+        values = before.numpy().copy()
+        values[:, :after[0].size] = after.reshape(len(after), -1)
+        arrays.append(wp.array(values, dtype=wp.float32, device=str(before.device)))
+    return found._replace(phase=arrays[0], sigma=arrays[1], modulation_hz=other.hz)
+
+
+def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[float, str | None]:
+    """Return by how much the frequencies disagree beyond noise, radians (`further`, τ² of `widen`), and a sentence if they do over most of
+    the scene."""
     part = float((further > 0).mean()) if further.size else 0.0
     if part < MOST_OF_SCENE:
-        return ()
-    size = 1000 * float(np.sqrt(np.median(further[further > 0])))
+        return 0.0, None
+    size_rad = float(np.sqrt(np.median(further[further > 0])))
     advice = ("check that the calibration is of this camera" if calibrated
               else "measure the wiggling with relit calibrate tof and give --tof-calibration")
-    return (f"frames[].tof: the phases of the frequencies disagree by {size:.0f} mrad more than noise at {100 * part:.0f} % of the pixels, "
-            f"by wiggling or by light that comes over several ways: {advice}, and modulation_hz; the standard "
-            "deviations hold what the frequencies disagree by, not an error that they share",)
+    so = ("no range is believed, because wiggling alone bends phases less than that" if size_rad > SCATTERED_RAD
+          else "the standard deviations hold what the frequencies disagree by, not an error that they share")
+    return size_rad, (f"frames[].tof: the phases of the frequencies disagree by {1000 * size_rad:.0f} mrad more than noise at "
+                      f"{100 * part:.0f} % of the pixels, by wiggling or by light that comes over several ways, as in fog: {advice}, and "
+                      f"modulation_hz; {so}")
 
 
 def _noise(frames: CorrelationImages, calibration: TofCalibration, limit: float | None, usable: np.ndarray) -> tuple[Noise, str]:

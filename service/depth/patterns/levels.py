@@ -1,0 +1,107 @@
+"""Levels that no pattern has: frames that mix two patterns, and surfaces that move between frames.
+
+A pattern and its inverse add up to even light, and so does a wave over its shifts, whatever is seen and however blurred it is. Where these
+sums differ between the bits of a code, or between the periods of its waves, frames of one pixel do not show one scene under the patterns
+that are declared: the camera has recorded parts of two patterns, or the surface has moved.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.phase import weights
+from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+
+CLEAR_SIGMAS = 5.0
+"""Difference of two sums, in its standard deviations, from which on it is none of noise."""
+LEAST_PART, WAVE_PART = 0.04, 0.02
+"""The same as a part of the largest difference of two readings of the pixel, for pairs and for waves: lamps flicker by less."""
+CLEAR_BIT = 0.85
+"""Least difference of a bit and its inverse, as a part of the largest of the pixel's bits, with which its sum is compared."""
+LIT_SIGMAS = 20.0
+"""Least of that largest difference, in deviations of a reading, of pixels that tell whether frames are mixed."""
+MOST_MIXED = 0.25
+"""Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
+
+
+class EvenLevels(NamedTuple):
+    """Sums of frames that are the same at a pixel, as weights [sums, frames]; None without two of a kind."""
+
+    pairs: np.ndarray | None
+    """Bits with their inverses."""
+    waves: np.ndarray | None
+    """Waves over their shifts."""
+    bits: np.ndarray | None
+    """Differences of the bits and their inverses."""
+
+    @classmethod
+    def of(cls, collected: Collected, frames: int) -> "EvenLevels":
+        """Return the sums that a capture has; where no code has waves none, because stripes are read rightly from mixed frames."""
+        pairs: list[tuple[int, int]] = []
+        waves: list[np.ndarray] = []
+        phases = [code for code in collected.codes if isinstance(code, PhaseCode)]
+        for code in collected.codes:
+            if isinstance(code, BinaryCode) and code.inverses is not None and phases:
+                pairs += zip(code.frames, code.inverses, strict=True)
+        for phase in phases:
+            for period in dict.fromkeys(phase.periods_px):
+                members = [index for index, other in enumerate(phase.periods_px) if other == period]
+                if len(members) >= FULL_STEPS:
+                    mean = weights(np.array([phase.shifts[index] for index in members]), period)[:, 0]
+                    waves.append(_row(frames, [phase.frames[index] for index in members], mean))
+        several = len(pairs) > 1
+        return cls(np.stack([_row(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
+                   np.stack(waves) if len(waves) > 1 else None,
+                   np.stack([_row(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None)
+
+    def mixed(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return where readings [frames, pixels] have levels that no pattern has, [pixels] bool.
+
+        Of the bits that are equally clear, those that are lit in the pattern are compared with those that are lit in the inverse: a camera
+        that is not linear bends their sums alike, and a frame that holds part of the next one bends them apart.
+        """
+        found = np.zeros(grey.shape[1], bool)
+        whole = np.ptp(grey, axis=0)
+
+        def clear(away: np.ndarray, rows: np.ndarray, level: np.ndarray, part: float) -> np.ndarray:
+            variance = 2 * float((rows**2).sum(axis=1).max()) * (noise.read**2 + noise.gain * np.maximum(level, 0))
+            return np.asarray(away > np.maximum(CLEAR_SIGMAS * np.sqrt(variance), part * whole))
+
+        if self.waves is not None:
+            sums = self.waves.astype(np.float32) @ grey
+            found |= clear(np.ptp(sums, axis=0), self.waves, sums.mean(axis=0), WAVE_PART)
+        if self.pairs is not None and self.bits is not None:
+            sums, bits = self.pairs.astype(np.float32) @ grey, self.bits.astype(np.float32) @ grey
+            seen = np.abs(bits) >= CLEAR_BIT * np.abs(bits).max(axis=0)
+            sides = [np.where(seen & lit, sums, 0).sum(axis=0) / np.maximum((seen & lit).sum(axis=0), 1) for lit in (bits > 0, bits < 0)]
+            both = np.logical_and(*((seen & lit).any(axis=0) for lit in (bits > 0, bits < 0)))
+            found |= both & clear(np.abs(sides[0] - sides[1]), self.pairs, sums.mean(axis=0), LEAST_PART)
+        return found
+
+
+def _row(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:
+    """Return [frames] weights that are 0 elsewhere."""
+    row = np.zeros(frames)
+    row[list(places)] = values
+    return row
+
+
+def check_levels(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
+    """Return a sentence if much of a sample has levels that no pattern has."""
+    grey = sample.grey
+    lit = sample.mask.ravel() & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
+    if sample.saturated is not None:
+        lit &= ~sample.saturated.any(axis=0)
+    if lit.sum() < ENOUGH:
+        return None
+    share = float(EvenLevels.of(collected, len(grey)).mixed(grey[:, lit], noise).mean())
+    if share < MOST_MIXED:
+        return None
+    return (f"frames: {100 * share:.0f} % of the lit pixels have levels that no pattern has (bits and their inverses, or waves over their "
+            "shifts, do not add up to the same light): the camera has recorded parts of two patterns, or what it sees has moved: wait "
+            "longer for each pattern, or synchronise projector and camera")

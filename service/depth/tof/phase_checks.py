@@ -1,0 +1,161 @@
+"""Checks of what the phases of a continuous-wave camera are declared to be: how they change over surfaces, and how bright these are.
+
+Over a surface every phase changes in proportion to its frequency, whatever its wraps and its zero are; so frequencies that are declared
+wrongly show in the changes between neighbours. Phases that run backwards turn the scene inside out: each surface then grows brighter with
+the distance, where light falls off with its square. Both are only looked for; a reading is named where it fits and the declared one does
+not.
+"""
+
+from collections.abc import Callable, Iterator
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+
+LAG = 3
+"""Distance in pixels of the neighbours that are compared: a surface changes over it by more than noise."""
+LARGEST_RAD = 0.7
+"""Largest change of a phase between them; a larger one is an edge."""
+CLEAR_SIGMAS = 5.0
+"""Least change of the phase that others are compared with, in its standard deviations: noise then hardly dilutes their ratio."""
+ENOUGH = 200
+"""Number of neighbours that tell a ratio."""
+AGREE, CLEAR_SHARE, CLEAR_TIMES = 0.5, 0.6, 2.0
+"""Share of the pixels whose frequencies agree, from which on the frequencies are not doubted; least share with which another reading is
+named, and how many times that of the declared one it must be."""
+AS_GOOD = 0.02
+"""Share of the pixels by which one reading may be worse than another and still be named in its place."""
+STEP_HZ, UNSURE_RATIO = 1e6, 0.04
+"""Steps of the frequencies that are tried, and the part by which changes of phases leave their ratio open: wiggling and edges bend it."""
+BLOCKS = 12
+"""Number of blocks in each direction of an image in which the brightness is compared with the range."""
+IN_A_BLOCK = 20
+"""Number of neighbours that tell it in a block."""
+EDGE_PART, FALL_OFF = 0.05, 0.35
+"""Largest change of the range, as a part of it, and of the logarithm of the brightness, between neighbours of one surface."""
+SURE_BLOCK, MOST_BLOCKS, FEWEST_BLOCKS = 0.3, 0.7, 20
+"""Least correlation of brightness and range in a block that tells a sign, share of such blocks in which surfaces grow brighter with the
+distance from which on phases run backwards, and number of blocks that tell it."""
+DOUBTED = 0.1
+"""Factor on the probability of ranges whose frames are declared wrongly."""
+
+
+class Phases(NamedTuple):
+    """Phases of a whole image, ascending in frequency."""
+
+    phase: np.ndarray  # [F, rows, cols] radians
+    sigma: np.ndarray  # [F, rows, cols] radians, not above 0 where there is none
+    hz: np.ndarray  # [F]
+
+    def changed(self, hz: np.ndarray, sign: np.ndarray) -> "Phases":
+        """Return what they are if they belong to other frequencies, and run backwards where the sign is -1."""
+        order = np.argsort(hz)
+        return Phases((self.phase * sign[:, None, None] % (2 * np.pi))[order], self.sigma[order], hz[order])
+
+
+def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float]) -> str | None:
+    """Return how frequencies are declared wrongly, as a sentence; None if none is, or no other reading fits.
+
+    Args:
+        declared: share of the pixels whose frequencies agree as declared.
+        agreeing: of other phases.
+    """
+    if declared >= AGREE or len(phases.hz) < 2:
+        return None
+    tried = [(agreeing(other), words) for other, words in _readings(phases)]
+    best, words = next(found for found in tried if found[0] >= max(tried)[0] - AS_GOOD)  # exchanged ones come first
+    if best < max(CLEAR_SHARE, CLEAR_TIMES * declared):
+        return None
+    return (f"frames[].tof: as declared, the frequencies agree at {100 * declared:.0f} % of the pixels, and at {100 * best:.0f} % if "
+            f"{words}; no range is believed")
+
+
+def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
+    """Yield other ways to understand the phases of several frequencies, and what to check."""
+    hz, same = phases.hz, np.ones(len(phases.hz))
+    for a, b in combinations(range(len(hz)), 2):
+        swapped = hz.copy()
+        swapped[[a, b]] = hz[[b, a]]
+        yield phases.changed(swapped, same), f"{hz[a] / 1e6:g} and {hz[b] / 1e6:g} MHz are exchanged: check modulation_hz"
+    seen: set[tuple[int, float]] = set()
+    for known, other in permutations(range(len(hz)), 2):
+        ratio = _ratio(phases, other, known)
+        if ratio is None:
+            continue
+        least, most = (round((1 + part) * abs(ratio) * hz[known] / STEP_HZ) for part in (-UNSURE_RATIO, UNSURE_RATIO))
+        for step in range(max(least, 1), most + 1):
+            found, sign = hz.copy(), same.copy()
+            found[other], sign[other] = step * STEP_HZ, np.sign(ratio)
+            reading = other, float(sign[other] * found[other])
+            if len(set(found)) == len(found) and reading not in {*seen, (other, float(hz[other]))}:
+                seen.add(reading)
+                yield phases.changed(found, sign), _words(hz[other], found[other], backwards=ratio < 0)
+
+
+def _words(declared_hz: float, found_hz: float, *, backwards: bool) -> str:
+    """Return what is wrong with one frequency, and what to check."""
+    declared = f"{declared_hz / 1e6:g} MHz"
+    what = [f"{declared} are {found_hz / 1e6:g} MHz: check modulation_hz"] if found_hz != declared_hz else []
+    return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad"] if backwards else what)
+
+
+def _ratio(phases: Phases, one: int, other: int) -> float | None:
+    """Return how many times as fast one phase changes over surfaces as another; None if too few neighbours tell it."""
+    first: list[np.ndarray] = []
+    second: list[np.ndarray] = []
+    for axis in (0, 1):
+        step = [_between(phases.phase[f], axis) for f in (one, other)]
+        spread = [np.hypot(*_ends(phases.sigma[f], axis)) for f in (one, other)]
+        known = np.logical_and.reduce([(side > 0) for f in (one, other) for side in _ends(phases.sigma[f], axis)])
+        kept = known & (np.abs(step[0]) < LARGEST_RAD) & (np.abs(step[1]) < LARGEST_RAD) & (np.abs(step[1]) > CLEAR_SIGMAS * spread[1])
+        first.append(step[0][kept])
+        second.append(step[1][kept])
+    changes, reference = np.concatenate(first), np.concatenate(second)
+    if len(changes) < ENOUGH:
+        return None
+    ratio = changes / reference
+    order = np.argsort(ratio)
+    weight = np.cumsum(np.abs(reference)[order])
+    return float(ratio[order][np.searchsorted(weight, weight[-1] / 2)])
+
+
+def _ends(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values of both pixels of each pair LAG apart."""
+    return (values[LAG:], values[:-LAG]) if axis == 0 else (values[:, LAG:], values[:, :-LAG])
+
+
+def _between(phase: np.ndarray, axis: int) -> np.ndarray:
+    """Return the change of a phase over LAG pixels, -π…π."""
+    there, here = _ends(phase, axis)
+    return (there - here + np.pi) % (2 * np.pi) - np.pi
+
+
+def misread_direction(range_m: np.ndarray, amplitude: np.ndarray, sure: np.ndarray) -> str | None:
+    """Return that the phases look declared backwards, as a sentence; None if surfaces do not grow brighter with the distance.
+
+    Source: Horn, "Obtaining shape from shading information", 1975: under a source at the camera, a plane's light falls with the cube of the
+    distance.
+
+    Args:
+        range_m: [rows, cols] metres.
+        amplitude: [rows, cols], in any unit.
+        sure: [rows, cols] bool, pixels with a range.
+    """
+    rows, cols = range_m.shape
+    lit = sure & (amplitude > 0) & (range_m > 0)
+    near, bright = np.log(np.where(lit, range_m, 1.0)), np.log(np.where(lit, amplitude, 1.0))
+    square, mixed, other, count = (np.zeros((BLOCKS, BLOCKS)) for _ in range(4))
+    for axis in (0, 1):
+        step, change = (np.subtract(*_ends(values, axis)) for values in (near, bright))
+        both = np.logical_and(*_ends(lit, axis)) & (np.abs(step) < EDGE_PART) & (np.abs(change) < FALL_OFF)
+        line, place = np.nonzero(both)
+        block = (line * BLOCKS // rows, place * BLOCKS // cols)
+        for total, values in ((square, step * step), (mixed, step * change), (other, change * change), (count, np.ones_like(step))):
+            np.add.at(total, block, values[both])
+    part = mixed / np.sqrt(np.maximum(square * other, 1e-30))
+    tells = (count >= IN_A_BLOCK) & (np.abs(part) >= SURE_BLOCK)
+    share = float((part[tells] > 0).mean()) if tells.sum() >= FEWEST_BLOCKS else 0.0
+    if share < MOST_BLOCKS:
+        return None
+    return (f"frames[].tof.reference_phase_rad: in {100 * share:.0f} % of the scene surfaces grow brighter with the distance, as if the "
+            "phases ran backwards: check the order of the images, and the sign of reference_phase_rad; no range is believed")

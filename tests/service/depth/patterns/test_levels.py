@@ -1,0 +1,49 @@
+"""Frames that hold part of the next pattern are named, and no depth is believed: the scene and the images of tests/scenes/depth.py."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest
+from tests.scenes.captures import write_exr
+from tests.scenes.depth import AMBIENT, gray_patterns, make_scene, manifest, phase_patterns, shown
+
+NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
+SEVERAL = [*phase_patterns("column", 16.0), *phase_patterns("column", 18.0), *phase_patterns("column", 21.0)]
+NOISE = 0.003
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene()
+
+
+def measured(folder, scene, patterns, part, *, gamma=1.0):
+    """What relit depth makes of frames of which each holds this part of the next one, recorded by a camera of this exponent."""
+    rng = np.random.default_rng(4)
+    light = np.array([scene.albedo[..., 1] * (0.8 * shown(pattern, scene.uv) * ~scene.shaded + AMBIENT) for pattern in patterns])
+    light = ((1 - part) * light + part * np.roll(light, -1, axis=0)) ** gamma
+    frames = []
+    for number, (image, pattern) in enumerate(zip(light, patterns, strict=True)):
+        write_exr(folder / f"{number:02d}.exr", np.repeat((image + rng.normal(0, NOISE, image.shape))[..., None], 3, axis=-1))
+        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
+    (folder / "capture.json").write_text(json.dumps(manifest(frames)))
+    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+
+
+@pytest.mark.parametrize("patterns", [NUMBERED, SEVERAL], ids=["numbered", "several"])
+@pytest.mark.parametrize("part", [0.2, 0.3])
+def test_frames_that_mix_two_patterns_are_named(tmp_path, scene, patterns, part):
+    result = measured(tmp_path, scene, patterns, part)
+    assert not result.maps.mask.any()
+    assert any("levels that no pattern has" in sentence for sentence in result.warnings)
+
+
+@pytest.mark.parametrize(("patterns", "gamma"), [(NUMBERED, 1.0), (SEVERAL, 1.0), (NUMBERED, 1.8)],
+                         ids=["numbered", "several", "a camera that is not linear"])
+def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
+    result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)
+    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
+    assert gamma != 1.0 or result.maps.mask[~scene.shaded].mean() > 0.9

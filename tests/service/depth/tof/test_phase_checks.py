@@ -1,0 +1,80 @@
+"""Phases that are declared backwards, or of other frequencies, and fog: named, and no range is believed. The room, its images and their
+noise are those of tests/reference/tof.py."""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.depth.depth import depth
+from service.requests.depth import DepthRequest
+from tests.reference import tof
+
+ROWS, COLS = 72, 96
+VIEW = tof.room(ROWS, COLS)
+HZ = (20e6, 50e6, 60e6)
+
+
+def measured(folder, images, settings):
+    """What relit depth makes of correlation images under these declarations."""
+    frames = []
+    for index, (image, (hz, delta)) in enumerate(zip(images, settings, strict=True)):
+        np.save(folder / f"{index:02d}.npy", image.astype(np.float32))
+        frames.append({"image": f"{index:02d}.npy", "tof": {"type": "cw", "modulation_hz": hz, "reference_phase_rad": delta}})
+    camera = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [90.0, 90.0]}
+    (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "room", "camera": camera, "frames": frames}))
+    return depth(DepthRequest(capture=folder, out=folder / "out", device="cpu"))
+
+
+def under(hz=HZ, phases=4, **more):
+    """Images of the room and their true settings."""
+    settings = tof.even(hz, phases)
+    return tof.correlations(VIEW, 2e5, settings, ambient=30, seed=3, **more), settings
+
+
+@pytest.mark.parametrize(("hz", "phases"), [(HZ, 4), (HZ, 3), ((30e6, 70e6), 4), ((12e6,), 4)])
+def test_phases_that_are_declared_backwards_are_named(tmp_path, hz, phases):
+    images, settings = under(hz, phases)
+    result = measured(tmp_path, images, [(f, -delta % (2 * np.pi)) for f, delta in settings])
+    assert not result.maps.mask.any()
+    assert "phases ran backwards" in result.warnings[0]
+
+
+@pytest.mark.parametrize(("declared", "words"), [
+    ({50e6: 52e6}, "52 MHz are 50 MHz"),
+    ({60e6: 57e6}, "57 MHz are 60 MHz"),
+    ({20e6: 60e6, 60e6: 20e6}, "20 and 60 MHz are exchanged"),
+])
+def test_frequencies_that_are_declared_wrongly_are_named(tmp_path, declared, words):
+    images, settings = under()
+    result = measured(tmp_path, images, [(declared.get(hz, hz), delta) for hz, delta in settings])
+    assert not result.maps.mask.any()
+    assert words in result.warnings[0]
+
+
+def test_one_frequency_that_runs_backwards_is_named(tmp_path):
+    images, settings = under()
+    result = measured(tmp_path, images, [(hz, -delta % (2 * np.pi) if hz == 50e6 else delta) for hz, delta in settings])
+    assert not result.maps.mask.any()
+    assert "the phases of 50 MHz run backwards" in result.warnings[0]
+
+
+def test_fog_is_not_believed(tmp_path):
+    """Fog scatters light from all depths before a surface, here 2 % a metre, and most of it from near the camera."""
+    images, settings = under()
+    near = np.arange(0.25, 8.0, 0.05)
+    for image, (hz, delta) in zip(images, settings, strict=True):
+        for at in near:
+            image += 2e5 * 0.02 / 4 / at**2 * 0.05 * (1 + np.cos(4 * np.pi * hz * at / tof.LIGHT - delta)) * (at < VIEW.distance)
+    result = measured(tmp_path, images, settings)
+    error = np.abs(result.maps.range - VIEW.distance)[result.maps.mask]
+    assert (error > 0.1).sum() < 0.01 * VIEW.distance.size
+    assert "as in fog" in result.warnings[0]
+
+
+@pytest.mark.parametrize("more", [{}, {"harmonics": {3: 0.06}}], ids=["cosine", "wiggling"])
+def test_what_is_declared_rightly_is_believed(tmp_path, more):
+    images, settings = under(**more)
+    result = measured(tmp_path, images, settings)
+    assert result.maps.mask.mean() > 0.95
+    assert not any("believed" in sentence for sentence in result.warnings)
