@@ -24,6 +24,7 @@ from benchmarks.fresnel import fresnel_table
 from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
+from benchmarks.on_set import set_table
 from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
@@ -186,6 +187,11 @@ def memory(given: argparse.Namespace) -> list[str] | None:
     return None if given.large is None else large_table(given.large, given.megapixels, given.lights, given.frames)
 
 
+def on_set(_: argparse.Namespace) -> list[str]:
+    """Measure faults that are named, and times of captures."""
+    return set_table()
+
+
 SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
@@ -204,6 +210,7 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
+    "on_set": ("Captures on the set", on_set),
 }
 INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\n"
                 "Written by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "

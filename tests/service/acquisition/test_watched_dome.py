@@ -1,23 +1,14 @@
 """The shipped owl under its 96 lamps on the twin of a stage, by the command line alone: a watched folder, solve, export."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import OpenEXR
 import pytest
 
-import service
 from stage.capture.capture import Capture
 from stage.formats import images
-from tests.scenes.patched_rigs import loopback
-from tests.scenes.rigs import write_rig
-from tests.service.acquisition.test_acquire import posting
+from tests.service.acquisition.owl_stage import owl_on_stage
 from tests.service.owl import OWL, block_mean
 
-ROOT = Path(service.__file__).parents[1]
 CROP = "130,120,48,48"
 """The part of the owl that is solved."""
 
@@ -25,24 +16,12 @@ CROP = "130,120,48,48"
 @pytest.mark.long
 def test_the_owl_is_captured_as_its_files_are_imported(tmp_path, relit):
     """Each of 96 pictures is that of its lamp, and what is solved of them is what is solved of the same files when they are imported."""
-    lights = [frame.light.direction for frame in Capture.open(OWL).manifest.frames]
-    rig, watched, host = tmp_path / "rig.json", tmp_path / "watched", loopback()
-    write_rig(rig, lights, {"white": (1.0, 1.0, 1.0)}, host=host)
-    command = [sys.executable, "-m", "service.cli.main", "twin", rig, OWL, "--interface", host, "--port", "0", "--pictures", watched,
-               "--noise", "0.001", "--exposure", "-1", "--cache", tmp_path]
-    twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    try:
-        assert twin.stdout.readline().startswith("twin ")
-        page = twin.stdout.readline().split()[1].removesuffix(":")
-        said = relit.done("capture", "olat", "--rig", rig, "--camera", f"watch:{watched}", "--trigger", posting(f"{page}/release"), "--out",
-                          tmp_path / "capture").out
-    finally:
-        twin.kill()
-        twin.wait()
+    with owl_on_stage(tmp_path) as given:
+        said = relit.done("capture", "olat", *given, "--out", tmp_path / "capture").out
     assert "fault " not in said and "96 of 96" in said
     capture, imported = tmp_path / "capture", tmp_path / "imported"
-    frames = Capture.open(capture).manifest.frames
-    assert np.allclose([frame.light.direction for frame in frames], lights, atol=1e-6)
+    frames, lights = (Capture.open(folder).manifest.frames for folder in (capture, OWL))
+    assert np.allclose([frame.light.direction for frame in frames], [frame.light.direction for frame in lights], atol=1e-6)
     seen, lit = (np.stack([block_mean(images.read_pixels(path).astype(np.float32), 8) for path in paths])
                  for paths in ([capture / frame.image for frame in frames], sorted(OWL.glob("[0-9][0-9][0-9].exr"))))
     # the owl's lamps are three times as bright, and the exposure is a half

@@ -1,0 +1,70 @@
+"""Captures on the set: faults that are named over random seeds, Relit's own time for a picture, and the time until the preview.
+
+    python -m benchmarks.on_set      prints the tables of docs/figures.md
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from service.acquisition.checks.fault import FaultKind
+from service.acquisition.preview import PREVIEW_FILE
+from tests.service.acquisition.owl_stage import ROOT, owl_on_stage
+from tests.service.acquisition.scenes import KINDS, Scene, named, owl, relief
+from tests.service.acquisition.test_acquire import faults_at_random
+
+SEEDS = range(20)
+SCENES: dict[str, tuple[int, Callable[[int], Scene]]] = {
+    "the shipped owl": (96, lambda seed: owl()), "one relief": (34, lambda seed: relief(5)), "a relief for each seed": (34, relief)}
+PIXELS, CROP = 60_000, "10,60,300,200"
+
+
+def fault_rows() -> list[str]:
+    """Return the rows of the captures whose faults are exactly those that were made."""
+    rows = []
+    for name, (lamps, scene) in SCENES.items():
+        for kinds in (KINDS, ()):
+            right = [found == made for made, found in (named(scene(seed), seed, kinds) for seed in SEEDS)]
+            rows.append(f"| {name}, {lamps} lamps | {_said(kinds)} | {sum(right)} of {len(right)} |")
+    right = []
+    for seed in SEEDS:
+        with tempfile.TemporaryDirectory() as folder:
+            made, found = faults_at_random(Path(folder), seed)
+            right.append(found == made)
+    kinds = (FaultKind.DOUBLED, FaultKind.MISSING, FaultKind.CLIPPED, FaultKind.LATE)
+    return [*rows, f"| six lamps, whole captures | {_said(kinds)} | {sum(right)} of {len(right)} |"]
+
+
+def time_row(picture_format: str) -> str:
+    """Return the row of a capture of the owl by the command line."""
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        capture = folder / "capture"
+        with owl_on_stage(folder, "--crop", CROP, "--picture-format", picture_format) as given:
+            subprocess.run([sys.executable, "-m", "service.cli.main", "capture", "dark,olat", *map(str, given), "--out", str(capture)],
+                           cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=sys.stderr)  # a fault that remains is said
+        lines = [json.loads(line) for line in (capture / "acquisition.jsonl").read_text().splitlines()]
+        last = max(line["time"] for line in lines if line.get("event") == "taken")
+        own = json.loads((capture / "report.json").read_text())["own_ms"]["median"]
+        return f"| {picture_format} | {own:.0f} ms | {(capture / PREVIEW_FILE).stat().st_mtime - last:.1f} s |"
+
+
+def set_table() -> list[str]:
+    """Return the section of docs/figures.md."""
+    return [f"Captures whose faults are named with their pictures and none else, over {len(SEEDS)} seeds that choose noise and places.", "",
+            "| object | faults in each capture | right |", "|---|---|---|", *fault_rows(), "",
+            f"A dark picture and 96 of {PIXELS} pixels under single lamps, from the twin through a watched folder. Own: the median picture "
+            "beside exposure, transfer and settling. Preview: from the last picture, over the last judgement of all, to `preview.png`.", "",
+            "| pictures | own (bar: 50 ms) | preview (bar: 10 s) |", "|---|---|---|", *map(time_row, ("exr", "png"))]
+
+
+def _said(kinds: tuple[FaultKind, ...]) -> str:
+    return ", ".join(str(kind).replace("_", " ") for kind in kinds) or "none"
+
+
+if __name__ == "__main__":
+    print("\n".join(set_table()))
