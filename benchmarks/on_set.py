@@ -20,7 +20,7 @@ from tests.service.acquisition.test_acquire import faults_at_random
 SEEDS = range(20)
 SCENES: dict[str, tuple[int, Callable[[int], Scene]]] = {
     "the shipped owl": (96, lambda seed: owl()), "one relief": (34, lambda seed: relief(5)), "a relief for each seed": (34, relief)}
-PIXELS, CROP = 60_000, "10,60,300,200"
+PIXELS, CROP, CAPTURES = 60_000, "10,60,300,200", 3
 
 
 def fault_rows() -> list[str]:
@@ -40,7 +40,13 @@ def fault_rows() -> list[str]:
 
 
 def time_row(picture_format: str) -> str:
-    """Return the row of a capture of the owl by the command line."""
+    """Return the row of a format of pictures: the least times of several captures."""
+    own, preview = zip(*(times(picture_format) for _ in range(CAPTURES)), strict=True)
+    return f"| {picture_format} | {min(own):.0f} ms | {min(preview):.1f} s |"
+
+
+def times(picture_format: str) -> tuple[float, float]:
+    """Return Relit's own milliseconds a picture, and the seconds from the last one to the preview, of a capture by the command line."""
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         capture = folder / "capture"
@@ -49,8 +55,7 @@ def time_row(picture_format: str) -> str:
                            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=sys.stderr)  # a fault that remains is said
         lines = [json.loads(line) for line in (capture / "acquisition.jsonl").read_text().splitlines()]
         last = max(line["time"] for line in lines if line.get("event") == "taken")
-        own = json.loads((capture / "report.json").read_text())["own_ms"]["median"]
-        return f"| {picture_format} | {own:.0f} ms | {(capture / PREVIEW_FILE).stat().st_mtime - last:.1f} s |"
+        return json.loads((capture / "report.json").read_text())["own_ms"]["median"], (capture / PREVIEW_FILE).stat().st_mtime - last
 
 
 def set_table() -> list[str]:
@@ -58,7 +63,8 @@ def set_table() -> list[str]:
     return [f"Captures whose faults are named with their pictures and none else, over {len(SEEDS)} seeds that choose noise and places.", "",
             "| object | faults in each capture | right |", "|---|---|---|", *fault_rows(), "",
             f"A dark picture and 96 of {PIXELS} pixels under single lamps, from the twin through a watched folder. Own: the median picture "
-            "beside exposure, transfer and settling. Preview: from the last picture, over the last judgement of all, to `preview.png`.", "",
+            "beside exposure, transfer and settling. Preview: from the last picture, over the last judgement of all, to `preview.png`. "
+            f"The least of {CAPTURES} captures each, on a machine that other work shares.", "",
             "| pictures | own (bar: 50 ms) | preview (bar: 10 s) |", "|---|---|---|", *map(time_row, ("exr", "png"))]
 
 

@@ -26,7 +26,7 @@ def owl_on_stage(folder: Path, *options: object) -> Iterator[list[object]]:
     rig, watched, host = folder / "rig.json", folder / "watched", loopback()
     write_rig(rig, [frame.light.direction for frame in Capture.open(OWL).manifest.frames], {"white": (1.0, 1.0, 1.0)}, host=host)
     command = [sys.executable, "-m", "service.cli.main", "twin", rig, OWL, "--interface", host, "--port", "0", "--pictures", watched,
-               "--noise", "0.001", "--exposure", "-1", "--cache", folder, *options]
+               "--noise", "0.001", "--exposure", "-2", "--cache", folder, *options]
     twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     try:
         assert twin.stdout.readline().startswith("twin ")

@@ -24,8 +24,8 @@ def test_the_owl_is_captured_as_its_files_are_imported(tmp_path, relit):
     assert np.allclose([frame.light.direction for frame in frames], [frame.light.direction for frame in lights], atol=1e-6)
     seen, lit = (np.stack([block_mean(images.read_pixels(path).astype(np.float32), 8) for path in paths])
                  for paths in ([capture / frame.image for frame in frames], sorted(OWL.glob("[0-9][0-9][0-9].exr"))))
-    # the owl's lamps are three times as bright, and the exposure is a half
-    assert [np.abs(lit / 6 - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(96))
+    # the owl's lamps are three times as bright, and the exposure is a quarter
+    assert [np.abs(lit / 12 - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(96))
 
     rows = [" ".join([frame.image, *map(repr, frame.light.direction)]) for frame in frames]
     (capture / "dome.lp").write_text("\n".join([str(len(rows)), *rows]))
