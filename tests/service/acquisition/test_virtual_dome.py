@@ -118,15 +118,15 @@ def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
-def test_faults_on_the_card_are_named_with_their_pictures_and_none_else(tmp_path, seed):
+@pytest.mark.parametrize(("seed", "protocol"), [(1, "sacn"), (2, "artnet")])
+def test_faults_on_the_card_are_named_with_their_pictures_and_none_else(tmp_path, seed, protocol):
     scene = relief(seed, (10, 8, 5))
     count, random = len(scene.directions), np.random.default_rng(seed)
     light, even = scene.radiance.mean(axis=(1, 2, 3)), np.ones((count, 3))
     pictures = make_scene()._replace(directions=scene.directions, irradiance=even, images=scene.radiance,
                                      mask=np.ones(scene.radiance.shape[1:3], bool))
     write_capture(tmp_path / "scene", pictures)
-    write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()))
+    write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()), protocol=protocol)
     plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     (tmp_path / "card").mkdir()
