@@ -1,6 +1,7 @@
 """Lamps that a person holds about where Relit asks for them, a dozen degrees off: where they were is found from the pictures."""
 
 import json
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire
+from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.requests.acquire import AcquireRequest
 from stage.results.maps import SurfaceMaps
 from tests.reference.balls import render as render_ball
@@ -25,19 +27,29 @@ WIDTH, HEIGHT = 220, 120
 
 def capture_by_hand(folder: Path, monkeypatch, directions: np.ndarray, pictures: np.ndarray) -> Path:
     """Take a capture whose lamps shine from `directions`, [lamps, 3], and give `pictures`, [lamps, rows, cols, 3]; the rig has them
-    elsewhere."""
-    random, watched, shining = np.random.default_rng(5), folder / "watched", []
+    elsewhere. It is stopped after five pictures and goes on with the fifth lamp held so that its shadows are three pixels off."""
+    random, watched, shining, released, stop = np.random.default_rng(5), folder / "watched", [], [], threading.Event()
     rough = directions + np.radians(10) * random.normal(size=directions.shape)
     rough /= np.linalg.norm(rough, axis=1, keepdims=True)
     assert angles_degrees(rough, directions).mean() > 10
     watched.mkdir()
     rig = write_rig(folder / "rig.json", SimpleNamespace(scene=SimpleNamespace(directions=rough)), "manual")
-    monkeypatch.setattr("service.acquisition.cameras.watched_folder.WatchedFolder._release", lambda camera, exposure: write_exr(
-        watched / f"{len(list(watched.iterdir())):04d}.exr",
-        np.maximum(pictures[shining[-1]] + NOISE * random.standard_normal(pictures[0].shape), 0)))
-    result = acquire(AcquireRequest(plan="olat", rig=rig, camera=f"watch:{watched}", out=folder / "capture", trigger="true"),
-                     lambda what: shining.extend(index for index in range(len(directions)) if f"L{index} " in what))
-    assert (result.faults, result.there, shining) == ((), len(directions), list(range(len(directions))))
+
+    def release(camera, exposure) -> None:
+        picture = np.roll(pictures[shining[-1]], 3 * (shining[-1] in released), axis=1)
+        write_exr(watched / f"{len(released):04d}.exr", np.maximum(picture + NOISE * random.standard_normal(picture.shape), 0))
+        released.append(shining[-1])
+        if len(released) == 5:
+            stop.set()
+
+    def ask(what: str) -> None:
+        shining.extend(index for index in range(len(directions)) if f"L{index} " in what)
+
+    monkeypatch.setattr(WatchedFolder, "_release", release)
+    request = AcquireRequest(plan="olat", rig=rig, camera=f"watch:{watched}", out=folder / "capture", trigger="true")
+    assert acquire(request, ask, stop=stop).there == 5
+    result = acquire(request, ask)
+    assert (result.faults, result.there, released) == ((), len(directions), [0, 1, 2, 3, 4, *range(4, len(directions))])
     return folder / "capture"
 
 
