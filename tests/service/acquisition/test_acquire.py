@@ -23,6 +23,7 @@ import service
 from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.fault import FaultKind
+from service.cli.main import main
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
@@ -303,6 +304,15 @@ def test_a_picture_that_is_there_is_taken_again_on_request(tmp_path, stage):
         acquire(request(tmp_path, stage, rig, retake=("0009_light_008",)), ask)
 
 
+def be_the_program(words: list[str], said: Path) -> None:
+    """Run `relit` in this process, with its output in a file."""
+    with said.open("w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    sys.argv = ["relit", *words]
+    main()
+
+
 @pytest.mark.long
 def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
     stage, rounds, most = Stage(tmp_path / "watch"), 5, 3
@@ -310,21 +320,24 @@ def test_a_capture_goes_on_after_sigkill_at_random_moments(tmp_path):
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     with controller(tmp_path, stage) as (rig, url):
         given = request(tmp_path, stage, rig, trigger=posting(f"{url}/shoot"), timeout=10)
-        command = [sys.executable, "-m", "service.cli.main", "capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out",
-                   str(given.out), "--trigger", given.trigger, "--timeout", "10"]
+        words = ["capture", given.plan, "--rig", str(rig), "--camera", given.camera, "--out", str(given.out), "--trigger", given.trigger,
+                 "--timeout", "10"]
         random, processes = np.random.default_rng(2), multiprocessing.get_context("forkserver")  # which loads all modules once
-        processes.set_forkserver_preload(["service.acquisition.acquire", "service.acquisition.cameras.watched_folder",
-                                          "service.acquisition.lights.http_requests"])
+        processes.set_forkserver_preload(["service.cli.commands.acquire", "service.acquisition.acquire", "service.acquisition.early_ingest",
+                                          "service.acquisition.cameras.watched_folder", "service.acquisition.lights.http_requests"])
         for _ in range(10):
             wanted = stage.released + int(random.integers(1, most + 1))  # the first shows that nothing moved
-            program = processes.Process(target=acquire, args=[given, refuse_to_ask])
+            program = processes.Process(target=be_the_program, args=[words, tmp_path / "said.txt"])
             program.start()
             until(lambda program=program, wanted=wanted: stage.released >= wanted or not program.is_alive(), "no picture", every_s=0.001)
             time.sleep(random.uniform(0, 0.1))
-            assert program.is_alive(), "the capture ended before it was killed"
+            assert program.is_alive(), f"the capture ended before it was killed: {(tmp_path / 'said.txt').read_text()}"
             program.kill()
             program.join()
-        subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=subprocess.DEVNULL)
+        last = processes.Process(target=be_the_program, args=[words, tmp_path / "said.txt"])
+        last.start()
+        last.join()
+        assert last.exitcode == 0, (tmp_path / "said.txt").read_text()
     assert stage.on == set()
     check(tmp_path / "capture", stage, rounds=rounds)
     assert not list((tmp_path / "capture").glob(".*.exr"))  # half-written when it was killed
