@@ -240,8 +240,8 @@ def _thirds(factor: float) -> float:
 
 def bars(counts: np.ndarray, rows: int, cols: int) -> np.ndarray:
     """Return a histogram as a picture, [rows, cols, 3], the last bin red; heights are the square roots of counts."""
-    bin_of, part = np.arange(cols) * len(counts) // cols, np.sqrt(counts / max(1, counts.max()))
-    lit = np.arange(rows)[::-1, None] < rows * part[bin_of]
+    bin_of: np.ndarray = np.arange(cols) * len(counts) // cols
+    lit = np.arange(rows)[::-1, None] < rows * np.sqrt(counts / max(1, counts.max()))[bin_of]
     shown = np.where(lit[..., None], np.float32(0.8), BACKGROUND)
     shown[lit & (bin_of == len(counts) - 1)] = (1.0, 0.1, 0.1)
     return shown
