@@ -81,7 +81,7 @@ def time_table() -> list[str]:
     """Return the section of docs/figures.md on times."""
     return [f"A dark picture and 96 of {PIXELS} pixels under single lamps, from the twin through a watched folder. Own: the median picture "
             "beside exposure, transfer and settling. Preview: from the last picture, over the last judgement of all, to `preview.png`. "
-            f"The least of {CAPTURES} captures each, on a machine that other work shares.", "",
+            f"The least of {CAPTURES} captures each, at a load of {os.getloadavg()[2]:.0f} processes.", "",
             "| pictures | own (bar: 50 ms) | computed of it | preview (bar: 10 s) |", "|---|---|---|---|", *map(time_row, ("exr", "png"))]
 
 
