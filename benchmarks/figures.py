@@ -24,6 +24,7 @@ from benchmarks.fresnel import fresnel_table
 from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
+from benchmarks.on_set import fault_table, time_table
 from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
@@ -186,6 +187,16 @@ def memory(given: argparse.Namespace) -> list[str] | None:
     return None if given.large is None else large_table(given.large, given.megapixels, given.lights, given.frames)
 
 
+def set_faults(_: argparse.Namespace) -> list[str]:
+    """Count captures whose faults are named."""
+    return fault_table()
+
+
+def set_times(_: argparse.Namespace) -> list[str]:
+    """Measure Relit's part of the time of a capture."""
+    return time_table()
+
+
 SECTIONS: dict[str, tuple[str, Section]] = {
     "lambert": ("Lambertian surface with cast shadows", lambert),
     "real": ("Real objects", real),
@@ -204,6 +215,8 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
     "memory": ("Memory", memory),
+    "set_faults": ("Faults of captures", set_faults),
+    "set_times": ("Time of captures", set_times),
 }
 INTRODUCTION = ("# Figures\n\n*After reading this page you can judge what Relit reaches on your machine: accuracy, speed and memory.*\n\n"
                 "Written by `make figures` (`python -m benchmarks.figures`); each section says when and where it was "

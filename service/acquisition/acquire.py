@@ -1,6 +1,5 @@
 """Take a capture shot by shot: lamps, settling, picture, checks, files; and leave the lamps dark however it ends."""
 
-import shlex
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from service.acquisition.cameras.camera import Camera, NoPictureError, Picture, Setup, open_camera
+from service.acquisition.cameras.camera import SPOOL, Camera, NoPictureError, Picture, Setup, open_camera
 from service.acquisition.capture_files import CaptureFiles
 from service.acquisition.checks.fault import Fault, FaultKind, said
 from service.acquisition.checks.judge import FULL_SCALE, Judge
@@ -35,8 +34,6 @@ from stage.rig.cues import rig_digest
 from stage.rig.rig import Rig, read_rig
 from stage.stack import fingerprint
 
-SPOOL = ".spool"
-"""The folder, in that of the capture, of files that are not of the capture yet."""
 LATE_POLL_S = 0.05
 """The time between two looks for pictures that are late."""
 NO_LAMPS = Rig.model_construct(schema_="relit.rig/1", name="no lamps", color_space="lin_rec709_scene", subject_m=(0.0, 0.0, 0.0),
@@ -98,9 +95,8 @@ class Acquisition:
         self.patterns: PatternImages = PatternImages(request, self.shots)
         head = {"plan": self.plan.model_dump(mode="json", by_alias=True), "rig": rig_digest(self.rig), "camera": request.camera}
         self.journal = Journal(request.out, head)
-        self._camera: Camera = open_camera(request.camera, Setup(
-            request.out / SPOOL, request.timeout, tuple(shlex.split(request.trigger or "")),
-            None if self.journal.known is None else frozenset(self.journal.known)))
+        known = None if self.journal.known is None else frozenset(self.journal.known)
+        self._camera: Camera = open_camera(request.camera, Setup.of(request, known))
         if self.journal.known is None:
             self.journal.begin(self._camera.present())
         self._files = CaptureFiles(request.out, self.rig, self.shots, request.color_space, request.saturation)

@@ -1,6 +1,6 @@
 """The live view of a camera under the lamps: a process of its own, so that the camera is free when it has ended, however it ends.
 
-It writes one picture after another, striped where it clips, and tells of each on a line of its output.
+It writes one picture after another, striped where it clips, with a histogram below it, and tells of each on a line of its output.
 """
 
 import json
@@ -19,7 +19,7 @@ from service.acquisition.cameras.camera import LIVE, Setup, open_camera
 from service.acquisition.checks.judge import FULL_SCALE
 from service.acquisition.checks.sample import TILE_PX, place_of_tile
 from service.acquisition.lights.lights import Lights
-from service.acquisition.meter import focus_of, zebra
+from service.acquisition.meter import BINS, bars, focus_of, zebra
 from service.acquisition.plans.shots import even_levels
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.play.play import ended_by_signals
@@ -33,6 +33,8 @@ SPACE = "srgb_texture"
 PICTURE = "live.png"
 PERIOD_S, TOLD_EVERY = 0.2, 3
 """The least time between two pictures, and the number of pictures between two readings, which a person could not read faster."""
+HISTOGRAM_PART = 5
+"""The height of a picture over that of the histogram below it."""
 END_S = 10.0
 """The longest time until the lamps are dark and the camera is free."""
 
@@ -87,7 +89,7 @@ def look(rig_path: Path, camera: str, folder: Path, stop: threading.Event) -> No
         RequestError: the lamps or the camera do not answer, or the camera has no live view.
     """
     rig = read_rig(rig_path)
-    setup = Setup(folder, END_S, (), None)
+    setup = Setup(folder, END_S, (), None, jpeg=True)  # the format of pictures is not the live view's
     with closing(open_camera(camera, setup)) as opened, closing(Lights(rig_path, rig, lambda what: None)) as lights:  # none is asked
         lights.set(even_levels(rig))
         number, place, told = 0, None, {}
@@ -97,12 +99,19 @@ def look(rig_path: Path, camera: str, folder: Path, stop: threading.Event) -> No
             place = place or place_of_tile(pixels)
             number += 1
             with replacing(folder / PICTURE, flush=False) as temporary:
-                write_png(temporary, np.round(255 * np.clip(zebra(pixels, SPACE, FULL_SCALE), 0, 1)).astype(np.uint8), srgb=True)
+                write_png(temporary, np.round(255 * np.clip(_shown(pixels), 0, 1)).astype(np.uint8), srgb=True)
             if number % TOLD_EVERY == 1:
                 tile = pixels[place[0]:place[0] + TILE_PX, place[1]:place[1] + TILE_PX]
                 told = {"focus": focus_of(linearise(tile, SPACE).mean(axis=2)), "clipped": float((pixels.max(axis=2) >= FULL_SCALE).mean())}
             print(json.dumps({"number": number, **told}), flush=True)
             stop.wait(PERIOD_S - (time.monotonic() - began))
+
+
+def _shown(pixels: np.ndarray) -> np.ndarray:
+    """Return a picture with stripes where it clips, and below it the histogram of its brightest channel, the part that clips red."""
+    striped = zebra(pixels, SPACE, FULL_SCALE)
+    counts = np.histogram(pixels.max(axis=2), bins=BINS, range=(0, 1))[0]
+    return np.vstack([striped, bars(counts, max(1, len(striped) // HISTOGRAM_PART), striped.shape[1])])
 
 
 def main(rig: str, camera: str, folder: str) -> int:

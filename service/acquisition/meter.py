@@ -1,7 +1,6 @@
 """A light meter before a capture: how much of the object several lamps clip, how sharp it is, and the exposure time to take."""
 
 import json
-import shlex
 import time
 from contextlib import closing
 from pathlib import Path
@@ -105,7 +104,7 @@ def meter(request: AcquireRequest, ask: Ask, progress: Progress | None = None) -
     shots = () if rig is None else _spread(shots_of(read_plan(request.plan), rig, request.projector), rig)
     if rig is None or not shots:
         raise RequestError("--preview: the plan has no picture of the object under lamps: meter one such as olat, with --rig")
-    setup = Setup(request.out / ".spool", request.timeout, tuple(shlex.split(request.trigger or "")), None)
+    setup = Setup.of(request, None)
     with closing(open_camera(request.camera, setup)) as camera, closing(Lights(request.rig or Path(), rig, ask)) as lights:
         return _Meter(request, rig, camera, lights).run(shots, Timings(progress))
 
@@ -209,7 +208,7 @@ class _Meter:
         review = self._request.review
         tiles = [(f"{reading.lamp}: {100 * reading.clipped:.2g} % clipped", zebra(each.pixels, self._space, self._full, review))
                  for each, reading in zip(taken, result.readings, strict=True)]
-        tiles.append((f"readings under {result.readings[brightest].lamp}", _bars(counts)))
+        tiles.append((f"readings under {result.readings[brightest].lamp}", bars(counts, TILE, 4 * BINS)))
         write_sheet(result.picture, [tiles[begin:begin + across] for begin in range(0, len(tiles), across)])
         proposed = {"factor": result.factor, "exposure_s": result.exposure_s, "sure": result.sure, "clipped": result.clipped}
         write_text(result.path, json.dumps({
@@ -239,10 +238,10 @@ def _thirds(factor: float) -> float:
     return float(STEP ** np.floor(np.log(factor) / np.log(STEP) + 1e-9))
 
 
-def _bars(counts: np.ndarray) -> np.ndarray:
-    """Return a histogram as a picture, [TILE, 4 BINS, 3], the last bin red."""
-    part = np.sqrt(counts / max(1, counts.max()))
-    lit = np.arange(TILE)[::-1, None] < TILE * np.repeat(part, 4)[None]
+def bars(counts: np.ndarray, rows: int, cols: int) -> np.ndarray:
+    """Return a histogram as a picture, [rows, cols, 3], the last bin red; heights are the square roots of counts."""
+    bin_of: np.ndarray = np.arange(cols) * len(counts) // cols
+    lit = np.arange(rows)[::-1, None] < rows * np.sqrt(counts / max(1, counts.max()))[bin_of]
     shown = np.where(lit[..., None], np.float32(0.8), BACKGROUND)
-    shown[:, -4:][lit[:, -4:]] = (1.0, 0.1, 0.1)
+    shown[lit & (bin_of == len(counts) - 1)] = (1.0, 0.1, 0.1)
     return shown

@@ -129,7 +129,7 @@ class RemoteControl:
             self._refuse_beside_another()
             self._show(name, plan)
             self._metering = preview
-            words = [plan, *self._words, "--out", str(self._capture), *(["--preview"] if preview else []),
+            words = [plan, *self._words, "--out", str(self._capture), *(["--preview", "--no-live"] if preview else []),
                      *(word for shot in retake for word in ("--retake", shot))]
             self._darken()
             self._folder.mkdir(parents=True, exist_ok=True)

@@ -73,6 +73,8 @@ def change_since(earlier: Path, picture: Picture, shot: Shot, judge: Judge, rig:
     before = images.read_pixels(earlier)
     if (change := _other_setting(_told(earlier, before), _told(picture.path, picture.pixels))) is not None:
         return change
+    if shot.lamp is not None and _by_hand(shot, rig):
+        return None  # its highlights and shadows are elsewhere each time, like those of something that has moved
     if (fault := judge.compare(shot, before, picture.pixels, space, full_scale)) is not None:
         return f"{fault.sentence} since {shot.key} was taken: put it back"
     if _by_hand(shot, rig) or not (shot.projected or shot.levels.any()):

@@ -41,6 +41,11 @@ class AcquireRequest(ReviewOptions, DeviceRequest):
     preview: Annotated[bool, Role.RUN] = False
     """Take no capture, and meter the light: the share of the object that lamps clip, its focus, and a proposed exposure, in meter.json and
     meter.png."""
+    live: Annotated[bool, Role.RUN] = True
+    """With --preview on a terminal: show before it, on a page of this machine, the live view of a camera that has one, until Enter is
+    pressed."""
+    jpeg: bool = False
+    """Let a camera at a USB port that offers raw files keep the format that it has, such as JPEG."""
     then: Annotated[tuple[Then, ...], FirstFault, Commas, Role.RUN, Spelling(metavar="STEPS")] = ()
     """What is made of the capture when its last picture is there: solve, or solve,export; not where a picture has a fault."""
     to: Annotated[Line | None, Role.RUN, Spelling(metavar="URL")] = None

@@ -101,7 +101,8 @@ class TwinRequest(ReviewOptions, DrivenOptions, PixelOptions, Request):
     noise: NotNegative = 0.0
     """The noise of these pictures: its standard deviation at half of full scale."""
     faults: Annotated[tuple[Line, ...], Commas, Spelling(metavar="KIND@N,…")] = ()
-    """What goes wrong at which release, counted from 1: dead@17, or ambient@17- from release 17 on."""
+    """What goes wrong at which release, counted from 1: dead@17, or ambient@17- from release 17 on; with the format `card`, which sees no
+    release, under which lamps, in the order in which they are lit."""
     seed: NotNegativeCount = 0
     """The seed of the noise."""
     frames: Count | None = None

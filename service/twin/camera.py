@@ -35,6 +35,8 @@ BLUR_PX = 2.0
 AMBIENT = 0.2
 """The light that is not the rig's, over that of all lamps at their share of full level."""
 OVEREXPOSED = 16.0
+NOT_ON_A_CARD = (PictureFault.DROPPED, PictureFault.LATE)
+"""Faults of releases, of which the card sees none."""
 CARD_FILE = "TWIN.JPG"
 CARD_QUALITY = 98
 CARD_POLL_S = 0.5
@@ -44,7 +46,7 @@ CARD_HEADER_BYTES = 4096
 
 
 class FaultSpan(NamedTuple):
-    """The releases at which a fault happens."""
+    """The releases at which a fault happens, of a card the times when other lamps are lit."""
 
     kind: PictureFault
     first: int
@@ -73,8 +75,8 @@ class TwinCamera:
         """Write the picture of this moment into the folder; `exposure_s`: the exposure time; None: 1."""
         with self._lock:
             self.released += 1
-            faults = {span.kind for span in self._spans if span.first <= self.released <= (span.last or self.released)}
-            pixels = self._pixels(faults, exposure_s or 1.0)
+            faults = self._faults(self.released)
+            pixels = self._pixels(levels_of_universes(self._rig, dict(self._listener.last.values)), faults, exposure_s or 1.0)
             if PictureFault.DOUBLED in faults and self._previous is not None:
                 pixels = self._previous
             self._previous = pixels
@@ -87,28 +89,40 @@ class TwinCamera:
     def keep_card(self, stop: threading.Event) -> None:
         """Write the picture of this moment over the one on the card at each frame that comes, until an event, as a JPEG of one size.
 
+        A fault happens as long as the lamps shine that are the ones of its number, counted from the first that are lit. A picture that
+        will come again has the same noise as long as it is there.
+
         The virtual camera looks at the size of its card's file when it is opened, and reads so many bytes at each release; what follows
         the end of a JPEG is ignored.
 
         Raises:
             StorageError: it cannot be written.
         """
-        path = self._folder / CARD_FILE
+        path, lit, levels = self._folder / CARD_FILE, 0, np.zeros(0)
         while not stop.is_set():
-            number = self._listener.last.number
-            if number != self.on_card:
-                pixels = self._pixels(set(), 1.0)
+            frame = self._listener.last
+            stays = frame.number == self.on_card
+            if not stays:
+                before, levels = levels, levels_of_universes(self._rig, dict(frame.values))
+                same = np.array_equal(levels, before)
+                lit += bool(levels.any()) and not same
+                faults = self._faults(lit) if levels.any() else set()
+                stays = PictureFault.DOUBLED in (faults | self._faults(lit + 1) if same else faults)
+            if not stays:
+                pixels = self._pixels(levels, faults, 1.0)
                 with storage("write", path), tempfile.TemporaryDirectory(prefix="relit-twin-") as folder:
                     picture = Path(folder) / CARD_FILE
                     write_jpeg(picture, self._codes(pixels), CARD_QUALITY, subsampled=False)
                     with replacing(path, flush=False) as temporary:
                         temporary.write_bytes(picture.read_bytes().ljust(pixels.size + CARD_HEADER_BYTES, b"\0"))
-                self.on_card = number
-            self._listener.wait(number + 1, time.monotonic() + CARD_POLL_S)
+            self.on_card = frame.number
+            self._listener.wait(frame.number + 1, time.monotonic() + CARD_POLL_S)
 
-    def _pixels(self, faults: set[PictureFault], exposure: float) -> np.ndarray:
-        """Return the picture, [rows, cols, 3] float32, full scale 1."""
-        levels = levels_of_universes(self._rig, dict(self._listener.last.values))
+    def _faults(self, number: int) -> set[PictureFault]:
+        return {span.kind for span in self._spans if span.first <= number <= (span.last or number)}
+
+    def _pixels(self, levels: np.ndarray, faults: set[PictureFault], exposure: float) -> np.ndarray:
+        """Return the picture at levels [emitters], [rows, cols, 3] float32, full scale 1."""
         if PictureFault.DEAD in faults:
             levels = np.zeros_like(levels)
         if PictureFault.WRONG in faults:  # the lamps take each other's places: the next one in the file shines in place of each

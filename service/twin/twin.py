@@ -15,7 +15,7 @@ from service.play.addresses import driven_universes, with_protocol
 from service.play.play import Prepared, prepare, run
 from service.reporting.progress import Progress, Timings
 from service.requests.play import PictureFormat, PlayRequest, TwinRequest
-from service.twin.camera import TwinCamera, card_kept, fault_spans
+from service.twin.camera import NOT_ON_A_CARD, TwinCamera, card_kept, fault_spans
 from service.twin.fixtures import UniverseId
 from service.twin.listener import ANY, Listener
 from service.twin.local_page import page_address, page_socket
@@ -60,8 +60,9 @@ def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
         raise RequestError(f"--snapshot {request.snapshot}: end the name in {' or '.join(PICTURES)}")
     if request.pictures is not None and (request.snapshot or request.frames or request.after):
         raise RequestError("--pictures needs the page: leave out --snapshot, --frames and --after")
-    if fault_spans(request.faults) and request.picture_format is PictureFormat.CARD:
-        raise RequestError("--faults counts releases, and the twin sees none with --picture-format card: leave it out")
+    if request.picture_format is PictureFormat.CARD and (kind := next((span.kind for span in fault_spans(request.faults)
+                                                                      if span.kind in NOT_ON_A_CARD), None)) is not None:
+        raise RequestError(f"--faults {kind}: the picture of --picture-format card is always there: leave it out")
     rig = with_protocol(read_rig(request.rig), request.protocol)
     universes = driven_universes(request.rig, rig).keys()
     player = None

@@ -1,16 +1,20 @@
 """The interface that every camera has, and how one is named on the command line."""
 
+import shlex
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 
 from service.errors import RequestError
+from service.requests.acquire import AcquireRequest
 
 KINDS = {"watch": "watched_folder", "gphoto2": "gphoto2_camera", "video": "video_device", "aravis": "aravis_camera"}
 """The module of each kind of camera, KIND or KIND:DETAIL. A new one is a module with a function `open_camera(detail, setup)`, and an entry
 here."""
+SPOOL = ".spool"
+"""The folder, in that of the capture, of files that are not of the capture yet."""
 LIVE = ("gphoto2", "video", "aravis")
 """The kinds of cameras that show what they see before a picture is taken."""
 
@@ -40,6 +44,13 @@ class Setup(NamedTuple):
     known: frozenset[str] | None
     """The names of files of a watched folder that were there before the capture began, or belong to its pictures; None: all that are
     there."""
+    jpeg: bool = False
+    """Whether a camera that offers raw files is left at the format that it has."""
+
+    @classmethod
+    def of(cls, request: AcquireRequest, known: frozenset[str] | None) -> Self:
+        """Return what the options of a capture say."""
+        return cls(request.out / SPOOL, request.timeout, tuple(shlex.split(request.trigger or "")), known, request.jpeg)
 
 
 class Camera(Protocol):

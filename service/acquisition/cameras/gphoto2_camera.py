@@ -14,10 +14,15 @@ from stage.files import replacing
 from stage.formats import images
 
 RECORDED = ("cameramodel", "serialnumber", "shutterspeed", "f-number", "aperture", "iso", "whitebalance", "imageformat", "imagequality",
-            "imagesize", "expprogram", "autoexposuremode", "focusmode")
+            "imagesize", "expprogram", "autoexposuremode", "autoiso", "isoauto", "focusmode")
 """The settings that decide what a picture looks like, under the names that makers give them in libgphoto2."""
-BY_HAND = {"expprogram": ("m", "manual"), "autoexposuremode": ("m", "manual")}
-"""The settings of the exposure mode, and their values without automatic."""
+MANUAL = "the exposure is automatic ({}): turn the camera to manual, M"
+OFF = "the sensitivity is automatic ({}): switch that off on the camera"
+BY_HAND = {"expprogram": (("m", "manual"), MANUAL), "autoexposuremode": (("m", "manual"), MANUAL),
+           "autoiso": (("off",), OFF), "isoauto": (("off",), OFF)}
+"""The settings that make a camera automatic, their values without that, and what to say where it cannot be switched off."""
+FORMATS = ("imageformat", "imagequality")
+"""The settings of the format of pictures; makers use one or the other."""
 NEVER_AUTOMATIC = ("iso", "whitebalance", "shutterspeed")
 """The settings that must not be automatic."""
 EXPOSURE_PART = 0.1
@@ -131,15 +136,19 @@ class Gphoto2Camera:
             self._camera.exit()
 
     def _fix(self) -> None:
-        """Switch automatic modes off, or refuse the camera."""
-        for name, values in BY_HAND.items():
+        """Switch automatic modes off and raw files on, or refuse the camera."""
+        for name, (values, words) in BY_HAND.items():
             value = self._value(name)
             if value is not None and value.lower() not in values and not self._set(name, values):
-                raise RequestError(f"{self._name}: the exposure is automatic ({name} is {value}): turn the camera to manual, M")
+                raise RequestError(f"{self._name}: {words.format(f'{name} is {value}')}")
         for name in NEVER_AUTOMATIC:
             value = self._value(name)
             if value is not None and "auto" in value.lower():
                 raise RequestError(f"{self._name}: {name} is {value}: set it to a fixed value on the camera")
+        for name in () if self._setup.jpeg else FORMATS:
+            value, raw = self._value(name), [choice for choice in self._choices(name) if is_raw(choice)]
+            if raw and value not in raw and not self._set(name, (raw[0].lower(),)):
+                raise RequestError(f"{self._name}: {name} is {value} and does not become {raw[0]}: set it on the camera, or give --jpeg")
 
     def _value(self, name: str) -> str | None:
         try:
@@ -181,6 +190,11 @@ class Gphoto2Camera:
 
     def _refused(self, error: gp.GPhoto2Error) -> RequestError:
         return RequestError(f"{self._name}: {REASONS.get(error.code, error.string.lower())}")
+
+
+def is_raw(format_name: str) -> bool:
+    """Return whether a format, as makers name it in libgphoto2, is raw of full size without a JPEG beside it: RAW, NEF (Raw)."""
+    return re.fullmatch(r"(?:uncompressed |lossless compressed |lossless )?raw|nef \(raw\)", format_name.lower()) is not None
 
 
 def seconds_of(text: str) -> float | None:

@@ -15,8 +15,9 @@ STALE_FRAMES = 4
 """The frames that a device keeps in its buffers, which were taken before the lamps changed."""
 AUTOMATIC = {"autofocus": cv2.CAP_PROP_AUTOFOCUS, "white balance": cv2.CAP_PROP_AUTO_WB, "exposure": cv2.CAP_PROP_AUTO_EXPOSURE}
 """What a device may set by itself."""
-EXPOSED_BY_HAND = (0.0, 1.0, 0.25)
-"""The values of the exposure mode that mean manual in the systems that OpenCV speaks to."""
+EXPOSED_BY_HAND = {"V4L2": 1.0}
+"""The value of the exposure mode that means manual, by OpenCV's name of the system; 0 in all others. Linux has 0 for automatic
+(V4L2_CID_EXPOSURE_AUTO)."""
 RECORDED = {"width": cv2.CAP_PROP_FRAME_WIDTH, "height": cv2.CAP_PROP_FRAME_HEIGHT, "exposure": cv2.CAP_PROP_EXPOSURE,
             "gain": cv2.CAP_PROP_GAIN, "white_balance": cv2.CAP_PROP_WB_TEMPERATURE, "focus": cv2.CAP_PROP_FOCUS}
 
@@ -84,11 +85,10 @@ class VideoDevice:
     def _fix(self) -> None:
         """Switch automatic modes off, or refuse the device."""
         for name, number in AUTOMATIC.items():
-            manual = EXPOSED_BY_HAND if name == "exposure" else (0.0,)
-            before = self._video.get(number)
-            if before == -1.0 or before in manual:  # the device has no such mode, or it is off
+            off = EXPOSED_BY_HAND.get(self._video.getBackendName(), 0.0) if name == "exposure" else 0.0
+            if self._video.get(number) in (-1.0, off):  # the device has no such mode, or it is off
                 continue
-            if not any(self._video.set(number, value) and self._video.get(number) == value for value in manual[::-1]):
+            if not (self._video.set(number, off) and self._video.get(number) == off):
                 self.close()
                 raise RequestError(f"{self._name}: the {name} is automatic and cannot be switched off")
 

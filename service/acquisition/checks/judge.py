@@ -72,6 +72,7 @@ class Judge:
 
     def __init__(self, rig: Rig) -> None:
         self._expectation = Expectation(rig.directions)
+        self._held = {index for index, lamp in enumerate(rig.lights) if lamp.address is not None and lamp.address.protocol == "manual"}
         self._place: tuple[int, int] | None = None
         self._seen: dict[str, Seen] = {}
         self._digests: dict[bytes, str] = {}
@@ -217,19 +218,20 @@ class Judge:
             return []
         if light < UNLIT_PART * should:
             return [Fault(shot.key, FaultKind.UNLIT, f"has {max(0.0, 100 * light / should):.2g} % of the light that the others predict")]
-        if shot.lamp is not None and (twin := self._twin(seen, others)) is not None:
+        held = shot.lamp in self._held  # by a person, so that it stands about where the rig says: shading tells no more than that it is on
+        if shot.lamp is not None and not held and (twin := self._twin(seen, others)) is not None:
             return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
         if faint:
-            return self._ambient_faults(seen, others, used, BORDER_AMBIENT_PART)
+            return [] if held else self._ambient_faults(seen, others, used, BORDER_AMBIENT_PART)
         if light < least:
             return []
         motion = motion_between(seen.bands, expected_bands(used))
-        if (moved := _moved(shot, motion)) is not None and self._details_stay(used, others):
+        if not held and (moved := _moved(shot, motion)) is not None and self._details_stay(used, others):
             return [moved]
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
         if shot.lamp is not None:
-            return self._ambient_faults(seen, others, used, AMBIENT_PART)
+            return [] if held else self._ambient_faults(seen, others, used, AMBIENT_PART)
         return [] if light <= AMBIENT_GAIN * should else [_ambient(shot, light / should - 1)]
 
     def _ambient_faults(self, seen: Seen, others: list[Seen], used: list[tuple[np.float32, Seen]], part: float) -> list[Fault]:

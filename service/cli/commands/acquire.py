@@ -78,8 +78,16 @@ def _capture(request: AcquireRequest) -> None:
 
 def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
     """Meter the light, and print what to set."""
+    from service.acquisition.cameras.camera import LIVE, SPOOL
+    from service.acquisition.live_page import LivePage
     from service.acquisition.meter import SHARE, meter
 
+    if request.live and request.rig is not None and sys.stdin.isatty() and request.camera.partition(":")[0] in LIVE:
+        with LivePage(request.rig, request.camera, request.out / SPOOL) as page:
+            if (refused := page.wait()) is None:
+                ask(f"open {page.address} in a browser, and frame and focus the object; to meter the light")
+            else:
+                print(f"live     none: {refused}")
     with ProgressBar() as bar:
         found = meter(request, ask, bar)
     for reading in found.readings:

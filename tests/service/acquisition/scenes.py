@@ -1,11 +1,13 @@
 """Pictures under single lamps, in memory, with the noise and the faults of a camera."""
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
 from service.acquisition.plans.shots import Shot, shots_of
 from service.twin.camera import AMBIENT, BLUR_PX, OVEREXPOSED, SHIFT_PX
@@ -13,6 +15,14 @@ from stage.capture.capture import Capture
 from stage.formats import images
 from stage.rig.rig import Rig
 from tests.service.owl import OWL, block_mean
+
+KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
+         FaultKind.UNSHARP)
+VISIBLE = 0.3
+"""Faults are put where a lamp gives this part of the mean light of a lamp: behind the object nothing tells a lamp from none."""
+
+BRIGHT = 1.5
+"""Ambient light of 0.8 of the mean picture goes where a lamp gives less than this: the prediction errs by more beside the brightest."""
 
 
 class Scene(NamedTuple):
@@ -22,6 +32,7 @@ class Scene(NamedTuple):
     directions: np.ndarray  # [lamps, 3]
 
 
+@cache
 def owl() -> Scene:
     """The shipped owl under lamps all around, at half its width."""
     names = sorted(OWL.glob("[0-9][0-9][0-9].exr"))
@@ -29,6 +40,7 @@ def owl() -> Scene:
     return Scene(np.stack([block_mean(images.read_pixels(name).astype(np.float32), 2) for name in names]) / 2.83, directions)
 
 
+@cache
 def relief(seed: int, rings: tuple[int, ...] = (12, 10, 8, 4)) -> Scene:
     """Textured bumps with cast shadows and a little gloss, under a dome of rings that a person has built."""
     random, (rows, cols) = np.random.default_rng(seed), (110, 130)
@@ -90,7 +102,8 @@ class NoisyCamera:
             levels = np.roll(levels, 1)
         if fault is FaultKind.AMBIENT:
             levels = levels + AMBIENT * 4 / len(levels)
-        pixels = np.tensordot(levels.astype(np.float32), self._scene.radiance, 1)
+        on = np.flatnonzero(levels)
+        pixels = np.tensordot(levels[on].astype(np.float32), self._scene.radiance[on], 1)
         if fault is FaultKind.MOVED:
             pixels = np.roll(pixels, SHIFT_PX, axis=1)
         if fault is FaultKind.UNSHARP:
@@ -103,3 +116,23 @@ class NoisyCamera:
             taken = self._previous
         self._previous = taken
         return taken.astype(np.float32)
+
+
+def named(scene: Scene, seed: int, kinds: tuple[FaultKind, ...]) -> tuple[dict[str, FaultKind], dict[str, FaultKind]]:
+    """Return the faults that were made, at random frames, and those that the judge names at the end."""
+    rig = rig_of(scene)
+    shots, random, judge = shots_on(rig), np.random.default_rng(seed), Judge(rig)
+    light = scene.radiance.mean(axis=(1, 2, 3))
+    bright = light > VISIBLE * light.mean()
+    able = [index for index, shot in enumerate(shots)
+            if shot.lamp is not None and bright[shot.lamp] and bright[(shot.lamp + 1) % len(light)]]
+    made: dict[int, FaultKind] = {}
+    for kind in kinds:  # beside a wrong lamp stands a right picture of the lamp that shone
+        free = [index for index in able if not {index - 1, index, index + 1} & made.keys()
+                and (kind is not FaultKind.AMBIENT or light[shots[index].lamp] < BRIGHT * light.mean())]
+        made[int(random.choice(free))] = kind
+    camera = NoisyCamera(scene, seed)
+    for index, shot in enumerate(shots):
+        pixels = camera.take(shot, made.get(index))
+        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE))
+    return {shots[index].key: kind for index, kind in made.items()}, {fault.shot: fault.kind for fault in judge.review()}

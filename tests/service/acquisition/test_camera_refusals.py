@@ -1,11 +1,13 @@
 """What cameras and boards that are not as they should be make Relit say, by stand-ins for packages, libraries and devices."""
 
 import os
+import re
 import tty
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
 import cv2
+import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire, refuse_to_ask
@@ -13,6 +15,7 @@ from service.acquisition.cameras import aravis_camera
 from service.acquisition.cameras.aravis_camera import AravisError
 from service.acquisition.cameras.camera import Setup, open_camera
 from service.errors import RequestError
+from tests.scenes.dng import write_dng
 from tests.service.acquisition.test_acquire import Stage, request, write_rig
 
 
@@ -27,6 +30,7 @@ class Reflex:
 
     ports: tuple[tuple[str, str], ...] = (("Reflex", "usb:001,004"),)
     error: int | None = None
+    fixed = False
     values: ClassVar[dict[str, str]] = {}
     choices: ClassVar[dict[str, list[str]]] = {}
     package: ModuleType
@@ -48,7 +52,7 @@ class Reflex:
             raise self.package.GPhoto2Error(self.package.GP_ERROR_BAD_PARAMETERS)
         choices = self.choices.get(name, [])
         return SimpleNamespace(get_value=lambda: self.values[name], count_choices=lambda: len(choices), get_choice=choices.__getitem__,
-                               set_value=lambda value: self.values.__setitem__(name, value))
+                               set_value=lambda value: self.fixed or self.values.__setitem__(name, value))
 
     def set_single_config(self, name: str, widget: object) -> None:
         """Do nothing: the value is set already."""
@@ -96,6 +100,39 @@ def test_a_camera_at_usb_in_an_automatic_mode_is_refused(setup, reflex, name, va
 def test_an_exposure_mode_that_can_be_set_is_set(setup, reflex):
     reflex.values, reflex.choices = {"expprogram": "A", "iso": "100"}, {"expprogram": ["A", "M"]}
     assert open_camera("gphoto2", setup).settings == {"iso": "100", "expprogram": "M"}
+
+
+def test_automatic_sensitivity_is_switched_off_or_the_camera_is_refused(setup, reflex):
+    reflex.values, reflex.choices = {"iso": "100", "autoiso": "On"}, {"autoiso": ["On", "Off"]}
+    assert open_camera("gphoto2", setup).settings == {"iso": "100", "autoiso": "Off"}
+    reflex.values["autoiso"], reflex.fixed = "On", True
+    with pytest.raises(RequestError, match=r"^--camera gphoto2: the sensitivity is automatic \(autoiso is On\): switch that off"):
+        open_camera("gphoto2", setup)
+
+
+@pytest.mark.parametrize(("name", "before", "choices", "after"), [
+    ("imageformat", "Large Fine JPEG", ["Large Fine JPEG", "RAW + Large Fine JPEG", "cRAW", "RAW"], "RAW"),
+    ("imagequality", "NEF+Fine", ["JPEG Fine", "NEF (Raw)", "NEF+Fine"], "NEF (Raw)"),
+    ("imagequality", "Fine", ["Fine", "Standard"], "Fine")])
+def test_raw_files_are_taken_where_a_camera_offers_them(setup, reflex, name, before, choices, after):
+    reflex.values, reflex.choices = {name: before}, {name: choices}
+    assert open_camera("gphoto2", setup._replace(jpeg=True)).settings == {name: before}
+    assert open_camera("gphoto2", setup).settings == {name: after}
+    reflex.values, reflex.fixed = {name: before}, True
+    if after != before:
+        with pytest.raises(RequestError, match=re.escape(f"{name} is {before} and does not become {after}: set it on the camera, or give")):
+            open_camera("gphoto2", setup)
+
+
+def test_a_raw_file_over_the_cable_is_read_as_light(setup, reflex, tmp_path, monkeypatch):
+    pytest.importorskip("rawpy")
+    write_dng(tmp_path / "sensor.dng", np.full((40, 60), 7756, np.uint16), black=(512,) * 4, white=15000)
+    file = reflex.package.CameraFile()
+    file.set_data_and_size((tmp_path / "sensor.dng").read_bytes())
+    monkeypatch.setattr(reflex, "capture", lambda self, kind: SimpleNamespace(folder="/", name="DSC_0001.DNG"), raising=False)
+    monkeypatch.setattr(reflex, "file_get", lambda self, *place: file, raising=False)
+    picture = open_camera("gphoto2", setup).take(None)
+    assert picture.pixels.shape == (40, 60, 3) and np.allclose(picture.pixels, 0.5, atol=1e-3)  # (7756 - 512) / (15000 - 512)
 
 
 class Machine:
@@ -155,8 +192,9 @@ def test_a_machine_vision_camera_that_is_lost_tells_no_settings_and_the_cause_is
         acquire(request(tmp_path, stage, write_rig(tmp_path / "rig.json", stage, "manual"), camera="aravis:M"), lambda what: None)
 
 
-def test_automatic_modes_of_a_video_device_are_switched_off_or_it_is_refused(setup, monkeypatch):
-    values = {cv2.CAP_PROP_AUTOFOCUS: 1.0, cv2.CAP_PROP_AUTO_WB: 1.0, cv2.CAP_PROP_AUTO_EXPOSURE: 3.0}
+@pytest.mark.parametrize(("system", "automatic", "manual"), [("V4L2", 3.0, 1.0), ("V4L2", 0.0, 1.0), ("DSHOW", 1.0, 0.0)])
+def test_automatic_modes_of_a_video_device_are_switched_off_or_it_is_refused(setup, monkeypatch, system, automatic, manual):
+    values = {cv2.CAP_PROP_AUTOFOCUS: 1.0, cv2.CAP_PROP_AUTO_WB: 1.0, cv2.CAP_PROP_AUTO_EXPOSURE: automatic}
     fixed = set()
 
     class Device:
@@ -165,6 +203,9 @@ def test_automatic_modes_of_a_video_device_are_switched_off_or_it_is_refused(set
 
         def isOpened(self) -> bool:
             return True
+
+        def getBackendName(self) -> str:
+            return system
 
         def get(self, number: int) -> float:
             return values.get(number, -1.0)
@@ -179,12 +220,12 @@ def test_automatic_modes_of_a_video_device_are_switched_off_or_it_is_refused(set
 
     monkeypatch.setattr(cv2, "VideoCapture", Device)
     open_camera("video:0", setup)
-    assert list(values.values())[:2] == [0.0, 0.0] and values[cv2.CAP_PROP_AUTO_EXPOSURE] in (0.0, 1.0, 0.25)
+    assert list(values.values()) == [0.0, 0.0, manual]
     for number, word in ((cv2.CAP_PROP_AUTO_WB, "white balance"), (cv2.CAP_PROP_AUTO_EXPOSURE, "exposure")):
-        values[number], fixed = 3.0, {number}
+        before, values[number], fixed = values[number], automatic if word == "exposure" else 1.0, {number}
         with pytest.raises(RequestError, match=f"^--camera video:0: the {word} is automatic and cannot be switched off$"):
             open_camera("video:0", setup)
-        values[number] = 0.0
+        values[number] = before
 
 
 def test_a_serial_board_that_never_answers(tmp_path):

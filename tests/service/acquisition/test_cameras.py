@@ -81,6 +81,22 @@ def test_a_video_gives_its_frames_in_order_and_ends(tmp_path):
     camera.close()
 
 
+def test_a_video_device_gives_no_frame_that_was_taken_before_the_release(tmp_path, monkeypatch):
+    """A device by its number, behind which a file is opened: a device keeps four frames, which the lamps before have lit."""
+    path, opened = tmp_path / "video.avi", cv2.VideoCapture
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for level in range(10):
+        writer.write(np.full((48, 64, 3), 20 * level, np.uint8))
+    writer.release()
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: opened(str(path)))
+    camera = open_camera("video:0", Setup(tmp_path / "spool", 1.0, (), None))
+    assert [255 * float(camera.take(None).pixels.mean()) for _ in range(2)] == pytest.approx([80, 180], abs=4)  # JPEG
+    assert (camera.settings["width"], camera.settings["height"]) == ("64", "48")
+    with pytest.raises(NoPictureError):
+        camera.take(None)
+    camera.close()
+
+
 @pytest.mark.parametrize("given", ["tin:0", "watch:", "watch:/nowhere", "video:", "video:/nowhere.avi"])
 def test_a_camera_that_is_not_there(tmp_path, given):
     with pytest.raises(RequestError, match="--camera"):

@@ -4,6 +4,8 @@ import json
 import os
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import cv2
@@ -21,13 +23,13 @@ from tests.service.waiting import until
 ROOT = Path(__file__).parents[3]
 
 
-def video(path: Path, *, blur_px: float) -> Path:
+def video(path: Path, *, blur_px: float, frames: int = 3) -> Path:
     """A video of one frame again and again: fine texture, and a quarter of it at full scale."""
     frame = np.random.default_rng(3).integers(40, 160, (200, 240), dtype=np.uint8)
     frame = cv2.GaussianBlur(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR), (0, 0), blur_px)
     frame[100:, 120:] = 255
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (240, 200))
-    for _ in range(3):
+    for _ in range(frames):
         writer.write(frame)
     writer.release()
     return path
@@ -48,7 +50,39 @@ def test_it_tells_focus_and_stripes_what_clips_and_the_lamps_are_dark_when_it_en
     assert focus[0] > 1.2 * focus[1]  # JPEG adds details of its own to the blurred one
     shown = images.read_pixels(tmp_path / "live" / "live.png").astype(np.float32)
     red = (shown[..., 0] > 0.9) & (shown[..., 1] < 0.2)
-    assert red[104:, 124:].mean() == pytest.approx(1 / 2, abs=0.05) and not red[:96].any()
+    assert red[104:200, 124:].mean() == pytest.approx(1 / 2, abs=0.05) and not red[:96].any()
+    bins = (shown[200:] - shown[200, 0]).any(axis=2).sum(axis=0)  # the height of the histogram below it
+    assert red[-1, -3:].all() and not red[200:, :-4].any() and bins[:20].max() == 0 < bins[100]  # a quarter clips; nothing is black
+
+
+@pytest.mark.long
+def test_the_meter_shows_the_live_view_on_a_page_before(tmp_path):
+    """On a terminal, until Enter; the lamps are dark, and the pictures are metered, after it."""
+    stage = Stage(tmp_path / "watch")
+    with controller(tmp_path, stage) as (rig, _):
+        person, terminal = os.openpty()
+        command = [sys.executable, "-m", "service.cli.main", "capture", "olat", "--rig", rig, "--camera",
+                   f"video:{video(tmp_path / 'video.avi', blur_px=0.5, frames=30)}", "--out", tmp_path / "out", "--preview"]
+        program = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdin=terminal, stdout=subprocess.PIPE,
+                                   stderr=subprocess.PIPE, text=True)
+        page = next(word.rstrip(",") for line in program.stderr if "then press Enter" in line for word in line.split() if "http" in word)
+        assert stage.on == set(range(LAMPS))
+
+        def asked(path: str) -> bytes:
+            with urllib.request.urlopen(page + path, timeout=20) as answer:
+                return answer.read()
+
+        state = until(lambda: (found := json.loads(asked("/state.json")))["clipped"] is not None and found)
+        assert state["clipped"] == pytest.approx(1 / 4, abs=0.01) and state["focus"] > 0
+        assert asked("/live.png").startswith(b"\x89PNG") and b"live.js" in asked("/") and b"Focus" in asked("/live.js")
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            asked("/rig.json")
+        os.write(person, b"\n")
+        said, _ = program.communicate(timeout=60)
+        os.close(person)
+        os.close(terminal)
+    assert program.returncode == 0 and "exposure" in said and stage.on == set()
+    assert json.loads((tmp_path / "out" / "meter.json").read_text())["readings"]
 
 
 def test_a_camera_without_a_live_view_is_refused(tmp_path):

@@ -7,23 +7,27 @@ The card is full after 26 pictures, so the capture goes on several times.
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 
+from service.acquisition.checks.fault import FaultKind
 from stage.formats import images
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render, write_capture
 from tests.scenes.patched_rigs import loopback
 from tests.scenes.rigs import write_rig
+from tests.service.acquisition.scenes import BRIGHT, VISIBLE, relief
 from tests.service.acquisition.test_cameras import virtual_camera
 
 LAMPS = 96
-RUNS = 6
-"""More than cards are filled: of the 26 pictures on a card one is taken to see that nothing has moved."""
+FAULTS = {"dead": FaultKind.UNLIT, "wrong": FaultKind.WRONG_LIGHT, "doubled": FaultKind.DOUBLED, "moved": FaultKind.MOVED,
+          "clipped": FaultKind.CLIPPED, "ambient": FaultKind.AMBIENT, "focus": FaultKind.UNSHARP}
 SIZE = 48
 CAPTURE = """
+import json
 import sys
 import time
 from pathlib import Path
@@ -40,9 +44,9 @@ from service.twin.listener import Listener
 from service.twin.twin import open_twin
 from stage.rig.patch import levels_of_universes
 
-folder, host = Path(sys.argv[1]), sys.argv[2]
+folder, host, faults = Path(sys.argv[1]), sys.argv[2], tuple(sys.argv[3:])
 request = TwinRequest(rig=folder / "rig.json", capture=folder / "scene", interface=host, pictures=folder / "card",
-                      picture_format=PictureFormat.CARD)
+                      picture_format=PictureFormat.CARD, faults=faults, noise=0.004 * bool(faults))
 twin = open_twin(request)
 with Listener(twin.universes, host, keep=False) as listener:
     camera = TwinCamera(twin.rig, twin.picture, listener, request.pictures, request)
@@ -58,13 +62,28 @@ with Listener(twin.universes, host, keep=False) as listener:
 
     DmxSwitch.set = send_and_settle
     with card_kept(camera):
-        try:
-            result = acquire(AcquireRequest(plan=str(folder / "plan.json"), rig=folder / "rig.json", camera="gphoto2",
-                                            out=folder / "capture"), refuse_to_ask)
-        except RequestError as error:
-            sys.exit(str(error))
-print([fault.sentence for fault in result.faults])
+        cards, result = 0, None
+        while result is None:
+            try:
+                result = acquire(AcquireRequest(plan=str(folder / "plan.json"), rig=folder / "rig.json", camera="gphoto2",
+                                                out=folder / "capture", retakes=0 if faults else 2), refuse_to_ask)
+            except RequestError as error:
+                cards += 1
+                if "the card of the camera is full: empty it" not in str(error) or cards == 6:
+                    raise  # the next camera has an empty one
+print(json.dumps([cards, {fault.shot: fault.kind for fault in result.faults}]))
 """
+
+
+def photographed(folder: Path, host: str, *faults: str) -> list:
+    """Return how many cards were filled by a capture of the twin with faults, and the faults that were named, by shots.
+
+    The package finds the virtual camera by the environment in which its process starts.
+    """
+    done = subprocess.run([sys.executable, "-c", CAPTURE, str(folder), host, *faults], env=virtual_camera(folder / "card"),
+                          capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 @pytest.mark.long
@@ -78,15 +97,8 @@ def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
     plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat"}]}
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     (tmp_path / "card").mkdir()
-    environment, full = virtual_camera(tmp_path / "card"), 0
-    for _ in range(RUNS):
-        done = subprocess.run([sys.executable, "-c", CAPTURE, str(tmp_path), host], env=environment, capture_output=True, text=True,
-                              timeout=300)
-        full += "the card of the camera is full" in done.stderr
-        if done.returncode == 0:
-            break
-        assert "the card of the camera is full" in done.stderr, done.stderr
-    assert full >= 2 and done.stdout.splitlines()[-1] == "[]", done.stderr
+    cards, faults = photographed(tmp_path, host)
+    assert cards >= 2 and faults == {}
     capture, imported = tmp_path / "capture", tmp_path / "imported"
     frames = json.loads((capture / "capture.json").read_text())["frames"]
     towards = np.array([frame["light"]["direction"] for frame in frames])
@@ -103,3 +115,34 @@ def test_a_dome_of_96_and_a_virtual_camera(tmp_path, relit):
     assert maps[0].keys() == maps[1].keys()
     for name, channel in maps[0].items():
         assert np.array_equal(channel.pixels, maps[1][name].pixels, equal_nan=True), name
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("seed", "protocol"), [(1, "sacn"), (2, "artnet")])
+def test_faults_on_the_card_are_named_with_their_pictures_and_none_else(tmp_path, seed, protocol):
+    scene = relief(seed, (10, 8, 5))
+    count, random = len(scene.directions), np.random.default_rng(seed)
+    light, even = scene.radiance.mean(axis=(1, 2, 3)), np.ones((count, 3))
+    pictures = make_scene()._replace(directions=scene.directions, irradiance=even, images=scene.radiance,
+                                     mask=np.ones(scene.radiance.shape[1:3], bool))
+    write_capture(tmp_path / "scene", pictures)
+    write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=(host := loopback()), protocol=protocol)
+    plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "dark"}, {"take": "olat"}]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "card").mkdir()
+    made: dict[int, str] = {}
+    for fault in FAULTS:
+        made[int(random.choice([lamp for lamp in range(1, count) if not {lamp - 1, lamp, lamp + 1} & made.keys()
+                                and VISIBLE < light[lamp] / light.mean() < BRIGHT]))] = fault
+    words = [f"{fault}@{lamp + 1}" for lamp, fault in made.items()]
+    wanted = {f"{lamp + 2:04d}_light_{lamp + 1:03d}": FAULTS[fault] for lamp, fault in made.items()}  # a dark picture is the first
+    assert photographed(tmp_path, host, *words) == [0, wanted]
+
+
+def test_a_card_cannot_lose_a_picture(tmp_path, relit):
+    """The sentence says which fault."""
+    write_capture(tmp_path / "scene")
+    write_rig(tmp_path / "rig.json", make_scene().directions, host="127.0.0.1")
+    words = relit.refused("twin", tmp_path / "rig.json", tmp_path / "scene", "--pictures", tmp_path / "card", "--picture-format", "card",
+                          "--faults", "dead@3,late@4")
+    assert "--faults late" in words
