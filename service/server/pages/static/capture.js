@@ -67,7 +67,7 @@ function offer(facts) {
 
 async function look(facts) {
   const step = await chosenStep(identifier);
-  const { files } = await openView(identifier, null, step);
+  const { files } = await openView(identifier, null, step, byId("preparing"));
   const view = await ViewFile.open(files);
   if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier);
   show(byId("relight"), view.info.relight !== null && step === null);

@@ -92,7 +92,7 @@ await load(async () => {
     object = null;
     byId("picture-of-object").replaceChildren();
     if (capture === "") return;
-    const { files } = await openView(capture, null);
+    const { files } = await openView(capture, null, null, byId("picture-of-object"));
     object = await mountObject(byId("picture-of-object"), await ViewFile.open(files), directions, light, rig.color_space ?? DISPLAY_SPACE);
     views.push(object);
     present();

@@ -1,6 +1,6 @@
 /** What is predicted of a drive: the balls and the object that the lamps light, and the environment as it turns. */
 
-import { element } from "./element.js";
+import { element, numberOf } from "./element.js";
 import { BasisRenderer, canRender } from "./view/basis_renderer.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "./view/colour_spaces.js";
 import { srgbByte, VIEW_TRANSFORM } from "./view/display.js";
@@ -129,7 +129,7 @@ export async function mountObject(parent, view, directions, frames, space) {
     renderer.draw({ shown: model.ofCaptured(weights), compared: null, border: 1, gain: 2 ** Number(stops.value), backdrop: [0.2, 0.2, 0.2] });
   };
   stops.addEventListener("input", () => draw(shown));
-  parent.replaceChildren(canvas, element("label", {}, "Exposure (stops) ", stops), element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`));
+  parent.replaceChildren(canvas, element("label", {}, "Exposure (stops) ", stops, " ", numberOf(stops)), element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`));
   canvas.dataset.ready = "";
   return draw;
 }

@@ -9,8 +9,9 @@ import { openView } from "./view_jobs.js";
 const identifier = byId("main").dataset.identifier;
 
 await load(async () => {
-  const view = await ViewFile.open((await openView(identifier, null)).files);
+  const view = await ViewFile.open((await openView(identifier, null, null, byId("view"))).files);
   byId("name").textContent = view.info.name;
   document.title = `${view.info.name} · Relit`;
   await mountLight(byId("view"), identifier, view);
+  addEventListener("hashchange", () => location.reload()); // another link to this page was followed
 });

@@ -46,6 +46,78 @@ def test_the_modes_of_an_object_are_those_that_exist_and_stand_in_the_address(sm
     assert download.value.path().read_bytes()[:4] == b"\x76\x2f\x31\x01"
 
 
+def test_back_and_forward_go_through_the_modes_as_they_were_left(small_page, made):
+    page, errors = small_page, []
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto("/jobs")
+    page.goto(made.pages["object"])
+    made.wait_for_content(page, "object")
+    page.get_by_label("Size of the light in degrees").fill("12")
+    mode(page, "Maps", "[data-shows=maps] canvas.map")
+    page.get_by_label("Layer", exact=True).select_option("normal")
+    mode(page, "Photographs", "[data-shows=photographs] figure canvas")
+    page.evaluate("globalThis.isFirstDocument = true")
+    for way, name in (("go_back", "maps"), ("go_back", "light"), ("go_forward", "maps"), ("go_forward", "photographs"), ("go_back", "maps")):
+        getattr(page, way)()
+        page.locator(f"[data-shows={name}]:visible").wait_for()
+        assert page.locator("#modes [aria-pressed=true]").get_attribute("data-mode") == name
+        assert page.locator("[data-shows]:visible >> visible=true").first.get_attribute("data-shows") == name
+        assert "size=12" in page.url
+    assert page.evaluate("globalThis.isFirstDocument") is True  # nothing was loaded again
+    page.evaluate("location.hash = '#mode=photographs&size=3'")  # a link that shows something else than what was left
+    page.wait_for_function("() => globalThis.isFirstDocument === undefined")
+    page.locator("[data-shows=photographs] figure canvas").first.wait_for()
+    for _ in range(4):
+        page.go_back()
+    page.wait_for_url("**/jobs")
+    assert errors == []
+
+
+def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_mode(small_page, made):
+    page = small_page
+
+    def unprepared(route):
+        answer = route.fetch()
+        found = answer.json()
+        found["jobs"] = [{**job, "state": "running"} if job["request"].get("maps") else job for job in found["jobs"]]
+        route.fulfill(response=answer, json=found)
+
+    page.route("**/v1/jobs?limit=500&state=succeeded&state=queued&state=running", unprepared)
+    page.route("**/v1/jobs/*/events", lambda route: None)  # it never ends
+    page.goto(f"{made.pages['object']}#mode=photographs")
+    page.locator("[data-shows=photographs] figure canvas").first.wait_for()
+    mode(page, "Maps", "[data-shows=maps] progress")
+    page.get_by_text("its view is being prepared").wait_for()
+    mode(page, "Photographs", "[data-shows=photographs] figure canvas")
+    assert page.locator("progress:visible").count() == 0
+    assert page.get_by_text("its view is being prepared").is_hidden()
+
+
+def test_what_was_taken_for_granted_is_no_fault(page, made):
+    def doubtful(route):
+        answer = route.fetch()
+        route.fulfill(response=answer, json={**answer.json(), "findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"],
+                                             "assumed": ["no lens is known"]})
+
+    page.route("**/results/view.json", doubtful)
+    page.goto(f"{made.pages['object']}#mode=photographs")
+    colours = [page.get_by_text(words, exact=True).evaluate("(each) => getComputedStyle(each).color")
+               for words in ("a frame is dark", "the height is steep", "no lens is known")]
+    assert len(set(colours)) == 3 and page.locator(".assumed li").count() == 1
+
+
+def test_every_slider_has_its_number(page, made):
+    page.goto(made.pages["light"])
+    made.wait_for_content(page, "light")
+    page.get_by_label("Size of the light in degrees").fill("12.5")
+    page.evaluate("relit.set([0.3, 0.1, 0.9])")
+    sliders = page.locator(".panel input[type=range]")
+    for slider in sliders.all():
+        number = slider.locator("xpath=following-sibling::output")
+        assert float(number.text_content().replace("\u2212", "-")) == float(slider.input_value())
+    assert sliders.count() == 6
+
+
 def test_a_capture_that_an_earlier_build_has_checked_is_offered_what_its_light_allows(page, solved):
     """Its facts do not say what lit its frames; its view has their directions."""
     def earlier(route):

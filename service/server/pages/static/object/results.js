@@ -8,10 +8,10 @@ import { mount as mountPlot } from "../view/pixel_plot.js";
 import { ViewFile } from "../view/view_file.js";
 import { captureOf, openView } from "../view_jobs.js";
 
-/** Return the view of the maps of a job, prepared if it is not yet. */
-export async function viewOf(job) {
+/** Return the view of the maps of a job, prepared if it is not yet; `place` is where it will be shown. */
+export async function viewOf(job, place) {
   const capture = await captureOf(await read(`/v1/jobs/${job}`));
-  return ViewFile.open((await openView(capture, job, await chosenStep(capture, await stepNames(job)))).files);
+  return ViewFile.open((await openView(capture, job, await chosenStep(capture, () => stepNames(job)), place)).files);
 }
 
 /** Show a view of maps; `others` to compare with, as the viewer of maps takes them. */
@@ -28,9 +28,12 @@ export async function mountResults(parent, view, others = []) {
   }
 }
 
-/** Return what is wrong with maps, in words. */
-export function warningsOf(view) {
-  return element("ul", { class: "findings plain" }, ...[...view.info.findings, ...view.info.warnings].map((each) => element("li", {}, each)));
+/** Return what is wrong with a capture, what there is to know of its maps, and what was taken for granted, in words. */
+export function warningsOf({ info: { findings, warnings, assumed = [] } }) {
+  const list = (kind, sentences) => (sentences.length === 0 ? null : element("ul", { class: `${kind} plain` }, ...sentences.map((each) => element("li", {}, each))));
+  const granted = list("assumed", assumed);
+  return element("div", {}, list("findings", findings), list("warnings", warnings.filter((each) => !assumed.includes(each))),
+    granted === null ? null : element("div", { class: "help" }, "Taken for granted:", granted));
 }
 
 /** Return the names of the time steps of a job of a sequence; empty where it is of one capture. */

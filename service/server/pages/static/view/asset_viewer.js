@@ -1,7 +1,7 @@
 /** Shows an asset as programs that open it do: in 3D, lit by a room, an environment map or one light of the rig, with the rig's lights around it. */
 
 import { Group, LinearToneMapping, Matrix4 } from "three";
-import { element, tell } from "../element.js";
+import { element, numberOf, tell } from "../element.js";
 import { openAsset } from "./asset_file.js";
 import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
@@ -38,14 +38,13 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     exposure: element("input", { type: "range", min: -MOST_STOPS, max: MOST_STOPS, step: 0.1, value: 0 }),
     markers: element("input", { type: "checkbox", checked: true }),
   };
-  const stopsText = element("output", {});
-  const row = (text, ...each) => element("label", {}, `${text} `, ...each);
+  const row = (text, each) => element("label", {}, `${text} `, each, each.type === "range" ? numberOf(each) : null);
   const turnRow = row("Turn (degrees)", control.turn);
   const panel = element("div", { class: "panel" },
     row("Lit by", control.lit),
     element("fieldset", {}, element("legend", {}, "Environment"), environments.length > 0 ? row("Map", control.environment) : null,
       element("label", { class: "button quiet" }, "Open a file", control.file), preview, turnRow),
-    row("Exposure (stops)", control.exposure, stopsText),
+    row("Exposure (stops)", control.exposure),
     lights.length > 0 ? row("Lights of the rig", control.markers) : null,
     element("p", { class: "actions" }, element("button", { type: "button", class: "quiet", onclick: () => view.reset() }, "As it was captured")),
     element("p", { class: "help" }, words(asset, lights)),
@@ -90,7 +89,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   function change() {
     lighting.turn(control.lit.value === MAP ? Number(control.turn.value) : 0);
     renderer.toneMappingExposure = 2 ** Number(control.exposure.value);
-    stopsText.textContent = Number(control.exposure.value).toFixed(1);
+    for (const each of [control.turn, control.exposure]) each.dispatchEvent(new Event("set"));
     markers.object.visible = control.markers.checked;
     view.changed();
   }

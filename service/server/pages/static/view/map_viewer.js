@@ -1,6 +1,6 @@
 /** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
 
-import { element, tell } from "../element.js";
+import { element, numberOf, tell } from "../element.js";
 import { ControlAddress } from "./control_address.js";
 import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
 import { mountHistogram, short } from "./histogram.js";
@@ -37,12 +37,11 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   const wipe = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Where the two layers meet" });
   const colours = element("select", {}, ...COLOUR_MAPS.map((name) => element("option", { value: name }, name)));
   const stops = element("input", { type: "range", min: -6, max: 6, step: 0.1, value: 0, "aria-label": "Exposure in stops" });
-  const stopsText = element("output", {}, "0 stops");
   const hatched = { unsure: checkbox(true), refused: checkbox(true) };
   const named = (text, control, ...more) => element("label", {}, `${text} `, control, ...more);
   const colourRow = named("Colour map", colours);
-  const stopsRow = element("label", {}, "Exposure ", stops, " ", stopsText);
-  const [wipeRow, howRow] = [named("Wipe", wipe), named("How", how)];
+  const stopsRow = named("Exposure (stops)", stops, numberOf(stops));
+  const [wipeRow, howRow] = [named("Wipe (%)", wipe, numberOf(wipe)), named("How", how)];
   const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), howRow, wipeRow,
     named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
     element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
@@ -92,7 +91,6 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
 
   function select() {
     const look = { colours: colours.value, stops: Number(stops.value) };
-    stopsText.textContent = `${stops.value} stops`;
     const failed = (error) => tell(error.message);
     const made = (chosen) => {
       const [at, name] = chosen.includes("/") ? chosen.split("/") : [null, chosen];
@@ -213,16 +211,14 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   if (others.length > 0) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
   const address = new ControlAddress({ layer: layerSelect, with: otherSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
   address.read();
+  for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
   for (const each of [layerSelect, otherSelect, how]) each.addEventListener("change", select);
   how.addEventListener("change", fit);
   wipe.addEventListener("input", draw);
   for (const each of Object.values(hatched)) each.addEventListener("change", draw);
   colours.addEventListener("change", () => [image, other].forEach((each) => each?.setLook({ colours: colours.value })));
-  stops.addEventListener("input", () => {
-    stopsText.textContent = `${stops.value} stops`;
-    for (const each of [image, other]) each?.setLook({ stops: Number(stops.value) });
-  });
+  stops.addEventListener("input", () => [image, other].forEach((each) => each?.setLook({ stops: Number(stops.value) })));
   const resized = new ResizeObserver(() => {
     const box = canvas.getBoundingClientRect();
     const ratio = globalThis.devicePixelRatio ?? 1;
