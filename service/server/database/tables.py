@@ -50,6 +50,13 @@ intakes = sa.Table(  # captures and environments
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Index("relit_intakes_of_project", "project", "kind", "created_at"))
 
+annotations = sa.Table(  # texts about points and rectangles of captures
+    "relit_annotations", metadata, _id(),
+    sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id", ondelete="CASCADE"), nullable=False),
+    sa.Column("content", sa.JSON, nullable=False),  # of service.requests.base.annotations
+    sa.Column("created_at", sa.Float, nullable=False),
+    sa.Index("relit_annotations_of_intake", "intake", "created_at"))
+
 uploads = sa.Table(
     "relit_uploads", metadata, _id(), _project(),
     sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id"), nullable=False),

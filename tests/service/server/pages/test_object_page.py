@@ -227,6 +227,43 @@ def test_two_fingers_zoom_the_picture(browser, server, made):
     context.close()
 
 
+def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
+    page.goto(made.pages["light"])
+    made.wait_for_content(page, "light")
+    page.get_by_role("button", name="Add a note").click()
+    page.keyboard.press("Enter")
+    page.get_by_label("Text of the note").fill("<img src=x onerror=alert(1)> the middle")
+    page.get_by_role("button", name="Keep the note").click()
+    page.locator(".notes > button").first.wait_for()
+    page.get_by_role("button", name="Add a note").click()
+    box = page.locator(".marking").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 60, middle[1] + 40)
+    page.mouse.up()
+    page.get_by_label("Text of the note").fill("a region")
+    page.get_by_role("button", name="Keep the note").click()
+    page.locator(".notes > button").nth(1).wait_for()
+    page.locator("canvas.picture").focus()
+    page.keyboard.press("+")  # the marks go with the picture
+    page.wait_for_function("() => document.querySelectorAll('.notes .area')[1].offsetWidth > 70")
+    other = new_context(browser).new_page()
+    other.goto(page.url)
+    made.wait_for_content(other, "light")
+    assert other.locator(".notes-list li").all_inner_texts() == ["<img src=x onerror=alert(1)> the middle Delete", "a region Delete"]
+    assert other.locator("main img").count() == 0
+    marks = [each.bounding_box() for each in other.locator(".notes > button").all()]
+    canvas = other.locator("canvas.picture").bounding_box()
+    centre = canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2
+    for mark in marks:  # both begin in the middle of the picture
+        assert np.allclose((mark["x"] + mark["width"] / 2, mark["y"] + mark["height"] / 2), centre, atol=2)
+    for left in (1, 0):
+        other.get_by_role("button", name="Delete note 1").click()
+        other.wait_for_function("(left) => document.querySelectorAll('.notes-list li').length === left", arg=left)
+    other.close()
+
+
 def test_a_video_is_recorded_by_the_browser(page, made):
     page.goto(made.pages["light"])
     made.wait_for_content(page, "light")

@@ -16,7 +16,7 @@ import { mountResults, viewOf, warningsOf } from "./results.js";
 const identifier = byId("main").dataset.identifier;
 const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
 const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
-const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json)$/;
+const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json|annotations\.json)$/;
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
 const left = new Map(); // what the address said beside the mode when each was left

@@ -28,13 +28,13 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
  *     light; `embedded`: the page moves the light, and the address is its own.
  * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void,
- *     canvas: HTMLCanvasElement|null, turn: function(number): void}>} `turn` turns the environment by degrees, or the light where there is none.
+ *     canvas: HTMLCanvasElement|null, over: object|null, turn: function(number): void}>} `over` is that of zoomed_picture.js; `turn` turns the environment by degrees, or the light where there is none.
  */
 export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, turn: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, over: null, turn: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
@@ -261,6 +261,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
     canvas,
+    over: { ...zoomed.over, step: relight.step },
     turn,
   };
 }
