@@ -35,7 +35,7 @@ export async function mountAsset(parent, job, named = () => {}) {
   }
   const show = async () => {
     parent.replaceChildren(element("p", { role: "status" }, `Loading ${bytes(result.size)} …`));
-    const [{ mount }, data, environments, rig] = await Promise.all([import("../view/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
+    const [{ mount }, data, environments, rig] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
       readyEnvironments(), rigOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; })]);
     named(job.request.name || rig?.name || job.id);
     globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data }, { rig, environments, load: loadEnvironment });

@@ -23,7 +23,7 @@ export async function mountResults(parent, view, others = []) {
   if (view.info.points !== null) {
     const points = element("div");
     parent.append(element("section", { "aria-labelledby": "points-title" }, element("h2", { id: "points-title" }, "Points"), points));
-    const { mount } = await import("../view/cloud_viewer.js"); // three.js is large: only a depth needs it here
+    const { mount } = await import("../scene/cloud_viewer.js"); // three.js is large: only a depth needs it here
     globalThis.cloud = await mount(points, view);
   }
 }

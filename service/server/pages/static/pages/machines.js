@@ -1,8 +1,8 @@
 /** The page for operators: workers and what each does, the queue, the space left, the last errors, and the audit log. */
 
-import { attempt, load, read, Refusal } from "./api.js";
-import { byId, bytes, element, icon, show, time, words } from "./element.js";
-import { progressOf, titleOf } from "./jobs_table.js";
+import { attempt, load, read, Refusal } from "../api.js";
+import { byId, bytes, element, icon, show, time, words } from "../element.js";
+import { progressOf, titleOf } from "../jobs_table.js";
 
 const REFRESH_MS = 5000;
 const ERRORS = 10;

@@ -4,9 +4,9 @@ import { Group, LinearToneMapping, Matrix4 } from "three";
 import { element, numberOf, tell } from "../element.js";
 import { openAsset } from "./asset_file.js";
 import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
-import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
-import { VIEW_TRANSFORM } from "./display.js";
-import { previewOf, readEnvironment } from "./environment_map.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
+import { VIEW_TRANSFORM } from "../view/display.js";
+import { previewOf, readEnvironment } from "../view/environment_map.js";
 import { OrbitScene } from "./orbit_scene.js";
 import { RigLights } from "./rig_lights.js";
 

@@ -1,10 +1,10 @@
 /** The page that lights a capture live. */
 
-import { load } from "./api.js";
-import { byId } from "./element.js";
-import { mountLight } from "./object/light.js";
-import { ViewFile } from "./view/view_file.js";
-import { openView } from "./view_jobs.js";
+import { load } from "../api.js";
+import { byId } from "../element.js";
+import { mountLight } from "../object/light.js";
+import { ViewFile } from "../view/view_file.js";
+import { openView } from "../view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 

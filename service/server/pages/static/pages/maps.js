@@ -1,8 +1,8 @@
 /** The page of the maps of a job. */
 
-import { load } from "./api.js";
-import { byId } from "./element.js";
-import { mountResults, viewOf } from "./object/results.js";
+import { load } from "../api.js";
+import { byId } from "../element.js";
+import { mountResults, viewOf } from "../object/results.js";
 
 await load(async () => {
   const view = await viewOf(byId("main").dataset.identifier, byId("view"));

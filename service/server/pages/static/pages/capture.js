@@ -1,18 +1,18 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read } from "./api.js";
-import { byId, element, factText, show, words } from "./element.js";
-import { watch } from "./events.js";
-import { enableForms } from "./form.js";
-import { JobsTable } from "./jobs_table.js";
-import { heldBy, litFacts, offerSteps } from "./object/next_steps.js";
-import { mountPhotographs } from "./object/photographs.js";
-import { removeLater } from "./object/removal.js";
-import { proposalOf } from "./proposal.js";
-import { chosenStep } from "./time_steps.js";
-import { settled } from "./upload.js";
-import { ViewFile } from "./view/view_file.js";
-import { openView } from "./view_jobs.js";
+import { attempt, listing, load, read } from "../api.js";
+import { byId, element, factText, show, words } from "../element.js";
+import { watch } from "../events.js";
+import { enableForms } from "../form.js";
+import { JobsTable } from "../jobs_table.js";
+import { heldBy, litFacts, offerSteps } from "../object/next_steps.js";
+import { mountPhotographs } from "../object/photographs.js";
+import { removeLater } from "../object/removal.js";
+import { proposalOf } from "../upload/proposal.js";
+import { chosenStep } from "../time_steps.js";
+import { settled } from "../upload/upload.js";
+import { ViewFile } from "../view/view_file.js";
+import { openView } from "../view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
