@@ -85,4 +85,5 @@ def page_of(capture: str, rows: list[Any]) -> AnnotationPage:
 
 def view_of(capture: str, row: Any) -> AnnotationView:
     """Return the view of a row."""
-    return AnnotationView.model_validate({**row["content"], "id": f"/v1/captures/{capture}/annotations/{row['id']}", "created": row["created_at"]})
+    address = f"/v1/captures/{capture}/annotations/{row['id']}"
+    return AnnotationView.model_validate({**row["content"], "id": address, "created": row["created_at"]})

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.requests import states
-from service.requests.base.annotations import AnnotationPage, AnnotationView, NewAnnotation, page_of, view_of
 from service.requests.answers import IntakePage, IntakeView
+from service.requests.base.annotations import AnnotationPage, AnnotationView, NewAnnotation, page_of, view_of
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId, CaptureId, new_id, pattern
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
@@ -157,8 +157,8 @@ def list_annotations(service: ServiceDep, caller: Reader, capture: CaptureId) ->
 
 @captures.post("/{capture}/annotations", status_code=201, responses=responses(404, 409), summary="Annotate a capture")
 def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, wanted: Annotated[NewAnnotation, Body(openapi_examples={
-        "point": {"value": {"body": {"type": "TextualBody", "value": "A repair"}, "target": {"selector": {"type": "PointSelector", "x": 31, "y": 64}}}}})],
-                      response: Response) -> AnnotationView:
+        "point": {"value": {"body": {"type": "TextualBody", "value": "A repair"},
+                            "target": {"selector": {"type": "PointSelector", "x": 31, "y": 64}}}}})], response: Response) -> AnnotationView:
     """Keep a text about a point or a rectangle of the image with a capture."""
     width, height = ((row_of(service, caller, capture)["facts"] or {}).get("resolution") or (float("inf"), float("inf")))[:2]
     x, y, across, down = wanted.box()

@@ -14,7 +14,8 @@ MOST = 500
 
 def listing(database: Database, capture: str) -> list[sa.RowMapping]:
     """Return the annotations of a capture, the oldest first."""
-    return database.rows(sa.select(annotations).where(annotations.c.intake == capture).order_by(annotations.c.created_at, annotations.c.id))
+    of_capture = sa.select(annotations).where(annotations.c.intake == capture)
+    return database.rows(of_capture.order_by(annotations.c.created_at, annotations.c.id))
 
 
 def insert(connection: sa.Connection, capture: str, content: dict[str, object]) -> sa.RowMapping | None:

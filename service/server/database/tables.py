@@ -173,7 +173,8 @@ workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks 
     sa.Column("device", sa.String(100), nullable=False),
     sa.Column("started_at", sa.Float, nullable=False),
     sa.Column("seen_at", sa.Float, nullable=False),
-    sa.Column("state", sa.String(16), nullable=False))
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("asked", sa.String(8)))  # what an operator asks of it: drain or kill; NULL: nothing
 
 clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's clock is noticed
     "relit_clock", metadata, sa.Column("id", sa.Integer, primary_key=True),

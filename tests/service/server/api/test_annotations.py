@@ -13,7 +13,8 @@ from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
 
 POINT = {"body": {"type": "TextualBody", "value": "<b>The\nmiddle"}, "target": {"selector": {"type": "PointSelector", "x": 4, "y": 3.5}}}
-REGION = {"body": {"type": "TextualBody", "value": "A repair"}, "target": {"selector": {"type": "FragmentSelector", "value": "xywh=pixel:1,2,3,6"}}}
+REGION = {"body": {"type": "TextualBody", "value": "A repair"},
+          "target": {"selector": {"type": "FragmentSelector", "value": "xywh=pixel:1,2,3,6"}}}
 
 
 @pytest.fixture(scope="module")

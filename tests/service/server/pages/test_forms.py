@@ -7,8 +7,8 @@ import pytest
 from service.requests.base.base import Role
 from service.requests.base.options import build, options_of
 from service.requests.calibration_jobs import ProcamJob
-from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
 from service.requests.imports.layouts import LAYOUTS
+from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
 from service.server.pages.forms import BEGIN_WITH, CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, UNITS, Form, form_of, import_fields
 from stage.capture.manifest import LIT_BY
 
@@ -105,7 +105,8 @@ def test_a_next_step_needs_nothing_but_the_capture(holds, kind):
 
 
 def test_labels_are_words_with_their_units_in_brackets():
-    labels = [field.label for kind, model in (CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS).items() for form in [form_of(kind, model)] for field in (*form.main, *form.more)]
+    forms = [form_of(kind, model) for kind, model in (CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS).items()]
+    labels = [field.label for form in forms for field in (*form.main, *form.more)]
     labels += [field.label for layout in LAYOUTS for field in import_fields(layout)]
     assert not [label for label in labels if label.rpartition(" ")[2] in (*UNITS, "mm", "rad")]
     assert {"Focal length (pixels)", "Pixel size (metres)", "Spin (degrees)", "Frequencies (Hz)"} <= set(labels)

@@ -57,7 +57,8 @@ def test_back_and_forward_go_through_the_modes_as_they_were_left(small_page, mad
     page.get_by_label("Layer", exact=True).select_option("normal")
     mode(page, "Photographs", "[data-shows=photographs] figure canvas")
     page.evaluate("globalThis.isFirstDocument = true")
-    for way, name in (("go_back", "maps"), ("go_back", "light"), ("go_forward", "maps"), ("go_forward", "photographs"), ("go_back", "maps")):
+    ways = (("go_back", "maps"), ("go_back", "light"), ("go_forward", "maps"), ("go_forward", "photographs"), ("go_back", "maps"))
+    for way, name in ways:
         getattr(page, way)()
         page.locator(f"[data-shows={name}]:visible").wait_for()
         assert page.locator("#modes [aria-pressed=true]").get_attribute("data-mode") == name
@@ -96,8 +97,8 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
 def test_what_was_taken_for_granted_is_no_fault(page, made):
     def doubtful(route):
         answer = route.fetch()
-        route.fulfill(response=answer, json={**answer.json(), "findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"],
-                                             "assumed": ["no lens is known"]})
+        doubts = {"findings": ["a frame is dark"], "warnings": ["the height is steep", "no lens is known"], "assumed": ["no lens is known"]}
+        route.fulfill(response=answer, json=answer.json() | doubts)
 
     page.route("**/results/view.json", doubtful)
     page.goto(f"{made.pages['object']}#mode=photographs")
