@@ -20,7 +20,7 @@ def listing(database: Database, capture: str) -> list[sa.RowMapping]:
 
 def insert(connection: sa.Connection, capture: str, content: dict[str, object]) -> sa.RowMapping | None:
     """Insert an annotation, and return its row; None: the capture has MOST already, or is gone."""
-    connection.execute(intakes.update().where(intakes.c.id == capture).values(name=intakes.c.name))  # locks the row, so that the count stays
+    connection.execute(intakes.update().where(intakes.c.id == capture).values(name=intakes.c.name))  # locks the row: the count stays
     is_there = connection.execute(sa.select(intakes.c.id).where(intakes.c.id == capture)).first() is not None
     count = connection.execute(sa.select(sa.func.count()).where(annotations.c.intake == capture)).scalar() or 0
     if not is_there or count >= MOST:

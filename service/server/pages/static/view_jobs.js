@@ -32,14 +32,24 @@ export async function captureOf(job) {
  * @param {string|null} maps Identifier of the job that made the maps; null: the capture alone.
  * @param {number|null} step The time step that is shown, where the capture is a sequence.
  * @param {HTMLElement} place Where the view will be shown.
+ * @param {object} [more] Of the request.
  * @returns {Promise<{job: any, files: ReturnType<typeof resultsOf>}>}
  */
-export async function openView(capture, maps, step, place) {
-  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }) };
+export async function openView(capture, maps, step, place, more = {}) {
+  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }), ...more };
   let job = (await findView({ capture, maps, step })) ?? (await submitJob(body));
+  job = await followed(job, place, "This is looked at for the first time: its view is being prepared.", "the view was not prepared");
+  return { job, files: resultsOf(job.id) };
+}
+
+/**
+ * Return a job when it has succeeded; a place of the page shows how far it is until then.
+ * @param {string} doing A sentence that says what is done. @param {string} fault What is said where it fails, before the reason.
+ */
+export async function followed(job, place, doing, fault) {
   if (job.state !== "succeeded") {
     const [bar, stage] = [element("progress", { "aria-label": "Progress of the preparation" }), element("span")];
-    const told = element("div", { class: "preparing" }, element("p", { role: "status" }, "This is looked at for the first time: its view is being prepared."), bar, " ", stage);
+    const told = element("div", { class: "preparing" }, element("p", { role: "status" }, doing), bar, " ", stage);
     place.prepend(told);
     try {
       await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now, bar, stage); } });
@@ -48,10 +58,10 @@ export async function openView(capture, maps, step, place) {
       told.remove();
     }
     if (job.state !== "succeeded") {
-      throw new Error(`the view was not prepared: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
+      throw new Error(`${fault}: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
     }
   }
-  return { job, files: resultsOf(job.id) };
+  return job;
 }
 
 function progress(job, bar, stage) {

@@ -11,7 +11,7 @@ import { mountLight } from "./light.js";
 import { litFacts, offerSteps } from "./next_steps.js";
 import { mountPhotographs } from "./photographs.js";
 import { removeLater } from "./removal.js";
-import { mountResults, viewOf, warningsOf } from "./results.js";
+import { mountResults, PREVIEW, viewOf, warningsOf } from "./results.js";
 
 const identifier = byId("main").dataset.identifier;
 const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
@@ -29,7 +29,7 @@ async function jobsOfObject() {
   for await (const job of listing("/v1/jobs?limit=500&state=succeeded", "jobs")) all.push(job);
   const known = new Set();
   for (const job of all.toReversed()) if (job.request.capture === identifier || known.has(job.request.maps)) known.add(job.id);
-  return all.filter((job) => known.has(job.id) && job.request.kind !== "view");
+  return all.filter((job) => known.has(job.id) && job.request.kind !== "view" && job.request.name !== PREVIEW);
 }
 
 /** Return the modes that this object has: what each is called and how it is mounted. */

@@ -8,10 +8,15 @@ import { mount as mountPlot } from "../view/pixel_plot.js";
 import { ViewFile } from "../view/view_file.js";
 import { captureOf, openView } from "../view_jobs.js";
 
+/** Name of jobs that make a preview, which the page of an object leaves out. */
+export const PREVIEW = "Preview of the middle";
+
 /** Return the view of the maps of a job, prepared if it is not yet; `place` is where it will be shown. */
 export async function viewOf(job, place) {
-  const capture = await captureOf(await read(`/v1/jobs/${job}`));
-  return ViewFile.open((await openView(capture, job, await chosenStep(capture, () => stepNames(job)), place)).files);
+  const found = await read(`/v1/jobs/${job}`);
+  const capture = await captureOf(found);
+  const { crop = null } = found.request.options ?? {}; // maps of a part are shown with that part
+  return ViewFile.open((await openView(capture, job, await chosenStep(capture, () => stepNames(job)), place, crop === null ? {} : { options: { crop } })).files);
 }
 
 /** Show a view of maps; `others` to compare with, as the viewer of maps takes them. */

@@ -9,6 +9,8 @@ import { heldBy, litFacts, offerSteps } from "../object/next_steps.js";
 import { mountPhotographs } from "../object/photographs.js";
 import { removeLater } from "../object/removal.js";
 import { proposalOf } from "../upload/proposal.js";
+import { calibrationList } from "./calibrations.js";
+import { offerPreview } from "./preview.js";
 import { chosenStep } from "../time_steps.js";
 import { settled } from "../upload/upload.js";
 import { ViewFile } from "../view/view_file.js";
@@ -62,6 +64,10 @@ function offer(facts) {
     if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
     else if (first.includes(box.querySelector("form").dataset.kind)) byId("first").append(box);
   }
+  offerPreview(byId("preview"), byId("previewed"), identifier, facts, first[0]);
+  const list = calibrationList(facts, byId("more"));
+  if (list !== null) byId("calibrations").append(list);
+  show(byId("calibrations"), list !== null);
   show(byId("work"), true);
 }
 
