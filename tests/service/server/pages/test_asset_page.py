@@ -261,7 +261,7 @@ def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp
     assert asked == []
 
 
-def test_no_serious_violation(asset):
+def test_no_violation(asset):
     asset.set_viewport_size({"width": 390, "height": 844})
     asset.wait_for_function("document.documentElement.scrollWidth <= 390")
     assert violations_in_both_schemes(asset) == []

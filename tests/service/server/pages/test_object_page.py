@@ -277,7 +277,7 @@ def test_a_video_is_recorded_by_the_browser(page, made):
 
 
 @pytest.mark.parametrize("shown", ["compare", "photographs", "maps"])
-def test_each_mode_has_no_serious_violation_and_fits_a_phone(browser, server, made, shown):
+def test_each_mode_has_no_violation_and_fits_a_phone(browser, server, made, shown):
     page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()
     page.goto(f"{made.pages['object']}#mode={shown}")
     page.locator(f"[data-shows={shown}] canvas").first.wait_for()
