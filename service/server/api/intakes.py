@@ -16,6 +16,7 @@ from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
+from service.server.api.jobs import StrictJson
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
@@ -156,9 +157,10 @@ def list_annotations(service: ServiceDep, caller: Reader, capture: CaptureId) ->
 
 
 @captures.post("/{capture}/annotations", status_code=201, responses=responses(404, 409), summary="Annotate a capture")
-def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, wanted: Annotated[NewAnnotation, Body(openapi_examples={
-        "point": {"value": {"body": {"type": "TextualBody", "value": "A repair"},
-                            "target": {"selector": {"type": "PointSelector", "x": 31, "y": 64}}}}})], response: Response) -> AnnotationView:
+def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, wanted: Annotated[
+        NewAnnotation, StrictJson(NewAnnotation), Body(openapi_examples={"point": {"value": {
+            "body": {"type": "TextualBody", "value": "A repair"},
+            "target": {"selector": {"type": "PointSelector", "x": 31, "y": 64}}}}})], response: Response) -> AnnotationView:
     """Keep a text about a point or a rectangle of the image with a capture."""
     width, height = ((row_of(service, caller, capture)["facts"] or {}).get("resolution") or (float("inf"), float("inf")))[:2]
     x, y, across, down = wanted.box()

@@ -41,6 +41,7 @@ def test_the_page_is_the_file_that_publish_takes(client, noted, tmp_path):
     ({"target": {"selector": {"type": "SvgSelector", "value": "<svg/>"}}}, "selector"),
     ({"target": {"selector": {"type": "PointSelector", "x": 9, "y": 1}}}, "outside the image, which has 8x8 pixels"),
     ({"target": {"selector": {"type": "PointSelector", "x": -1, "y": 1}}}, "x"),
+    ({"target": {"selector": {"type": "PointSelector", "x": "1", "y": 1}}}, "x"),
     ({"target": {"selector": {"type": "FragmentSelector", "value": "xywh=1,1,8,1"}}}, "outside the image"),
     ({"target": {"selector": {"type": "FragmentSelector", "value": "xywh=percent:1,1,8,1"}}}, "value")])
 def test_what_is_no_annotation_of_the_image_is_refused(client, noted, change, words):
