@@ -81,7 +81,7 @@ def test_what_is_less_sure_is_greyed_out(opened, maps, by, title, sign):
         opened.wait_for_timeout(50)
     assert np.allclose(colour(least), wanted, atol=2) and np.allclose(colour(surest), before[0], atol=2)
     assert f"{title} " in point_at(opened, int(least[0]), int(least[1]), len(maps.mask))
-    assert f"over={by}" in opened.url
+    opened.wait_for_function("(by) => location.hash.includes(`over=${by}`)", arg=by)
 
 
 def test_rows_and_columns_are_numbered_along_the_edges(opened):

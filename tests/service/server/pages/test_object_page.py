@@ -68,10 +68,22 @@ def test_back_and_forward_go_through_the_modes_as_they_were_left(small_page, mad
     page.evaluate("location.hash = '#mode=photographs&size=3'")  # a link that shows something else than what was left
     page.wait_for_function("() => globalThis.isFirstDocument === undefined")
     page.locator("[data-shows=photographs] figure canvas").first.wait_for()
-    for _ in range(4):
+    for name in ("maps", "light"):
         page.go_back()
+        page.locator(f"[data-shows={name}]:visible").wait_for()
+    page.go_back()
     page.wait_for_url("**/jobs")
     assert errors == []
+
+
+def test_the_link_to_the_content_keeps_what_the_address_says(small_page, made):
+    page = small_page
+    page.goto(f"{made.pages['object']}#mode=photographs&size=9")
+    page.locator("[data-shows=photographs] figure canvas").first.wait_for()
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => document.activeElement.id === 'main'")
+    assert page.url.endswith("#mode=photographs&size=9")
 
 
 def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_mode(small_page, made):

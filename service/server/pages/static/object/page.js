@@ -81,9 +81,9 @@ async function choose(name) {
   await load(() => modes[name].mount(place));
 }
 
-/** Return what the address says beside the mode. */
-function others() {
-  return location.hash.slice(1).split("&").filter((part) => part !== "" && !part.startsWith("mode=")).join("&");
+/** Return what an address says beside the mode. */
+function others(hash = location.hash) {
+  return hash.slice(1).split("&").filter((part) => part !== "" && !part.startsWith("mode=")).join("&");
 }
 
 /** Show another mode, from which Back returns to this one. */
@@ -96,7 +96,8 @@ function go(name) {
 }
 
 /** Show what the address says after Back, Forward or a link: a mode as it was left, or else the page is loaded again. */
-function follow() {
+function follow({ oldURL }) {
+  left.set(shown, others(new URL(oldURL).hash));
   const wanted = { mode: Object.keys(modes)[0] };
   address.read(wanted);
   const isKnown = wanted.mode in modes && wanted.mode !== shown && (!places.has(wanted.mode) || left.get(wanted.mode) === others());

@@ -240,11 +240,13 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   const resized = new ResizeObserver(() => {
     const box = canvas.getBoundingClientRect();
     const ratio = globalThis.devicePixelRatio ?? 1;
-    canvas.width = Math.max(1, Math.round(box.width * ratio));
-    canvas.height = Math.max(1, Math.round(box.height * ratio));
+    const size = [box.width, box.height].map((side) => Math.round(side * ratio));
+    if (Math.min(...size) === 0 || (size[0] === canvas.width && size[1] === canvas.height)) return; // hidden, or shown again as it was left
+    [canvas.width, canvas.height] = size;
     fit();
   });
   select();
+  fit();
   resized.observe(canvas);
   return { destroy: () => resized.disconnect() };
 }

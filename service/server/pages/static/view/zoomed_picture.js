@@ -39,7 +39,7 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
     context.fillRect(0, 0, ...size);
     context.imageSmoothingQuality = "high";
     context.drawImage(source, size[0] / 2 - state.centre[0] * scale, size[1] / 2 - state.centre[1] * scale, source.width * scale, source.height * scale);
-    put((u, v) => [width / 2 + ((u - state.centre[0]) * scale) / ratio, height / 2 + ((v - state.centre[1]) * scale) / ratio]);
+    put((u, v) => [canvas.clientLeft + width / 2 + ((u - state.centre[0]) * scale) / ratio, canvas.clientTop + height / 2 + ((v - state.centre[1]) * scale) / ratio]);
     if (pixelSize !== null) showScale(bar, (1000 * pixelSize * ratio) / scale);
   }
 
@@ -63,7 +63,7 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
     onplace: (each) => { put = each; draw(); },
     pixelOf: (x, y) => {
       const { left, top, width, height } = canvas.getBoundingClientRect();
-      const scale = state.scale(width, height);
+      const scale = state.scale(canvas.clientWidth, canvas.clientHeight);
       return [state.centre[0] + (x - left - width / 2) / scale, state.centre[1] + (y - top - height / 2) / scale];
     } };
   return { canvas, draw, over, destroy: () => resized.disconnect() };
