@@ -18,6 +18,10 @@ from tests.service.server.pages.conftest import ARGUMENTS
 from tests.service.server_process import serving
 
 SAMPLES = Path(__file__).parents[1] / "samples"
+SHOWN = {"/": ".card canvas", "/captures": "#captures a", "captures": "#frames canvas", "/jobs": "#jobs tbody a",
+         "jobs": "#stages tbody tr",
+         "light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map"}
+"""What a page is opened for, by its address or the first word of it."""
 PAINT = "() => performance.getEntriesByName('first-contentful-paint')[0].startTime"
 FRAMES = 20
 RATE = """frames => {
@@ -35,20 +39,20 @@ def main() -> int:
         capture = client.post("/v1/captures", json={"name": "owl", "folder": str(SAMPLES / "owl")}).raise_for_status().json()["id"]
         server.wait(client, f"/v1/captures/{capture}", ("ready",))
         done = {}
-        for kind, request in {"solve": {"options": {"method": "robust"}}, "view": {}}.items():
-            done[kind] = client.post("/v1/jobs", json={"kind": kind, "capture": capture, **request}).raise_for_status().json()["id"]
+        for kind, request in {"solve": {"options": {"method": "robust"}}, "view": {}, "maps": {"kind": "view"}}.items():
+            wanted = {"kind": kind, "capture": capture, **request, **({"maps": done["solve"]} if kind == "maps" else {})}
+            done[kind] = client.post("/v1/jobs", json=wanted).raise_for_status().json()["id"]
             server.wait(client, f"/v1/jobs/{done[kind]}", ("succeeded",), timeout_s=600)
-        print("| page | first contentful paint, ms | loaded without data, kB |\n|---|---:|---:|")
-        for path in ("/captures", f"/captures/{capture}", "/jobs", f"/jobs/{done['solve']}", f"/light/{capture}"):
+        print("| page | first contentful paint, ms | what it is opened for, ms | loaded without data, kB |\n|---|---:|---:|---:|")
+        for path in ("/captures", "/", f"/captures/{capture}", "/jobs", f"/jobs/{done['solve']}", f"/light/{capture}", f"/object/{capture}",
+                     f"/maps/{done['solve']}"):
             page = browser.new_page(base_url=server.url)
             loaded = _counted(page)
             page.goto(path)
-            if "/light/" in path:
-                page.locator("canvas.picture[data-ready]").wait_for()
-            else:
-                page.wait_for_timeout(1000)
+            page.locator(SHOWN.get(path) or SHOWN[path.split("/")[1]]).first.wait_for()
+            shown = page.evaluate("performance.now()")
             name = path.replace(capture, "ID").replace(done["solve"], "ID")
-            print(f"| `{name}` | {page.evaluate(PAINT):.0f} | {sum(loaded) / 1000:.0f} |")
+            print(f"| `{name}` | {page.evaluate(PAINT):.0f} | {shown:.0f} | {sum(loaded) / 1000:.0f} |")
             if "/light/" in path:
                 rate, size = page.evaluate(RATE, FRAMES), page.evaluate(SIZE)
                 print(f"\nlive relighting on the processor ({os.cpu_count()} cores): {rate:.1f} frames a second at {size}")

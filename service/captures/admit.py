@@ -7,6 +7,7 @@ from service.relight.time_steps import time_steps
 from service.reporting.progress import Progress, Timings
 from stage import inputs
 from stage.capture.capture import Capture
+from stage.capture.lighting import has_placeholders
 from stage.capture.manifest import FILE_NAME, LIT_BY, Manifest, read_manifest
 from stage.capture.sequence import SEQUENCE_FILE, is_sequence, read_sequence
 from stage.colour.environment_maps import SUFFIXES
@@ -46,21 +47,32 @@ def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = 
         shots = read_scan(folder)
         return {"captures": 0, "frames": 0, "shots": len(shots.time_s), "name": shots.scan.name}
     timings = Timings(progress)
-    frames, manifest, lit_by = 0, None, set[str]()
+    frames, last, lit_by = 0, None, set[str]()
     _check_manifest_files(folder)
     steps = time_steps(folder)
     timings.stage("check", len(steps))
     for done, step in enumerate(steps, start=1):
         if (step / FILE_NAME).is_file():  # else opening it says what is missing
             _check_places(step, read_manifest(step / FILE_NAME), folder, max_pixels)
-        manifest = Capture.open(step).manifest
+        last = Capture.open(step)
+        manifest = last.manifest
         frames += len(manifest.frames)
         lit_by |= {name for frame in manifest.frames for name in LIT_BY if getattr(frame, name) is not None}
         timings.advance(done)
     timings.close()
-    assert manifest is not None, "time_steps gives at least one"
+    assert last is not None, "time_steps gives at least one"
     return {"captures": len(steps), "frames": frames, "resolution": list(manifest.camera.resolution), "color_space": manifest.color_space,
-            "name": manifest.name, "lit_by": sorted(lit_by), **({"steps": len(steps)} if is_sequence(folder) else {})}
+            "name": manifest.name, "lit_by": sorted(lit_by), "calibrated": calibrations_of(last),
+            **({"steps": len(steps)} if is_sequence(folder) else {})}
+
+
+def calibrations_of(capture: Capture) -> list[str]:
+    """Return what a capture was calibrated with: dark, flat, lights (their directions or positions), colours; in this order."""
+    manifest = capture.manifest
+    there = {"dark": manifest.dark is not None, "flat": manifest.flat is not None,
+             "lights": bool(capture.sources()) and not has_placeholders(capture),
+             "colours": any(each.color_matrix is not None for each in (manifest, *manifest.frames))}
+    return [name for name, is_there in there.items() if is_there]
 
 
 def _admit_board(folder: Path, max_pixels: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from typing import Self
 
 import httpx2
 
+from service.client.annotations import Annotations
 from service.client.connection import Connection
 from service.client.errors import (
     Busy,
@@ -48,6 +49,7 @@ class Client:
         self._connection = Connection(server, key, patience_s=patience_s, timeout_s=timeout_s, transport=transport)
         self.captures = Intakes(self._connection, "/v1/captures", "folder", parallel=parallel)
         self.environments = Intakes(self._connection, "/v1/environments", "file", parallel=parallel)
+        self.annotations = Annotations(self._connection)
         self.jobs = Jobs(self._connection, parallel=parallel)
         self.hooks = Hooks(self._connection)
 

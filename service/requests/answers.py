@@ -224,6 +224,8 @@ class WorkerView(View):
     """True if it does a job or helps with one, of whatever project."""
     job: JobView | None
     """The job that it does or helps with; null: it has none, or one of another project."""
+    asked: Literal["drain", "kill"] | None = None
+    """What an operator has asked of it, which it does within seconds; null: nothing."""
 
 
 class DiskView(View):

@@ -156,6 +156,7 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
         "frames": describe_frames(capture, images, thumbnails, report.suspects),
         "findings": findings,
         "warnings": report.warnings,
+        "assumed": capture.manifest.assumed,
         **sections,
         "provenance": metadata(request, capture=capture.name, inputs="" if readings is None else readings.stack.key,
                                contents=contents),

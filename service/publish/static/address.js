@@ -2,6 +2,13 @@
 
 const SOON_MS = 250; // browsers refuse addresses that change faster for long
 
+const pending = new Map(); // what is to be written, by its address
+
+/** Write at once what is to be written soon, as before the address becomes that of something else. */
+export function writeNow() {
+  for (const write of pending.values()) write();
+}
+
 /** Return the names and texts that the address has, in their order. */
 function entries() {
   return [...new URLSearchParams(location.hash.slice(1))];
@@ -9,7 +16,6 @@ function entries() {
 
 export class Address {
   #names;
-  #asked = null;
   #source = {};
 
   /** @param {Object<string, number>} names Of the values, each with the count of its numbers; 0: it is a word. Others in the address stay as they are. */
@@ -33,11 +39,15 @@ export class Address {
   /** Change the address to what an object says, soon. */
   write(source) {
     this.#source = source;
-    this.#asked ??= setTimeout(() => {
-      this.#asked = null;
+    if (pending.has(this)) return;
+    const write = () => {
+      clearTimeout(timer);
+      pending.delete(this);
       const others = entries().filter(([name]) => !(name in this.#names)).map(([name, value]) => `${name}=${encoded(value)}`);
       history.replaceState(null, "", `#${[this.text(this.#source), ...others].filter((part) => part !== "").join("&")}`);
-    }, SOON_MS);
+    };
+    const timer = setTimeout(write, SOON_MS);
+    pending.set(this, write);
   }
 
   /** Return what the address says of an object; what it lacks is left out. */

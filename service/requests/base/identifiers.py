@@ -13,7 +13,7 @@ DEFAULT_SERVER = f"http://127.0.0.1:{DEFAULT_PORT}"
 """The address at which a client looks for the service, where nothing else is given."""
 PROJECT_PATTERN = r"^[a-z0-9][a-z0-9-]{0,62}$"
 
-CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY, HOOK, DELIVERY = "cap", "env", "up", "job", "key", "hook", "msg"
+CAPTURE, ENVIRONMENT, UPLOAD, JOB, KEY, HOOK, DELIVERY, ANNOTATION = "cap", "env", "up", "job", "key", "hook", "msg", "ann"
 
 
 def new_id(prefix: str) -> str:
@@ -30,5 +30,6 @@ CaptureId = Annotated[str, StringConstraints(pattern=pattern(CAPTURE))]
 EnvironmentId = Annotated[str, StringConstraints(pattern=pattern(ENVIRONMENT))]
 UploadId = Annotated[str, StringConstraints(pattern=pattern(UPLOAD))]
 JobId = Annotated[str, StringConstraints(pattern=pattern(JOB))]
+AnnotationId = Annotated[str, StringConstraints(pattern=pattern(ANNOTATION))]
 HookId = Annotated[str, StringConstraints(pattern=pattern(HOOK))]
 Project = Annotated[str, StringConstraints(pattern=PROJECT_PATTERN)]

@@ -36,7 +36,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "IntakeView": {
         "id": "cap_0123456789abcdefghjk", "name": "owl", "state": "ready", "registered": False, "problem": None,
         "facts": {"captures": 1, "frames": 96, "resolution": [320, 320], "color_space": "lin_rec709_scene", "name": "owl",
-                  "lit_by": ["light"]},
+                  "lit_by": ["light"], "calibrated": ["lights"]},
         "view": "job_0123456789abcdefghjm", "created_at": "2026-11-20T08:59:00Z"},
     "ResultView": {
         "name": "frame.0001.exr", "size": 177062, "modified_at": "2026-11-20T09:00:02Z",

@@ -1,4 +1,4 @@
-"""Routes of captures and environments: create for an upload, or register where they lie on the server; check, list, delete."""
+"""Routes of captures and environments: create for an upload, or register where they lie on the server; check, list, annotate, delete."""
 
 import os
 from collections.abc import Callable
@@ -11,17 +11,19 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.requests import states
 from service.requests.answers import IntakePage, IntakeView
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id, pattern
+from service.requests.base.annotations import AnnotationPage, AnnotationView, NewAnnotation, page_of, view_of
+from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId, CaptureId, new_id, pattern
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
+from service.server.api.jobs import StrictJson
 from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
 from service.server.api.views import intake_views
 from service.server.base.safe_names import shown
-from service.server.database import audit, idempotency, intakes, jobs, quotas, uploads
+from service.server.database import annotations, audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
 from service.server.storage import layout
 from stage.files import resolved
@@ -145,6 +147,51 @@ def create_capture(service: ServiceDep, caller: Writer, response: Response, want
     """Create a capture, whose files are then uploaded; or register a folder of the server, which is checked at once."""
     folder = _registered(service, caller, "folder", wanted.folder, os.path.isdir)
     return _create(service, caller, CAPTURE, wanted.name, folder, token, response)
+
+
+@captures.get("/{capture}/annotations", responses=responses(404), summary="List the annotations of a capture", response_model_by_alias=True)
+def list_annotations(service: ServiceDep, caller: Reader, capture: CaptureId) -> AnnotationPage:
+    """Return the annotations of a capture as an AnnotationPage (W3C), which `relit publish --annotations` takes as a file."""
+    row_of(service, caller, capture)
+    return page_of(capture, annotations.listing(service.database, capture))
+
+
+@captures.post("/{capture}/annotations", status_code=201, responses=responses(404, 409), summary="Annotate a capture")
+def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, wanted: Annotated[
+        NewAnnotation, StrictJson(NewAnnotation), Body(openapi_examples={"point": {"value": {
+            "body": {"type": "TextualBody", "value": "A repair"},
+            "target": {"selector": {"type": "PointSelector", "x": 31, "y": 64}}}}})], response: Response) -> AnnotationView:
+    """Keep a text about a point or a rectangle of the image with a capture."""
+    width, height = ((row_of(service, caller, capture)["facts"] or {}).get("resolution") or (float("inf"), float("inf")))[:2]
+    x, y, across, down = wanted.box()
+    if x + across > width or y + down > height:
+        raise ApiError("invalid", f"target: lies outside the image, which has {width}x{height} pixels")
+
+    def work(connection: sa.Connection) -> AnnotationView:
+        row = annotations.insert(connection, capture, wanted.model_dump(mode="json"))
+        if row is None:
+            raise ApiError("conflict", f"{capture} has {annotations.MOST} annotations already: delete one first")
+        audit.record(connection, caller, "annotation.create", row["id"])
+        return view_of(capture, row)
+
+    made = service.database.transact(work)
+    response.headers["Location"] = made.id
+    return made
+
+
+@captures.delete("/{capture}/annotations/{annotation}", status_code=204, responses=responses(404), summary="Delete an annotation")
+def delete_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, annotation: AnnotationId) -> None:
+    """Delete an annotation of a capture."""
+    row_of(service, caller, capture)
+
+    def work(connection: sa.Connection) -> bool:
+        done = annotations.remove(connection, capture, annotation)
+        if done:
+            audit.record(connection, caller, "annotation.delete", annotation)
+        return done
+
+    if not service.database.transact(work):
+        raise ApiError("not-found", f"there is no {annotation} of {capture}")
 
 
 @environments.post("", status_code=201, responses=responses(404, 409, 507), summary="Create an environment")

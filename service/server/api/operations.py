@@ -5,7 +5,8 @@ import threading
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Depends, Query, Request, Response, Security
+import sqlalchemy as sa
+from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
@@ -22,6 +23,11 @@ from service.server.jobs.queue import job_and_attempt
 from stage.errors import StorageError
 
 router = APIRouter(tags=["operations"])
+WORKER = r"^[A-Za-z0-9_.:-]{1,200}$"
+WorkerName = Annotated[str, Path(pattern=WORKER, description="Identifier of the worker.")]
+ENDING = responses(401, 403, 404, 409, 422, 429, 503)
+MOST_OBJECT = 40
+"""Characters of an object of the audit log; the end of a worker's name is what no other has."""
 KEEP_S = 1.0
 """Seconds for which a result is used again, so that frequent requests cost nothing."""
 
@@ -108,6 +114,18 @@ def get_machines(service: ServiceDep, caller: Admin, request: Request) -> Machin
         "disk": DiskView(free=disk.free, total=disk.total, least_free=service.settings.min_free_bytes), "faults": readiness.wrong(service)})
 
 
+@router.post("/v1/machines/{worker}/drain", status_code=202, responses=ENDING, summary="Drain a worker")
+def drain_worker(service: ServiceDep, caller: Admin, worker: WorkerName) -> WorkerView:
+    """Let a worker without a job of another project finish its step, give its job back and end; its supervisor starts another."""
+    return _end_worker(service, caller, worker, workers.DRAIN)
+
+
+@router.post("/v1/machines/{worker}/kill", status_code=202, responses=ENDING, summary="Kill a worker")
+def kill_worker(service: ServiceDep, caller: Admin, worker: WorkerName) -> WorkerView:
+    """Let a worker without a job of another project end at once; another takes its job over, and its supervisor starts another."""
+    return _end_worker(service, caller, worker, workers.KILL)
+
+
 @router.get("/v1/audit", responses=responses(401, 403, 422, 429, 503), summary="Read the audit log, the newest first")
 def get_audit(service: ServiceDep, caller: Admin, limit: Annotated[int, Query(ge=1, le=500)] = 100,
               before: Annotated[int | None, Query(ge=1, le=2**63 - 1, description="`next` of the page before.")] = None) -> AuditPage:
@@ -115,6 +133,22 @@ def get_audit(service: ServiceDep, caller: Admin, limit: Annotated[int, Query(ge
     rows = audit.listing(service.database, project=caller.project, limit=limit + 1, before=before)
     return AuditPage(entries=[AuditEntry.model_validate(dict(row)) for row in rows[:limit]],
                      next=rows[limit - 1]["id"] if len(rows) > limit else None)
+
+
+def _end_worker(service: Service, caller: Caller, worker: str, what: str) -> WorkerView:
+    found = next((each for each in _workers(service, caller) if each.id == worker), None)
+    if found is None:
+        raise ApiError("not-found", f"there is no worker {worker}")
+    if found.busy and found.job is None:
+        raise ApiError("conflict", f"{worker} does a job of another project")
+
+    def work(connection: sa.Connection) -> None:
+        if not workers.ask(connection, worker, what):
+            raise ApiError("not-found", f"there is no worker {worker}")
+        audit.record(connection, caller, f"worker.{what}", worker[-MOST_OBJECT:])
+
+    service.database.transact(work)
+    return found.model_copy(update={"asked": what})
 
 
 def _workers(service: Service, caller: Caller) -> list[WorkerView]:

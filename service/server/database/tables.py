@@ -50,6 +50,13 @@ intakes = sa.Table(  # captures and environments
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Index("relit_intakes_of_project", "project", "kind", "created_at"))
 
+annotations = sa.Table(  # texts about points and rectangles of captures
+    "relit_annotations", metadata, _id(),
+    sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id", ondelete="CASCADE"), nullable=False),
+    sa.Column("content", sa.JSON, nullable=False),  # of service.requests.base.annotations
+    sa.Column("created_at", sa.Float, nullable=False),
+    sa.Index("relit_annotations_of_intake", "intake", "created_at"))
+
 uploads = sa.Table(
     "relit_uploads", metadata, _id(), _project(),
     sa.Column("intake", sa.String(32), sa.ForeignKey("relit_intakes.id"), nullable=False),
@@ -166,7 +173,8 @@ workers = sa.Table(  # for operators: DBOS keeps no list of them, and the locks 
     sa.Column("device", sa.String(100), nullable=False),
     sa.Column("started_at", sa.Float, nullable=False),
     sa.Column("seen_at", sa.Float, nullable=False),
-    sa.Column("state", sa.String(16), nullable=False))
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("asked", sa.String(8)))  # what an operator asks of it: drain or kill; NULL: nothing
 
 clock = sa.Table(  # of the housekeeping, one row: by it a jump of the machine's clock is noticed
     "relit_clock", metadata, sa.Column("id", sa.Integer, primary_key=True),

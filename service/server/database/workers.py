@@ -8,6 +8,8 @@ from service.server.database.engine import Database
 from service.server.database.tables import workers
 
 READY, DRAINING = "ready", "draining"
+DRAIN, KILL = "drain", "kill"
+"""What an operator may ask of a worker, which it does itself when it next looks."""
 SILENT_S = 30.0
 """A worker that was not seen for this long is not counted as present."""
 
@@ -21,6 +23,18 @@ def insert(database: Database, worker: str, *, host: str, pid: int, device: str)
 def record_alive(database: Database, worker: str, state: str = READY) -> None:
     """Record that a worker is alive, and its state."""
     database.execute(workers.update().where(workers.c.id == worker).values(seen_at=time.time(), state=state))
+
+
+def ask(connection: sa.Connection, worker: str, what: str) -> bool:
+    """Ask something of a worker that was seen lately; return False if there is none."""
+    is_there = workers.c.id == worker, workers.c.seen_at > time.time() - SILENT_S
+    return connection.execute(workers.update().where(*is_there).values(asked=what)).rowcount == 1
+
+
+def asked_of(database: Database, worker: str) -> str | None:
+    """Return what an operator asks of a worker."""
+    row = database.row(sa.select(workers.c.asked).where(workers.c.id == worker))
+    return None if row is None else row["asked"]
 
 
 def remove(database: Database, worker: str) -> None:

@@ -37,6 +37,7 @@ def export(request: jobs.ExportJob, files: StepFiles) -> None:
     from service.requests.export import ExportRequest
 
     make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress)
+    files.write_annotations(request.rig or request.maps)
 
 
 def _join(request: jobs.JoinJob, files: StepFiles) -> None:

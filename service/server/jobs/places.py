@@ -6,15 +6,17 @@ from typing import Any, NamedTuple, TypeVar
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.reporting.provenance import name_place
+from service.requests.base.annotations import page_of
 from service.requests.base.base import JobRequest, Options
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT
-from service.server.database import intakes
+from service.server.database import annotations, intakes, jobs
 from service.server.jobs.context import Job, WorkerContext
 from service.server.storage import layout
 from stage import inputs
 from stage.capture.sequence import SEQUENCE_FILE, read_sequence
-from stage.files import resolved
+from stage.files import resolved, write_text
 
+ANNOTATIONS_FILE = "annotations.json"
 R = TypeVar("R", bound=Options)
 NAMES = ("images", "masks", "dark_images")
 """Fields of jobs with names of files in the folder of their capture; the other fields that requests have too hold identifiers."""
@@ -97,6 +99,17 @@ class StepFiles(NamedTuple):
         top = folder if identifier.startswith(CAPTURE) else folder.parent
         context.held.enter_context(inputs.confined(top, root, max_pixels=context.max_pixels))
         return _named(folder, identifier), root
+
+    def write_annotations(self, source: str) -> None:
+        """Write the annotations of a capture, or of that which a job began with, beside the results of this job; none: no file."""
+        database, found = self.context.database, source
+        while not found.startswith(CAPTURE):
+            job = jobs.find(database, found, self.job.project)
+            found = "" if job is None else job["request"].get("capture") or job["request"].get("maps") or ""
+            if not found:
+                return
+        if rows := annotations.listing(database, found):
+            write_text(self.out / ANNOTATIONS_FILE, page_of(found, rows).model_dump_json(by_alias=True, indent=1) + "\n")
 
     def environment_image(self, identifier: str) -> Path:
         """Return the image of an environment."""

@@ -29,15 +29,17 @@ class Takeover:
     """A thread that keeps the worker's own lock and takes over from workers that died."""
 
     def __init__(self, database: Database, queue: JobQueue, lock: WorkerLock, worker: str, *, every_s: float, max_lost: int,
-                 running: Callable[[], frozenset[str]], beat: Callable[[], None], lock_lost: Callable[[], None]) -> None:
+                 running: Callable[[], frozenset[str]], beat: Callable[[], None], lock_lost: Callable[[], None],
+                 asked: Callable[[str], None]) -> None:
         """Create the thread of the worker that holds `lock`; `start` starts it.
 
         Every `every_s` seconds it calls `beat`. `running` returns the workflows that run in this process, `max_lost` is the number of
-        workers that a job may lose without progress, and `lock_lost` is called when another process has this worker's lock for good.
+        workers that a job may lose without progress, and `lock_lost` is called when another process has this worker's lock for good;
+        `asked` is called with what an operator asks of this worker, each round.
         """
         self._database, self._queue, self._lock, self._worker = database, queue, lock, worker
         self._every_s, self._max_lost = every_s, max_lost
-        self._running, self._beat, self._lock_lost = running, beat, lock_lost
+        self._running, self._beat, self._lock_lost, self._asked = running, beat, lock_lost, asked
         self.state = workers.READY
         """State of this worker for the table of workers."""
         self._ended = threading.Event()
@@ -65,6 +67,8 @@ class Takeover:
         if held is LockState.TAKEN:
             self._grace = GRACE_ROUNDS
         workers.record_alive(self._database, self._worker, self.state)
+        if (what := workers.asked_of(self._database, self._worker)) is not None:
+            self._asked(what)
         taken = self._queue.taken_by()
         self._return_forgotten(taken.pop(self._worker, []))
         if self._grace > 0:

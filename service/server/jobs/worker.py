@@ -62,7 +62,7 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
     log.adopt("dbos", without=(dbos_error.DBOSAwaitedWorkflowCancelledError, dbos_error.DBOSNonExistentWorkflowError))
     runner.register()
     takeover = Takeover(database, queue, lock, name, every_s=settings.takeover_s, max_lost=settings.max_lost,
-                        running=lambda: runner.running, beat=heartbeat.beat, lock_lost=_end_without_lock)
+                        running=lambda: runner.running, beat=heartbeat.beat, lock_lost=_end_without_lock, asked=_obey)
     DBOS.launch()
     for waiting in (WORK, CHECKS):
         # a limit for each partition makes the queue one of partitions, which are the projects: DBOS draws the next one by lot
@@ -101,6 +101,12 @@ def _prepared(database: Database, settings: Settings, ending: threading.Event) -
             logger.warning("database does not answer", error=message_of(error))
         if ending.wait(LONGEST_PAUSE_S):
             os._exit(0)
+
+
+def _obey(what: str) -> None:
+    """Do what an operator asks of this worker: end after its step, or at once, as if it had died."""
+    logger.warning("an operator ends this worker", how=what)
+    os.kill(os.getpid(), signal.SIGKILL if what == workers.KILL else signal.SIGTERM)
 
 
 def _end_without_lock() -> None:

@@ -19,9 +19,9 @@ from service.requests.base.options import Option, help_text, is_document, places
 from service.requests.imports.layouts import LAYOUTS, options_of_layout
 from service.requests.jobs import JOBS
 
-TITLES = {"solve": "Solve normals and materials", "pipeline": "Solve, export and relight", "depth": "Decode depth",
-          "scan": "Turn shots of a scanning laser into points",
-          "inspect-board": "Inspect a board", "gauge-board": "Find how well inspections of boards repeat",
+TITLES = {"solve": "Solve normals and materials", "pipeline": "Make an asset", "depth": "Measure depth",
+          "scan": "Turn shots into points",
+          "inspect-board": "Inspect the board", "gauge-board": "Find how well inspections of boards repeat",
           "drive": "Drive the lamps of a rig",
           "relight": "Relight frames", "basis": "Reduce to a few coefficient images",
           "separate": "Separate direct and global light",
@@ -60,13 +60,16 @@ BEGIN_WITH: dict[str, tuple[str, ...]] = {
     "fuse": ("scan-set.json",)}
 """What there must be one of for a job to begin with something, by kind: in a capture what lit its frames (`lit_by` of its facts), the shots
 of a scan or the tiles of a board; in the results of another job a file."""
-NEXT_STEPS: dict[str, tuple[tuple[str, str], ...]] = {
-    "light": (("pipeline", "Make an asset"), ("solve", "Solve normals and materials")),
-    "pattern": (("depth", "Measure depth"), ("separate", "Separate direct and global light")),
-    "laser": (("depth", "Measure depth"),), "tof": (("depth", "Measure depth"),), "stereo": (("depth", "Measure depth"),),
-    "shots": (("scan", "Turn shots into points"),), "tiles": (("inspect-board", "Inspect the board"),)}
-"""What a capture is made for, by what it holds: jobs that need nothing but the capture, and the words of their buttons. A capture that
-can be relit is lit first."""
+NEXT_STEPS: dict[str, tuple[str, ...]] = {
+    "light": ("pipeline", "solve"), "pattern": ("depth", "separate"), "laser": ("depth",), "tof": ("depth",), "stereo": ("depth",),
+    "shots": ("scan",), "tiles": ("inspect-board",)}
+"""What a capture is made for, by what it holds: jobs that need nothing but the capture. A capture that can be relit is lit first."""
+UNITS = {"px": "pixels", "m": "metres", "s": "seconds", "hz": "Hz", "deg": "degrees", "degrees": "degrees", "c": "°C"}
+"""Units in words, by what ends the name of a field in them."""
+WORDS = {"focal_px": "Focal length (pixels)", "principal_px": "Principal point (pixels)",
+         "surface_z_m": "Distance of the surface, z (metres)",
+         "ball_z_m": "Distance of the ball, z (metres)", "must_find_m": "Defects that must be found (metres)"}
+"""Labels of fields whose names are too short for people."""
 IDENTIFIERS = {pattern(CAPTURE): "capture", pattern(ENVIRONMENT): "environment", pattern(JOB): "job"}
 """The kind of thing that the identifiers of a pattern name."""
 
@@ -133,10 +136,17 @@ def _field(model: type[BaseModel], paths: tuple[str, ...], option: Option) -> Fi
     default = option.field.default
     shown = "" if option.field.is_required() or default in (None, ()) or isinstance(default, bool) else typed(default)
     limits = {kind: f"{value:g}" for limit in option.constraints for kind, value in _limits(limit)}
-    label = paths[0].rpartition(".")[2].replace("_", " ").capitalize()
+    label = _label(paths[0].rpartition(".")[2])
     return Field(option.name, paths, label, help_text(option, model), control, value_type, option.flag, option.off,
                  option.spelling.argument, choices, "true" if default is True else shown, option.field.is_required(),
                  limits.get("low", ""), limits.get("high", ""))
+
+
+def _label(name: str) -> str:
+    """Return what people call a field: its unit in brackets."""
+    *stem, last = name.split("_")
+    words = [*stem, f"({UNITS[last]})"] if stem and last in UNITS else [*stem, last]
+    return WORDS.get(name) or " ".join([words[0].capitalize(), *words[1:]])
 
 
 def _control(option: Option) -> tuple[str, str, tuple[tuple[str, str], ...]]:

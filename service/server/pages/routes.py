@@ -46,7 +46,7 @@ set_router = APIRouter(include_in_schema=False)
 JobKind = Annotated[str, PathParameter(pattern=f"^({'|'.join(TITLES)})$")]
 templates = Environment(loader=FileSystemLoader(HOME / "templates"), autoescape=select_autoescape(), undefined=StrictUndefined,
                         trim_blocks=True, lstrip_blocks=True)
-templates.globals.update(version=__version__, static=STATIC, import_map=IMPORT_MAP, navigation=NAVIGATION)
+templates.globals.update(version=__version__, static=STATIC, titles=TITLES, import_map=IMPORT_MAP, navigation=NAVIGATION)
 templates.globals.update({name: getattr(templates.get_template("parts.html").module, name) for name in ("icon", "skeleton")})
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from service.captures.admit import admit_capture, admit_environment, environment_file, recheck_capture
+from stage.capture.light import PLACEHOLDER
+from stage.capture.manifest import read_manifest
 from stage.errors import ImageError, ManifestError
 from tests.scenes.captures import edit_manifest, make_scene, write_capture, write_exr, write_image, write_manifest
 from tests.service.recording import Recording
@@ -21,9 +23,21 @@ def test_a_capture_is_described_without_its_pixels(tmp_path):
     write_capture(tmp_path, SCENE)
     recording = Recording()
     assert admit_capture(tmp_path, max_pixels=PIXELS, progress=recording) == {
-        "captures": 1, "frames": 4, "resolution": [16, 16], "color_space": "lin_rec709_scene", "name": "cap", "lit_by": ["light"]}
+        "captures": 1, "frames": 4, "resolution": [16, 16], "color_space": "lin_rec709_scene", "name": "cap", "lit_by": ["light"],
+        "calibrated": ["lights"]}
     assert recording.stages == [("check", 1, [1])]
     recheck_capture(tmp_path, max_pixels=PIXELS)
+
+
+def test_the_calibrations_of_a_capture_are_told(tmp_path):
+    folder = write_capture(tmp_path, SCENE)
+    frames = read_manifest(folder / "capture.json").model_dump(mode="json", by_alias=True, exclude_none=True)["frames"]
+    matrix = [[1.1, 0, 0], [0, 1, 0], [0, 0, 0.9]]
+    edit_manifest(folder, dark=frames[0]["image"], color_matrix=matrix)
+    assert admit_capture(tmp_path, max_pixels=PIXELS)["calibrated"] == ["dark", "lights", "colours"]
+    placeholder = PLACEHOLDER.model_dump(mode="json", exclude_none=True)
+    edit_manifest(folder, frames=[frame | {"light": placeholder} for frame in frames])
+    assert admit_capture(tmp_path, max_pixels=PIXELS)["calibrated"] == ["dark", "colours"]
 
 
 def test_a_sequence_is_counted_and_a_manifest_that_is_wrong_is_named(tmp_path):

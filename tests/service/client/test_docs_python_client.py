@@ -52,6 +52,6 @@ def test_every_command_and_option_that_is_named_exists_and_every_method_is_named
         for word in words:
             assert not word.startswith("--") or word in out, (group, command, word)
     with Client() as client:
-        for part in (client.captures, client.jobs):
+        for part in (client.captures, client.annotations, client.jobs):
             for name in dir(part):
                 assert name.startswith("_") or f"`{name}`" in TEXT, name

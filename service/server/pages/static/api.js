@@ -223,4 +223,8 @@ function askForKey(fault = "") {
 byId("key").addEventListener("click", async () => {
   if (await askForKey()) location.reload();
 });
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // the address says what is shown, and keeps it
+  byId("main").focus();
+});
 byId("stuck").remove(); // all modules of the page are here

@@ -30,6 +30,16 @@ export function show(target, visible) {
   target.hidden = !visible;
 }
 
+/** Return what shows the number of a slider: it follows the hand, and the event `set` where the page has moved the slider. */
+export function numberOf(slider) {
+  const number = element("output", { class: "number" });
+  const digits = (slider.step.split(".")[1] ?? "").length;
+  const present = () => { number.textContent = Number(slider.value).toFixed(digits).replace("-", "−"); };
+  for (const name of ["input", "set"]) slider.addEventListener(name, present);
+  present();
+  return number;
+}
+
 /** Return a number of bytes as a person reads it. */
 export function bytes(count) {
   const units = ["bytes", "kB", "MB", "GB", "TB"];
@@ -64,6 +74,11 @@ export function time(iso) {
 export function words(name) {
   const text = name.replaceAll("_", " ");
   return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** Return what a kind of job is called, as its form is. */
+export function kindTitle(kind) {
+  return JSON.parse(document.body.dataset.titles)[kind] ?? words(kind);
 }
 
 /** Return a fact's value as text: lists with commas, several dimensions with ×. */

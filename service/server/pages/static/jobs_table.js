@@ -1,10 +1,10 @@
 /** Rows of jobs in a table, which follow the events of the server. */
 
-import { duration, element, time } from "./element.js";
+import { duration, element, kindTitle, time } from "./element.js";
 
 /** Return what a job is called. */
 export function titleOf(job) {
-  return job.request.name || job.request.kind;
+  return job.request.name || kindTitle(job.request.kind);
 }
 
 /** Return how far a job is, in words. */

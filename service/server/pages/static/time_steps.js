@@ -6,12 +6,13 @@ import { byId, element, show } from "./element.js";
 /**
  * Return the number of the time step that is shown, from 1, and let the person choose another; null: the capture is no sequence.
  * @param {string} capture Identifier.
- * @param {string[]} names Of the steps, where they are known.
+ * @param {function(): Promise<string[]>} namesOf Gives the names of the steps, where they are known; asked for a sequence alone.
  */
-export async function chosenStep(capture, names = []) {
+export async function chosenStep(capture, namesOf = async () => []) {
   const { facts } = await read(`/v1/captures/${capture}`);
   const count = facts?.steps ?? (facts?.captures > 1 ? facts.captures : 0);
   if (count === 0) return null;
+  const names = await namesOf();
   const asked = Number(new URLSearchParams(location.search).get("step") ?? 1);
   const step = Number.isInteger(asked) && asked >= 1 && asked <= count ? asked : 1;
   const go = (to) => location.assign(`?step=${to}${location.hash}`);

@@ -1,7 +1,7 @@
 /** Views, which jobs of the kind `view` prepare: of a capture, or of the maps that a job has made. */
 
 import { listing, read, resultsOf, submitJob } from "./api.js";
-import { byId, show } from "./element.js";
+import { element } from "./element.js";
 import { watch } from "./events.js";
 
 /**
@@ -27,37 +27,50 @@ export async function captureOf(job) {
 }
 
 /**
- * Return the files of a view, which is prepared first if it is not yet; the page shows how far that is.
+ * Return the files of a view, which is prepared first if it is not yet; a place of the page shows how far that is.
  * @param {string} capture Identifier.
  * @param {string|null} maps Identifier of the job that made the maps; null: the capture alone.
  * @param {number|null} step The time step that is shown, where the capture is a sequence.
+ * @param {HTMLElement} place Where the view will be shown.
+ * @param {object} [more] Of the request.
  * @returns {Promise<{job: any, files: ReturnType<typeof resultsOf>}>}
  */
-export async function openView(capture, maps, step = null) {
-  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }) };
+export async function openView(capture, maps, step, place, more = {}) {
+  const body = { kind: "view", capture, ...(maps === null ? {} : { maps }), ...(step === null ? {} : { step }), ...more };
   let job = (await findView({ capture, maps, step })) ?? (await submitJob(body));
-  if (job.state !== "succeeded") {
-    byId("state").textContent = "This is looked at for the first time: its view is being prepared.";
-    show(byId("progress"), true);
-    await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now); } });
-    job = await read(`/v1/jobs/${job.id}`);
-    show(byId("progress"), false);
-    if (job.state !== "succeeded") {
-      throw new Error(`the view was not prepared: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
-    }
-    byId("state").textContent = "";
-  }
+  job = await followed(job, place, "This is looked at for the first time: its view is being prepared.", "the view was not prepared");
   return { job, files: resultsOf(job.id) };
 }
 
-function progress(job) {
-  const bar = byId("bar");
+/**
+ * Return a job when it has succeeded; a place of the page shows how far it is until then.
+ * @param {string} doing A sentence that says what is done. @param {string} fault What is said where it fails, before the reason.
+ */
+export async function followed(job, place, doing, fault) {
+  if (job.state !== "succeeded") {
+    const [bar, stage] = [element("progress", { "aria-label": "Progress of the preparation" }), element("span")];
+    const told = element("div", { class: "preparing" }, element("p", { role: "status" }, doing), bar, " ", stage);
+    place.prepend(told);
+    try {
+      await watch(`/v1/jobs/${job.id}/events`, { job: (now) => { job = now; progress(now, bar, stage); } });
+      job = await read(`/v1/jobs/${job.id}`);
+    } finally {
+      told.remove();
+    }
+    if (job.state !== "succeeded") {
+      throw new Error(`${fault}: ${job.error ?? `its job ${job.id} is ${job.state}`}`);
+    }
+  }
+  return job;
+}
+
+function progress(job, bar, stage) {
   if (job.progress === null) {
     bar.removeAttribute("value");
-    byId("stage").textContent = job.state;
+    stage.textContent = job.state;
     return;
   }
   bar.max = Math.max(job.progress.total, 1);
   bar.value = job.progress.done;
-  byId("stage").textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}`;
+  stage.textContent = `${job.progress.stage} ${job.progress.done} of ${job.progress.total}`;
 }

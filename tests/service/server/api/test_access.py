@@ -9,9 +9,9 @@ from typing import NamedTuple
 import httpx2
 import pytest
 
-from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, HOOK, JOB, UPLOAD, new_id
+from service.requests.base.identifiers import ANNOTATION, CAPTURE, ENVIRONMENT, HOOK, JOB, UPLOAD, new_id
 from service.requests.keys import NewKey, Scope
-from service.server.database import keys, tables
+from service.server.database import keys, tables, workers
 from service.server.database.engine import Database
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import accepted
@@ -51,8 +51,10 @@ def site(keyed, keyed_database):
     (results / "maps.exr").write_bytes(b"maps")
     with made.client("larch") as client:
         hook = client.post("/v1/hooks", json={"url": f"https://chat.example/{SECRET_NAME}"}).raise_for_status().json()["id"]
+        note = client.post(f"/v1/captures/{capture}/annotations", json={"body": {"type": "TextualBody", "value": SECRET_NAME}, "target": {
+            "selector": {"type": "PointSelector", "x": 1, "y": 1}}}).raise_for_status().json()["id"]
     made.ours.update(capture=capture, environment=sky, upload=files.headers["Location"].rpartition("/")[2], job=job, name="maps.exr",
-                     hook=hook)
+                     hook=hook, annotation=note.rpartition("/")[2], worker="nobody-cpu-1")
     return made
 
 
@@ -81,7 +83,7 @@ def ask(client: httpx2.Client, method: str, path: str, names: dict[str, str]) ->
 
 def of_admins(path: str) -> bool:
     """The URL of a hook is seen by those who may set it: whoever knows that of a chat can write there."""
-    return path in ("/metrics", "/v1/machines", "/v1/audit") or path.startswith("/v1/hooks")
+    return path in ("/metrics", "/v1/audit") or path.startswith(("/v1/machines", "/v1/hooks"))
 
 
 def problem(response: httpx2.Response) -> dict:
@@ -146,6 +148,12 @@ def test_machines_and_the_audit_log_are_for_admins_and_show_nothing_of_other_pro
                                                              state="ready"))
         worker, = admin.get("/v1/machines").json()["workers"]
         assert (worker["device"], worker["state"], worker["busy"], worker["job"]) == ("cpu", "ready", False, None)
+        assert writer.post("/v1/machines/worker/kill").status_code == 403
+        assert admin.post("/v1/machines/worker/restart").status_code == 422 and admin.post("/v1/machines/nobody/kill").status_code == 404
+        assert worker["asked"] is None and workers.asked_of(site.database, "worker") is None
+        assert admin.post("/v1/machines/worker/drain").json()["asked"] == "drain" == workers.asked_of(site.database, "worker")
+        last = admin.get("/v1/audit", params={"limit": 1}).json()["entries"][0]
+        assert (last["action"], last["object"]) == ("worker.drain", "worker")
         site.database.execute(tables.workers.delete())
         page = admin.get("/v1/audit", params={"limit": 2}).raise_for_status().json()
         assert len(page["entries"]) == 2 and page["next"] == page["entries"][1]["id"]
@@ -202,7 +210,7 @@ def test_a_key_that_writes_registers_no_folders_and_reads_no_numbers(site):
 def test_a_project_finds_nothing_of_another(site):
     """By any identifier on any route: as if it did not exist, to the word."""
     absent = {"capture": new_id(CAPTURE), "environment": new_id(ENVIRONMENT), "upload": new_id(UPLOAD), "job": new_id(JOB),
-              "name": "maps.exr", "hook": new_id(HOOK)}
+              "name": "maps.exr", "hook": new_id(HOOK), "annotation": new_id(ANNOTATION), "worker": "nothing-cpu-2"}
     walked = 0
     with site.client("willow") as client:
         for method, path in operations(site):

@@ -36,7 +36,7 @@ def test_a_registered_capture_is_checked_at_once_and_stays_where_it_lies(server,
     folder = write_capture(registered / "kept")
     ready = admitted(server, client, folder)
     assert ready["facts"] == {"captures": 1, "frames": 4, "resolution": [8, 8], "color_space": "lin_rec709_scene", "name": "small",
-                              "lit_by": ["light"]}
+                              "lit_by": ["light"], "calibrated": ["lights"]}
     assert client.post(f"/v1/captures/{ready['id']}/validate").status_code == 409
     assert client.delete(f"/v1/captures/{ready['id']}").status_code == 204
     assert (folder / "capture.json").is_file()

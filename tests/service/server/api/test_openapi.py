@@ -23,6 +23,7 @@ from service.requests.hooks import NewHook
 from service.requests.jobs import UserJob
 from service.server.api.intakes import NewCapture, NewEnvironment
 from service.server.api.jobs import EXAMPLES, Priority
+from service.server.api.operations import WORKER
 from service.server.api.problems import KINDS
 from service.server.base.settings import Settings
 from tests.service.server.api.asgi import app_of
@@ -73,7 +74,8 @@ def test_every_operation_is_described_and_its_parameters_say_what_they_may_be(op
         assert all(response["description"] for response in operation["responses"].values()), name
         assert (operation.get("security", []) != []) == (name not in FREE), name
     patterns = {kind: pattern(prefix) for kind, prefix in
-                {"capture": "cap", "environment": "env", "job": "job", "upload": "up", "hook": "hook"}.items()}
+                {"capture": "cap", "environment": "env", "job": "job", "upload": "up", "hook": "hook", "annotation": "ann"}.items()}
+    patterns["worker"] = WORKER
     for name, operation in operations.items():
         for parameter in operation.get("parameters", []):
             if parameter["in"] == "path" and parameter["name"] != "name":

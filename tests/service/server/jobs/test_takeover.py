@@ -6,7 +6,7 @@ import pytest
 import sqlalchemy as sa
 
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, new_id
-from service.server.database import jobs
+from service.server.database import jobs, workers
 from service.server.database.jobs import Claim, StageProgress
 from service.server.jobs.progress import JobProgress
 from service.server.jobs.queue import workflow_id
@@ -31,11 +31,11 @@ def takeover(idle_harness):
     """Make the takeover of a worker of this name, whose lock is held to the end of the test."""
     locks = []
 
-    def make(name, *, running=frozenset(), lock_lost=lambda: None):
+    def make(name, *, running=frozenset(), lock_lost=lambda: None, asked=lambda what: None):
         locks.append(open_worker_lock(idle_harness.database, idle_harness.settings.locks, name))
         assert locks[-1].hold() is LockState.TAKEN
         return locks[-1], Takeover(idle_harness.database, idle_harness.queue, locks[-1], name, every_s=1, max_lost=MAX_LOST,
-                                   running=lambda: frozenset(running), beat=lambda: None, lock_lost=lock_lost)
+                                   running=lambda: frozenset(running), beat=lambda: None, lock_lost=lock_lost, asked=asked)
 
     yield make
     for lock in locks:
@@ -246,3 +246,14 @@ def test_a_worker_whose_lock_is_another_s_for_good_ends(idle_harness, takeover, 
     one.round()
     assert ends == ["one"]
     other.close()
+
+
+def test_a_worker_hears_what_an_operator_asks_of_it(idle_harness, takeover):
+    asked = []
+    _, one = takeover("one", asked=asked.append)
+    workers.insert(idle_harness.database, "one", host="here", pid=1, device="cpu")
+    one.round()
+    assert idle_harness.database.transact(lambda connection: workers.ask(connection, "one", workers.DRAIN))
+    assert not idle_harness.database.transact(lambda connection: workers.ask(connection, "two", workers.DRAIN))
+    one.round()
+    assert asked == [workers.DRAIN]

@@ -8,15 +8,12 @@ from benchmarks.clients import installed
 
 REQUIRED = os.environ.get("RELIT_TEST_CLIENTS") == "required"
 
-SERIOUS = ("serious", "critical")
-
-
 COLOURS = {"runOnly": ["cat.color"]}
 """Rules that look at colours, which are all that the dark scheme of base.css changes."""
 
 
 def violations(page, options: dict | None = None) -> list[str]:
-    """What axe-core finds wrong with a page, of the impacts that count here: the rule, what it asks for, and where."""
+    """What axe-core finds wrong with a page: the rule, what it asks for, and where."""
     try:
         script = installed.node_modules() / "axe-core" / "axe.min.js"
     except installed.MissingClientError as error:
@@ -24,7 +21,7 @@ def violations(page, options: dict | None = None) -> list[str]:
     if page.evaluate("() => globalThis.axe === undefined"):
         page.add_script_tag(path=script)
     found = page.evaluate("(options) => axe.run(options)", options or {})["violations"]
-    return [f"{each['id']}: {each['help']}: {node['html']}" for each in found if each["impact"] in SERIOUS for node in each["nodes"]]
+    return [f"{each['id']}: {each['help']}: {node['html']}" for each in found for node in each["nodes"]]
 
 
 def violations_in_both_schemes(page) -> list[str]:

@@ -145,6 +145,64 @@ def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
             assert np.sign(frames[index]["direction"][axis]) * shift_of_light(asset)[axis] > SHIFT
 
 
+def test_the_chosen_light_casts_shadows(asset):
+    """What is cast makes the picture darker, and nothing brighter than rounding does."""
+    pictures = {}
+    for light in asset.locator("select").first.locator("option").evaluate_all("all => all.slice(2).map((each) => each.value)"):
+        asset.get_by_label("Lit by").select_option(light)
+        for shadows in (True, False):
+            asset.get_by_label("Shadows").set_checked(shadows)
+            pictures[shadows] = shown(asset)[..., :3].astype(int)
+        assert (pictures[True] <= pictures[False] + 1).all()
+        if (pictures[False] - pictures[True] > 40).any(axis=2).sum() > 50:
+            break
+    else:
+        pytest.fail("no light of the rig casts a shadow on the ball with its hollows")
+    asset.get_by_label("Shadows").check()
+
+
+def test_the_surface_is_drawn_as_clay_as_wires_and_by_its_normals(asset):
+    first, seen = shown(asset), []
+    for way in ("clay", "wires", "normals", "asset"):
+        asset.get_by_label("Surface").select_option(way)
+        seen.append(shown(asset))
+    clay, wires, normals, again = seen
+    assert np.array_equal(first, again) and not any(np.array_equal(first, each) for each in seen[:3])
+    inside = clay[..., 3] == 255
+    hues = [np.ptp(picture[..., :3][inside].astype(float), axis=1).mean() for picture in (normals, clay)]
+    assert hues[0] > 2 * hues[1]  # three colours for three axes, one colour for clay
+    assert (wires[..., 3][inside] < 255).any()  # it is seen through
+
+
+def test_a_distance_is_measured_between_two_points_of_the_object(asset):
+    assert asset.evaluate("""async () => {
+      const { Mesh, MeshBasicMaterial, OrthographicCamera, PlaneGeometry, Vector3 } = await import("three");
+      const { Distance, lengthText } = await import("/static/scene/distance.js");
+      const camera = new OrthographicCamera(-1, 1, 1, -1, 0.1, 10);
+      camera.position.z = 5;
+      camera.updateMatrixWorld();
+      const plane = new Mesh(new PlaneGeometry(1.6, 1.6), new MeshBasicMaterial());
+      const distance = new Distance(plane, "red");
+      const at = (x, y) => distance.take(new Vector3(x, y, 0), camera);
+      const found = [at(-0.3, 0), distance.value, at(0.9, 0), at(0, 0.4), +distance.value.toFixed(9), at(0.1, 0), distance.value];
+      return [found, [2.5, 0.0321, 0.00321, 4.2e-6].map(lengthText)];
+    }""") == [[1, None, None, 2, 0.5, 1, None], ["2.500 m", "3.210 cm", "3.210 mm", "4.200 \u00b5m"]]
+    asset.get_by_role("button", name="Measure a distance").click()
+    asset.locator("canvas.scene").focus()
+    asset.keyboard.press("Enter")
+    asset.get_by_text("Choose the other point.").wait_for()
+    asset.keyboard.press("Enter")
+    assert asset.evaluate("() => globalThis.asset.state().distance") == 0  # the same point twice
+    asset.get_by_role("button", name="Measure a distance").click()
+
+
+def test_a_light_behind_the_object_is_not_chosen_through_it(asset):
+    asset.get_by_label("Lights of the rig").check()
+    asset.locator("canvas.scene").focus()
+    asset.keyboard.press("Enter")  # the middle of the object
+    assert asset.evaluate("() => globalThis.asset.state().lit") == "room"
+
+
 def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor_comes_back(asset):
     first = shown(asset)
     asset.locator("canvas.scene").focus()
@@ -203,7 +261,7 @@ def test_textures_that_are_not_in_the_file_are_named(page, exported, solved, tmp
     assert asked == []
 
 
-def test_no_serious_violation(asset):
+def test_no_violation(asset):
     asset.set_viewport_size({"width": 390, "height": 844})
     asset.wait_for_function("document.documentElement.scrollWidth <= 390")
     assert violations_in_both_schemes(asset) == []

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.conftest import CONTENT_MS, SAMPLES
 
 pytestmark = pytest.mark.long
 
@@ -110,3 +110,36 @@ def test_a_folder_without_images_is_refused_and_its_name_is_text(page, tmp_path)
     page.goto("/captures")
     page.set_input_files("#folder", folder)
     page.get_by_text("<img src=x onerror=alert(1)>: no capture can be made of these 1 files").wait_for()
+
+
+def test_what_a_capture_lacks_leads_to_the_form_that_measures_it(page, solved):
+    page.goto(solved.pages["capture"])
+    solved.wait_for_content(page, "capture")
+    page.locator("[data-calibration=dark]").wait_for()
+    found = {each.get_attribute("data-calibration"): each.get_attribute("class") for each in page.locator("[data-calibration]").all()}
+    assert found == {"dark": "missing", "flat": "missing", "lights": "there", "colours": "missing"}
+    assert page.locator("[data-calibration=lights] button").count() == 0
+    page.locator("[data-calibration=dark]").get_by_role("button", name="Calibrate the dark frame").click()
+    form = page.locator("form[data-kind=calibrate-dark]")
+    form.get_by_role("button", name="Submit").wait_for()
+    assert form.evaluate("(each) => each.contains(document.activeElement)")
+
+
+def test_a_preview_shows_the_middle_quarter_and_is_no_result_of_the_object(page, solved):
+    page.goto(solved.pages["capture"])
+    solved.wait_for_content(page, "capture")
+    page.get_by_role("button", name="Preview the middle").click()
+    page.locator("#previewed canvas.map").wait_for(timeout=CONTENT_MS)
+    with solved.server.client() as client:
+        jobs = client.get("/v1/jobs?limit=500").json()["jobs"]
+        preview = next(job for job in jobs if job["request"]["name"] == "Preview of the middle")
+        view = next(job for job in jobs if job["request"].get("maps") == preview["id"])
+        info = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
+        width, height = client.get(f"/v1/captures/{solved.capture}").json()["facts"]["resolution"]
+    assert (info["cols"], info["rows"]) == (width // 2, height // 2)
+    assert preview["request"]["options"]["crop"][:2] == [width // 4, height // 4]
+    page.goto(f"{solved.pages['object']}#mode=maps")
+    page.locator("canvas.map").wait_for()
+    assert "Preview of the middle" not in page.locator("main").inner_text()
+    page.locator("#files a", has_text="maps.exr").wait_for()
+    assert page.locator("#modes button", has_text="Maps").count() == 1

@@ -71,7 +71,7 @@ def test_a_job_of_another_kind_is_said(page, solved):
     page.locator("#state", has_text="This job drives no rig.").wait_for()
 
 
-def test_the_page_fits_and_has_no_serious_violation(browser, server, driven):
+def test_the_page_fits_and_has_no_violation(browser, server, driven):
     page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
     page.goto(f"/drive/{driven}")
     page.locator("#dome circle[fill]").first.wait_for()

@@ -7,8 +7,9 @@ import pytest
 from service.requests.base.base import Role
 from service.requests.base.options import build, options_of
 from service.requests.calibration_jobs import ProcamJob
+from service.requests.imports.layouts import LAYOUTS
 from service.requests.jobs import ANY_JOB, RelightJob, SolveJob
-from service.server.pages.forms import BEGIN_WITH, CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, Form, form_of
+from service.server.pages.forms import BEGIN_WITH, CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, UNITS, Form, form_of, import_fields
 from stage.capture.manifest import LIT_BY
 
 KINDS = CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS
@@ -97,10 +98,18 @@ def test_what_each_job_begins_with_is_declared():
     assert {each for kind in CAPTURE_JOBS for each in BEGIN_WITH[kind]} == {*LIT_BY, "shots", "tiles"} == set(NEXT_STEPS)
 
 
-@pytest.mark.parametrize(("holds", "kind"), [(holds, kind) for holds, steps in NEXT_STEPS.items() for kind, _ in steps])
+@pytest.mark.parametrize(("holds", "kind"), [(holds, kind) for holds, steps in NEXT_STEPS.items() for kind in steps])
 def test_a_next_step_needs_nothing_but_the_capture(holds, kind):
     assert holds in BEGIN_WITH[kind]
     assert ANY_JOB.validate_python({"kind": kind, "capture": CAPTURE}).kind == kind
+
+
+def test_labels_are_words_with_their_units_in_brackets():
+    forms = [form_of(kind, model) for kind, model in (CAPTURE_JOBS | MAPS_JOBS | FREE_JOBS).items()]
+    labels = [field.label for form in forms for field in (*form.main, *form.more)]
+    labels += [field.label for layout in LAYOUTS for field in import_fields(layout)]
+    assert not [label for label in labels if label.rpartition(" ")[2] in (*UNITS, "mm", "rad")]
+    assert {"Focal length (pixels)", "Pixel size (metres)", "Spin (degrees)", "Frequencies (Hz)"} <= set(labels)
 
 
 def test_limits_and_defaults_are_those_of_the_model():

@@ -155,7 +155,7 @@ def test_the_wall_shows_pictures_whose_light_follows_the_pointer(page, solved, s
 
 @pytest.mark.long
 @pytest.mark.parametrize("width", [1280, 640, 390])  # 640: as at 200 %
-def test_the_wall_fits_and_has_no_serious_violation(browser, server, solved, sky, width):
+def test_the_wall_fits_and_has_no_violation(browser, server, solved, sky, width):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": width, "height": 844}).new_page()
     page.goto("/")
     await_picture(page, solved.capture)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from service.client import Client
-from service.server.pages.forms import BEGIN_WITH, NEXT_STEPS
+from service.server.pages.forms import BEGIN_WITH, NEXT_STEPS, TITLES
 from tests.scenes.captures import write_exr
 from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.conftest import SAMPLES, new_context
@@ -58,11 +58,11 @@ def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot
     page.goto(f"/captures/{patterns}")
     page.get_by_role("heading", name="<b>stripes", level=1).wait_for()
     assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "pattern" in what}
-    assert page.locator("#next > button[data-kind]:visible").all_inner_texts() == [words for _, words in NEXT_STEPS["pattern"]]
+    assert page.locator("#next > button[data-kind]:visible").all_inner_texts() == [TITLES[kind] for kind in NEXT_STEPS["pattern"]]
     page.goto(f"/captures/{capture}")
     page.get_by_role("link", name="Light it").wait_for()
     assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "light" in what}
-    page.get_by_role("button", name=dict(NEXT_STEPS["light"])["pipeline"]).click()
+    page.get_by_role("button", name=TITLES["pipeline"]).click()
     page.wait_for_url("**/jobs/job_*")
     page.locator("#request dd", has_text=capture).wait_for()
     page.locator("#usual-part > summary").click()

@@ -43,6 +43,26 @@ def test_the_page_of_machines_shows_the_sample(browser, server, solved, tmp_path
     page.close()
 
 
+def test_a_worker_is_drained_and_killed_and_another_takes_its_place(browser, tmp_path):
+    with serving(tmp_path, "--anonymous", "--device", "cpu", takeover_s="0.2") as server:
+        page = new_context(browser, base_url=server.url).new_page()
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.goto("/machines")
+        for what in ("Drain", "Kill"):
+            button = page.get_by_role("button", name=f"{what} cpu, process")
+            button.first.wait_for()
+            before = button.first.get_attribute("aria-label")
+            button.first.click()
+            page.wait_for_function("([what, before]) => [...document.querySelectorAll('#workers button')].some((each) => !each.disabled"
+                                   " && each.textContent === what && each.getAttribute('aria-label') !== before)", arg=[what, before])
+            page.wait_for_function("(before) => [...document.querySelectorAll('#workers button')]"
+                                   ".every((each) => each.getAttribute('aria-label') !== before)", arg=before)
+        page.reload()
+        page.locator("#audit tbody tr").nth(1).wait_for()
+        assert page.locator("#audit tbody td:nth-child(3)").all_inner_texts() == ["Worker: kill", "Worker: drain"]
+        page.close()
+
+
 def test_the_audit_log_is_paged_and_names_stay_text(browser, locked):
     with locked.client(locked.key("birds")) as client:
         for number in range(60):

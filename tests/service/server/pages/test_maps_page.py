@@ -53,6 +53,51 @@ def test_the_value_under_the_cursor_is_that_of_the_file(opened, maps, layer, tit
         assert "status: " in said
 
 
+@pytest.mark.parametrize(("by", "title", "sign"), [("confidence", "Confidence", -1), ("sigma", "Standard error of the normal", 1)])
+def test_what_is_less_sure_is_greyed_out(opened, maps, by, title, sign):
+    """Grey is 128 in each channel; the veil covers at most 235 of 255."""
+    doubt = np.where(maps.mask > 0, sign * np.asarray(getattr(maps, by), dtype=float), np.nan)
+    surest, least = (np.unravel_index(find(doubt), doubt.shape) for find in (np.nanargmin, np.nanargmax))
+
+    def colour(at) -> np.ndarray:
+        return np.array(opened.locator("canvas.map").evaluate("""(canvas, [row, col, side]) => {
+          const scale = Math.min(canvas.width, canvas.height) / side;
+          const [x, y] = [canvas.width / 2 + (col + 0.5 - side / 2) * scale, canvas.height / 2 + (row + 0.5 - side / 2) * scale];
+          return [...canvas.getContext("2d").getImageData(x, y, 1, 1).data.slice(0, 3)];
+        }""", [int(at[0]), int(at[1]), len(maps.mask)]), dtype=float)
+
+    opened.get_by_label("Layer", exact=True).first.select_option("normal")
+    opened.get_by_label("Hatch unsure pixels").uncheck()
+    opened.get_by_label("Rows and columns").uncheck()
+    opened.wait_for_function("""() => { const canvas = document.querySelector('canvas.map');
+      return canvas.getContext('2d').getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data[3] === 255; }""")
+    before = [colour(at) for at in (surest, least)]
+    opened.get_by_label("Grey out by").select_option(by)
+    opened.wait_for_function("(title) => document.querySelector(`canvas[aria-label^='Histogram of ${title}']`) !== null", arg=title)
+    wanted = 128 + (before[1] - 128) * (1 - 235 / 255)
+    for _ in range(200):  # the tiles of the veil come one by one
+        if np.allclose(colour(least), wanted, atol=2):
+            break
+        opened.wait_for_timeout(50)
+    assert np.allclose(colour(least), wanted, atol=2) and np.allclose(colour(surest), before[0], atol=2)
+    assert f"{title} " in point_at(opened, int(least[0]), int(least[1]), len(maps.mask))
+    opened.wait_for_function("(by) => location.hash.includes(`over=${by}`)", arg=by)
+
+
+def test_rows_and_columns_are_numbered_along_the_edges(opened):
+    ticks = "async ([first, last, shortest]) => (await import('/static/view/map_axes.js')).ticks(first, last, shortest)"
+    assert opened.evaluate(ticks, [0, 127, 13.2]) == [0, 20, 40, 60, 80, 100, 120]
+    assert opened.evaluate(ticks, [37.5, 40.9, 0.3]) == [38, 39, 40]
+    edge = """(canvas) => { const { data } = canvas.getContext('2d').getImageData(0, canvas.height - 5, canvas.width, 5);
+      return data.filter((value, at) => at % 4 === 3 && value > 0).length; }"""
+    opened.get_by_label("Layer", exact=True).first.select_option("normal")
+    opened.wait_for_function(f"() => ({edge})(document.querySelector('canvas.map')) > 0")
+    opened.get_by_label("Rows and columns").uncheck()
+    opened.wait_for_function(f"() => ({edge})(document.querySelector('canvas.map')) === 0")
+    low, middle, high = (float(each.replace("\u2212", "-")) for each in opened.locator(".axis").first.locator("span").all_inner_texts())
+    assert low < middle < high and np.isclose(middle, (low + high) / 2, rtol=1e-3)
+
+
 def test_an_unsure_pixel_is_hatched_and_said(opened, maps):
     unsure = (maps.status == 15) & (maps.mask == 0)
     assert unsure.any(), "the capture was solved so that some pixels are unsure"

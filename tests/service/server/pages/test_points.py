@@ -90,7 +90,7 @@ def test_without_webgl_the_maps_remain(page, depth):
     assert page.locator("canvas.map").is_visible()
 
 
-def test_no_serious_violation(browser, server, depth):
+def test_no_violation(browser, server, depth):
     page = new_context(browser, base_url=server.url, bypass_csp=True, viewport={"width": 390, "height": 844}).new_page()
     page.goto(f"/maps/{depth[0]}")
     page.wait_for_function("() => globalThis.cloud !== undefined", timeout=LOADED_MS)

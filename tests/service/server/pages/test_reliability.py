@@ -9,14 +9,15 @@ from contextlib import ExitStack
 
 import pytest
 
+from tests.scenes.captures import make_scene, write_capture
 from tests.service.server.api.job_calls import admitted
-from tests.service.server.pages.conftest import SAMPLES, Solved, done, new_context
+from tests.service.server.pages.conftest import Solved, done, new_context
 from tests.service.server_process import Server, serving
 
 pytestmark = pytest.mark.long
 
-STEPS = 40
-STARTS = (13, 27)
+STEPS = 100
+STARTS = (31, 67)
 """Steps at which the server is killed and started again: starting takes seconds, so that chance does not choose them."""
 ACTIONS = ("go", "go", "back", "back", "forward", "reload", "tab", "offline", "hasty")
 CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map",
@@ -31,11 +32,12 @@ class Restartable:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self._options = (folder, "--anonymous", "--device", "cpu", "--port", str(free.getsockname()[1]))
+        self.capture = write_capture(folder / "small", make_scene(size=32, lights=8))
         self._stack = ExitStack()
         self.server: Server = self._start()
 
     def _start(self) -> Server:
-        return self._stack.enter_context(serving(*self._options, roots=str(SAMPLES)))
+        return self._stack.enter_context(serving(*self._options, roots=str(self.capture)))
 
     def kill(self) -> None:
         os.killpg(self.server.process.pid, signal.SIGKILL)
@@ -50,10 +52,10 @@ class Restartable:
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory) -> Iterator[tuple[Restartable, dict[str, str]]]:
-    """A server, and the addresses of its pages."""
+    """A server, and the addresses of its pages. Its capture is small, since what is tried is not how fast pictures are drawn."""
     made = Restartable(tmp_path_factory.mktemp("restartable"))
     with made.server.client() as client:
-        capture = admitted(made.server, client, SAMPLES / "lambert")["id"]
+        capture = admitted(made.server, client, made.capture)["id"]
         solve = done(made.server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
         for view in ({}, {"maps": solve}):
             done(made.server, client, {"kind": "view", "capture": capture, **view})

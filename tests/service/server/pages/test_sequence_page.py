@@ -46,7 +46,7 @@ def test_the_maps_and_the_frames_of_each_step_are_looked_at(page, walk):
     page.get_by_text("Export an asset").wait_for(timeout=CONTENT_MS)
 
 
-def test_the_choice_of_a_step_has_no_serious_violation(browser, server, walk):
+def test_the_choice_of_a_step_has_no_violation(browser, server, walk):
     page = new_context(browser, base_url=server.url, bypass_csp=True).new_page()  # axe is injected
     page.goto(f"/jobs/{walk[1]}")
     page.get_by_role("link", name="Look at the maps").click()

@@ -2,7 +2,7 @@
 
 import { listing, read } from "../api.js";
 import { watch } from "../events.js";
-import { words } from "../element.js";
+import { kindTitle } from "../element.js";
 
 const MOST_FAILED = 10;
 
@@ -62,5 +62,5 @@ export class Jobs {
 /** Return what a job is called, with the capture that it is about; `nameOf` gives the name of a capture or environment, or undefined. */
 export function titleOf({ request }, nameOf) {
   const about = nameOf(request.capture ?? request.intake);
-  return request.name || (about === undefined ? words(request.kind) : `${words(request.kind)} · ${about}`);
+  return request.name || (about === undefined ? kindTitle(request.kind) : `${kindTitle(request.kind)} · ${about}`);
 }

@@ -1,7 +1,7 @@
 /** The home page: all captures, sequences, assets and environments as cards, and the jobs above them. */
 
 import { attempt, load, read, Refusal, send } from "../api.js";
-import { mountDropZone } from "../drop_zone.js";
+import { mountDropZone } from "../upload/drop_zone.js";
 import { byId, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
 import { cardOf, setPicture } from "./card.js";

@@ -1,7 +1,7 @@
 /** An exported asset in 3D, with the lights of the rig that it was captured under. */
 
 import { attempt, fetched, listing, resultsOf } from "../api.js";
-import { byId, bytes, element, tell } from "../element.js";
+import { bytes, element, tell } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
 import { canRender } from "../view/basis_renderer.js";
 import { captureOf, findView } from "../view_jobs.js";
@@ -30,17 +30,15 @@ async function findAsset(job) {
 export async function mountAsset(parent, job, named = () => {}) {
   const result = await findAsset(job);
   if (!canRender()) {
-    byId("state").textContent = "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it.";
-    parent.replaceChildren();
+    parent.replaceChildren(element("p", { class: "fault" }, "This browser has no WebGL2, which the 3D view needs. The file can be saved on the page of its job, and opened by Blender, usdview or any other program that reads it."));
     return;
   }
   const show = async () => {
-    byId("state").textContent = `Loading ${bytes(result.size)} …`;
-    const [{ mount }, data, environments, rig] = await Promise.all([import("../view/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
+    parent.replaceChildren(element("p", { role: "status" }, `Loading ${bytes(result.size)} …`));
+    const [{ mount }, data, environments, rig] = await Promise.all([import("../scene/asset_viewer.js"), fetched(result.url, (answer) => answer.arrayBuffer()),
       readyEnvironments(), rigOf(job).catch((error) => { tell(`The lights of the rig are not shown: ${error.message}`); return null; })]);
     named(job.request.name || rig?.name || job.id);
     globalThis.asset = await mount(parent, { name: result.name.split("/").at(-1), data }, { rig, environments, load: loadEnvironment });
-    byId("state").textContent = "";
   };
   if (result.size <= LARGE) {
     await show();

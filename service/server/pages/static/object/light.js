@@ -5,6 +5,7 @@ import { element } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
 import { mount } from "../view/relight_viewer.js";
+import { mountAnnotations } from "./annotations.js";
 import { mountVideo } from "./video.js";
 
 const FIRST_FRAME = 1;
@@ -83,9 +84,10 @@ export async function mountLight(parent, capture, view) {
 
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
   const environments = await readyEnvironments();
-  const stage = element("div");
-  parent.replaceChildren(stage, batchForm());
+  const [stage, notes] = [element("div"), element("div")];
+  parent.replaceChildren(stage, notes, batchForm());
   const viewer = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });
+  if (viewer.over !== null) await mountAnnotations(notes, capture, viewer.over);
   mountVideo(stage.querySelector(".view-tools"), view.info.name, viewer);
   globalThis.relit = viewer;
 }

@@ -2,7 +2,7 @@
 
 import { attempt, listing, load, read, resultsOf, save } from "../api.js";
 import { byId, bytes, element, factText, show, words } from "../element.js";
-import { Address } from "../publish/address.js";
+import { Address, writeNow } from "../publish/address.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
@@ -11,14 +11,17 @@ import { mountLight } from "./light.js";
 import { litFacts, offerSteps } from "./next_steps.js";
 import { mountPhotographs } from "./photographs.js";
 import { removeLater } from "./removal.js";
-import { mountResults, viewOf, warningsOf } from "./results.js";
+import { mountResults, PREVIEW, viewOf, warningsOf } from "./results.js";
 
 const identifier = byId("main").dataset.identifier;
 const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
 const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
-const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json)$/;
+const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json|annotations\.json)$/;
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
+const left = new Map(); // what the address said beside the mode when each was left
+let modes = {};
+let shown = null;
 
 /** Return the jobs of this object that have succeeded, the newest first: those of its capture, and those that go on with their results. */
 async function jobsOfObject() {
@@ -26,7 +29,7 @@ async function jobsOfObject() {
   for await (const job of listing("/v1/jobs?limit=500&state=succeeded", "jobs")) all.push(job);
   const known = new Set();
   for (const job of all.toReversed()) if (job.request.capture === identifier || known.has(job.request.maps)) known.add(job.id);
-  return all.filter((job) => known.has(job.id) && job.request.kind !== "view");
+  return all.filter((job) => known.has(job.id) && job.request.kind !== "view" && job.request.name !== PREVIEW);
 }
 
 /** Return the modes that this object has: what each is called and how it is mounted. */
@@ -36,7 +39,7 @@ function modesOf(view, step, jobs) {
   const nameOf = (job) => `${job.request.name || job.request.options?.method || job.request.kind} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
   const modes = {};
   if (view.info.relight !== null && step === null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view) };
-  if (solved.length > 0) modes.maps = { title: "Maps", mount: async (parent) => mountResults(parent, await viewOf(solved[0].id)) };
+  if (solved.length > 0) modes.maps = { title: "Maps", mount: async (parent) => mountResults(parent, await viewOf(solved[0].id, parent)) };
   if (exported.length > 0) modes["3d"] = { title: "3-D", mount: (parent) => mountAsset(parent, exported[0]) };
   if (view.info.frames.length > 0) {
     modes.photographs = { title: "Photographs", mount: async (parent) => {
@@ -45,7 +48,7 @@ function modesOf(view, step, jobs) {
       await mountPhotographs(frames, dome, view);
     } };
   }
-  if (measured.length > 0) modes.depth = { title: "Depth", mount: async (parent) => mountResults(parent, await viewOf(measured[0].id)) };
+  if (measured.length > 0) modes.depth = { title: "Depth", mount: async (parent) => mountResults(parent, await viewOf(measured[0].id, parent)) };
   if (solved.length > 1) modes.compare = { title: "Compare", mount: (parent) => mountCompared(parent, solved, nameOf) };
   return modes;
 }
@@ -56,7 +59,7 @@ async function mountCompared(parent, jobs, nameOf) {
   const [first, second] = [choice("Maps", 0), choice("Compared with", 1)];
   const place = element("div");
   const again = () => attempt(async () => {
-    const [one, other] = await Promise.all([first.value, second.value].map(viewOf));
+    const [one, other] = await Promise.all([first.value, second.value].map((job) => viewOf(job, place)));
     if (one.info.rows !== other.info.rows || one.info.cols !== other.info.cols) throw new Error("these maps have different sizes");
     await mountResults(place, one, [{ name: second.selectedOptions[0].textContent, view: other }]);
   });
@@ -66,8 +69,8 @@ async function mountCompared(parent, jobs, nameOf) {
 }
 
 /** Show a mode; one that was shown before is as it was left. */
-async function choose(name, modes) {
-  address.write({ mode: name });
+async function choose(name) {
+  shown = name;
   for (const tab of byId("modes").children) tab.setAttribute("aria-pressed", String(tab.dataset.mode === name));
   for (const [each, place] of places) show(place, each === name);
   if (places.has(name)) return;
@@ -76,6 +79,30 @@ async function choose(name, modes) {
   byId("view").querySelector(".skeleton")?.remove();
   byId("view").append(place);
   await load(() => modes[name].mount(place));
+}
+
+/** Return what an address says beside the mode. */
+function others(hash = location.hash) {
+  return hash.slice(1).split("&").filter((part) => part !== "" && !part.startsWith("mode=")).join("&");
+}
+
+/** Show another mode, from which Back returns to this one. */
+function go(name) {
+  if (name === shown) return undefined;
+  writeNow();
+  left.set(shown, others());
+  history.pushState(null, "", `#${[`mode=${name}`, others()].filter((part) => part !== "").join("&")}`);
+  return choose(name);
+}
+
+/** Show what the address says after Back, Forward or a link: a mode as it was left, or else the page is loaded again. */
+function follow({ oldURL }) {
+  left.set(shown, others(new URL(oldURL).hash));
+  const wanted = { mode: Object.keys(modes)[0] };
+  address.read(wanted);
+  const isKnown = wanted.mode in modes && wanted.mode !== shown && (!places.has(wanted.mode) || left.get(wanted.mode) === others());
+  if (!isKnown) location.reload();
+  else choose(wanted.mode);
 }
 
 async function presentFiles(jobs) {
@@ -104,15 +131,19 @@ await load(async () => {
     return;
   }
   const step = await chosenStep(identifier);
-  const [view, jobs] = await Promise.all([openView(identifier, null, step).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
-  const modes = modesOf(view, step, jobs);
+  const [view, jobs] = await Promise.all([openView(identifier, null, step, byId("view")).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
+  modes = modesOf(view, step, jobs);
   offerSteps(byId("next"), litFacts(capture.facts ?? {}, view), identifier, jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]));
   const wanted = { mode: "" };
   address.read(wanted);
   byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name, "aria-pressed": "false",
-    onclick: () => choose(name, modes) }, title)));
+    onclick: () => go(name) }, title)));
   const first = wanted.mode in modes ? wanted.mode : Object.keys(modes)[0];
   if (first === undefined) byId("view").replaceChildren(element("p", {}, "There is nothing to show of this capture yet."));
-  else await choose(first, modes);
+  else {
+    address.write({ mode: first });
+    addEventListener("hashchange", follow);
+    await choose(first);
+  }
   await presentFiles(jobs);
 });

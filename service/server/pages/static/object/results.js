@@ -8,10 +8,15 @@ import { mount as mountPlot } from "../view/pixel_plot.js";
 import { ViewFile } from "../view/view_file.js";
 import { captureOf, openView } from "../view_jobs.js";
 
-/** Return the view of the maps of a job, prepared if it is not yet. */
-export async function viewOf(job) {
-  const capture = await captureOf(await read(`/v1/jobs/${job}`));
-  return ViewFile.open((await openView(capture, job, await chosenStep(capture, await stepNames(job)))).files);
+/** Name of jobs that make a preview, which the page of an object leaves out. */
+export const PREVIEW = "Preview of the middle";
+
+/** Return the view of the maps of a job, prepared if it is not yet; `place` is where it will be shown. */
+export async function viewOf(job, place) {
+  const found = await read(`/v1/jobs/${job}`);
+  const capture = await captureOf(found);
+  const { crop = null } = found.request.options ?? {}; // maps of a part are shown with that part
+  return ViewFile.open((await openView(capture, job, await chosenStep(capture, () => stepNames(job)), place, crop === null ? {} : { options: { crop } })).files);
 }
 
 /** Show a view of maps; `others` to compare with, as the viewer of maps takes them. */
@@ -23,14 +28,17 @@ export async function mountResults(parent, view, others = []) {
   if (view.info.points !== null) {
     const points = element("div");
     parent.append(element("section", { "aria-labelledby": "points-title" }, element("h2", { id: "points-title" }, "Points"), points));
-    const { mount } = await import("../view/cloud_viewer.js"); // three.js is large: only a depth needs it here
+    const { mount } = await import("../scene/cloud_viewer.js"); // three.js is large: only a depth needs it here
     globalThis.cloud = await mount(points, view);
   }
 }
 
-/** Return what is wrong with maps, in words. */
-export function warningsOf(view) {
-  return element("ul", { class: "findings plain" }, ...[...view.info.findings, ...view.info.warnings].map((each) => element("li", {}, each)));
+/** Return what is wrong with a capture, what there is to know of its maps, and what was taken for granted, in words. */
+export function warningsOf({ info: { findings, warnings, assumed = [] } }) {
+  const list = (kind, sentences) => (sentences.length === 0 ? null : element("ul", { class: `${kind} plain` }, ...sentences.map((each) => element("li", {}, each))));
+  const granted = list("assumed", assumed);
+  return element("div", {}, list("findings", findings), list("warnings", warnings.filter((each) => !assumed.includes(each))),
+    granted === null ? null : element("div", { class: "help" }, "Taken for granted:", granted));
 }
 
 /** Return the names of the time steps of a job of a sequence; empty where it is of one capture. */

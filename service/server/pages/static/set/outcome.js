@@ -65,7 +65,7 @@ export function mountOutcome(patterns, changed) {
 
   /** Show the capture under a light that moves; it replaces the preview. */
   async function present(current) {
-    const { files } = await openView(capture.id, null);
+    const { files } = await openView(capture.id, null, null, byId("turning"));
     const made = current() ? await mountTurning(byId("turning"), files) : null;
     if (made === null) return;
     if (!current()) {
@@ -138,7 +138,7 @@ export function mountOutcome(patterns, changed) {
       byId("turning").replaceChildren();
       byId("state").textContent = byId("jobs").textContent = "";
       show(byId("preview"), preview !== undefined);
-      for (const id of ["pages", "maps-page", "moving", "progress"]) show(byId(id), false);
+      for (const id of ["pages", "maps-page", "moving"]) show(byId(id), false);
       Object.assign(outcome, { solvable: false, patterns: kind === "depth", solved: false, asset: null });
       if (now !== null && state.shots.some((shot) => shot.step === "object")) attempt(() => begin(state));
     },

@@ -2,13 +2,14 @@
 
 import { attempt, post } from "../api.js";
 import { byId, element } from "../element.js";
+import { LACKS } from "../pages/calibrations.js";
 import { fill, open, planned, start } from "./plan_form.js";
 
 const STEPS = [
-  { id: "dark", name: "Dark", takes: ["dark"], lacks: "What the camera reads in the dark stays in the pictures." },
-  { id: "flat", name: "White card", takes: ["flat"], lacks: "What lens and lamps darken towards the edges stays in the pictures." },
+  { id: "dark", name: "Dark", takes: ["dark"], lacks: LACKS.dark },
+  { id: "flat", name: "White card", takes: ["flat"], lacks: LACKS.flat },
   { id: "ball", name: "Ball", takes: ["mirror-ball", "grey-ball"], alone: true, lacks: "The directions of the lights are those of the rig file.", use: "Measure the lights", used: "The lights are measured by it." },
-  { id: "chart", name: "Colour chart", takes: ["chart"], alone: true, lacks: "The colours are those of the camera.", use: "Correct the colours", used: "The colours are corrected by it." },
+  { id: "chart", name: "Colour chart", takes: ["chart"], alone: true, lacks: LACKS.colours, use: "Correct the colours", used: "The colours are corrected by it." },
 ];
 const PROJECTOR = { id: "projector-response", name: "Projector", takes: ["projector-response"], lacks: "The projector is taken to give light in proportion to what it is sent." };
 const OBJECT = { id: "object", name: "Object", takes: ["olat"], lacks: "There is nothing to solve." };

@@ -7,6 +7,8 @@ const ANCHORS = { // matplotlib's viridis at every sixteenth
   grey: "000000 ffffff",
 };
 const STEPS = 256;
+const VEIL = 128;
+const MOST_VEILED = 235;
 
 /** Names of the colour maps. */
 export const COLOUR_MAPS = Object.keys(ANCHORS);
@@ -55,7 +57,8 @@ const ENCODED = Uint8ClampedArray.from({ length: 4096 }, (_, index) => {
  * Paint a tile.
  * @param {any} layer Of view.json.
  * @param {import("./view_file.js").Tile} tile
- * @param {{low: number, high: number, stops: number, colours: string, space: string}} look
+ * @param {{low: number, high: number, stops: number, colours: string, space: string, veil?: "low"|"high"}} look `veil`: numbers become a grey that
+ *     covers the more, the lower or the higher they are.
  * @returns {ImageData}
  */
 export function paint(layer, tile, look) {
@@ -84,6 +87,11 @@ export function paint(layer, tile, look) {
     for (let at = 0, to = 0; at < count; at += 1, to += 4) {
       const colour = codeColour(layer, Math.round(x[at]));
       if (colour !== null) data.set([...colour, 255], to);
+    }
+  } else if (look.veil !== undefined) {
+    for (let at = 0, to = 0; at < count; at += 1, to += 4) {
+      const share = Math.max(0, Math.min(1, (x[at] - look.low) / (look.high - look.low || 1)));
+      data.set([VEIL, VEIL, VEIL, MOST_VEILED * (look.veil === "low" ? 1 - share : share)], to);
     }
   } else {
     const table = colourTable(look.colours);

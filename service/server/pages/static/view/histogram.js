@@ -16,8 +16,9 @@ const STEPS = 1000;
  * @param {any} codes Of view.json.
  * @param {{low: number, high: number}} look What is shown now.
  * @param {function({low: number, high: number}): void} changed Called with another range.
+ * @param {string} [which] Ends the names of its controls where a page has several.
  */
-export function mountHistogram(parent, layer, codes, look, changed) {
+export function mountHistogram(parent, layer, codes, look, changed, which = "") {
   if (layer.kind === "codes") {
     const names = layer.name === "status" ? (code) => codeWords(codes, code) : (code) => layer.codes?.[code]?.name ?? `${layer.title} ${code}`;
     parent.replaceChildren(element("ul", { class: "plain legend" }, ...layer.range.filter((code) => code !== 0).map((code) => legend(codeColour(layer, code), names(code)))));
@@ -35,14 +36,14 @@ export function mountHistogram(parent, layer, codes, look, changed) {
       context.fillRect((bin * WIDTH) / channel.length, HEIGHT - height, WIDTH / channel.length, height);
     });
   });
-  const children = [canvas];
+  const children = [canvas, element("p", { class: "axis" }, ...[low, (low + high) / 2, high].map((value) => element("span", {}, short(value))))];
   if (layer.kind === "scalar") {
     const toValue = (step) => low + ((high - low) * step) / STEPS;
     const toStep = (value) => Math.round((STEPS * (value - low)) / (high - low || 1));
     const text = element("output", {}, rangeText(look));
     const handle = (name, value) => element("input", { type: "range", min: 0, max: STEPS, value: toStep(value), "aria-label": name });
-    const from = handle("Lowest value that is shown", look.low);
-    const to = handle("Highest value that is shown", look.high);
+    const from = handle(`Lowest value that is shown${which}`, look.low);
+    const to = handle(`Highest value that is shown${which}`, look.high);
     const update = (moved) => {
       if (Number(from.value) >= Number(to.value)) {
         if (moved === from) to.value = String(Math.min(STEPS, Number(from.value) + 1));

@@ -1,9 +1,10 @@
 /** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
 
-import { element, tell } from "../element.js";
+import { element, numberOf, tell } from "../element.js";
 import { ControlAddress } from "./control_address.js";
 import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
 import { mountHistogram, short } from "./histogram.js";
+import { drawAxes } from "./map_axes.js";
 import { codeWords, OUTSIDE, REFUSED, stateOf, UNSURE } from "./pixel_states.js";
 import { TiledImage } from "./tiled_image.js";
 
@@ -12,6 +13,7 @@ const LARGEST_SCALE = 64;
 const ZOOM = 1.25;
 const PAN = 0.1; // of the canvas, for one press of an arrow key
 const NONE = "";
+const OVERLAID = /^confidence$|^(\w+_)?sigma(_\w+)?$/; // names of layers that say how sure others are
 const WAYS = { wipe: "by a wipe", difference: "as the difference of their colours", beside: "side by side" };
 
 /**
@@ -28,23 +30,26 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     "aria-label": "Map. Plus and minus zoom, arrow keys move, 0 shows all, Enter chooses the pixel in the middle." });
   const context = canvas.getContext("2d");
   const value = element("output", { class: "value", "aria-live": "polite" }, "Point at a pixel to read its values.");
-  const histogram = element("div", { class: "histogram" });
+  const [histogram, overHistogram] = [element("div", { class: "histogram" }), element("div", { class: "histogram" })];
   const layerSelect = layerChoice("Layer");
   const otherSelect = layerChoice("Compare with", true);
   otherSelect.append(...others.map(({ name, view: { info } }, at) => element("optgroup", { label: name },
     ...info.layers.map((layer) => element("option", { value: `${at}/${layer.name}` }, `${layer.title} of ${name}`)))));
+  const overSelect = element("select", {}, element("option", { value: NONE }, "nothing"),
+    ...view.info.layers.filter(({ kind, name }) => kind === "scalar" && OVERLAID.test(name)).map(({ name, title }) => element("option", { value: name }, title)));
+  const axes = checkbox(true);
   const how = element("select", {}, ...Object.entries(WAYS).map(([value, text]) => element("option", { value }, text)));
   const wipe = element("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Where the two layers meet" });
   const colours = element("select", {}, ...COLOUR_MAPS.map((name) => element("option", { value: name }, name)));
   const stops = element("input", { type: "range", min: -6, max: 6, step: 0.1, value: 0, "aria-label": "Exposure in stops" });
-  const stopsText = element("output", {}, "0 stops");
   const hatched = { unsure: checkbox(true), refused: checkbox(true) };
   const named = (text, control, ...more) => element("label", {}, `${text} `, control, ...more);
   const colourRow = named("Colour map", colours);
-  const stopsRow = element("label", {}, "Exposure ", stops, " ", stopsText);
-  const [wipeRow, howRow] = [named("Wipe", wipe), named("How", how)];
+  const stopsRow = named("Exposure (stops)", stops, numberOf(stops));
+  const [wipeRow, howRow] = [named("Wipe (%)", wipe, numberOf(wipe)), named("How", how)];
   const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), howRow, wipeRow,
-    named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
+    overSelect.options.length > 1 ? named("Grey out by", overSelect) : null, overHistogram,
+    named("Rows and columns", axes), named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
     element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
     element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, value), panel));
@@ -52,6 +57,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   let place = { x: 0, y: 0, scale: 1 };
   let image = null;
   let other = null;
+  let over = null; // a grey veil over the image, where this says that values are unsure
   let asked = false;
   let looked = 0;
 
@@ -83,6 +89,12 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
       if (way === "difference") context.globalCompositeOperation = "difference";
       other?.draw(context, { ...place, x: place.x + shift }, { left: way === "difference" ? 0 : border, right: width }, marks);
       context.globalCompositeOperation = "source-over";
+      over?.draw(context, { ...place, x: place.x - shift }, { left: 0, right: border }, {});
+      if (axes.checked) {
+        const [ink, paper] = ["color", "outlineColor"].map((name) => getComputedStyle(canvas)[name]);
+        drawAxes(context, { ...place, x: place.x - shift }, view.info, { left: 0, right: beside() ? border : width }, { ink, paper });
+        if (beside()) drawAxes(context, { ...place, x: place.x + shift }, view.info, { left: border, right: width }, { ink, paper });
+      }
       if (border < width) {
         context.fillStyle = getComputedStyle(canvas).color;
         context.fillRect(border - 1, 0, 2, height);
@@ -92,7 +104,6 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
 
   function select() {
     const look = { colours: colours.value, stops: Number(stops.value) };
-    stopsText.textContent = `${stops.value} stops`;
     const failed = (error) => tell(error.message);
     const made = (chosen) => {
       const [at, name] = chosen.includes("/") ? chosen.split("/") : [null, chosen];
@@ -101,6 +112,8 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     };
     image = made(layerSelect.value);
     other = otherSelect.value === NONE ? null : made(otherSelect.value);
+    over = overSelect.value === NONE ? null : new TiledImage(view, view.layer(overSelect.value), draw, failed);
+    over?.setLook({ veil: over.layer.name === "confidence" ? "low" : "high" });
     for (const each of [image, other]) each?.setLook(look);
     const kinds = [image, other].map((each) => each?.layer.kind);
     colourRow.hidden = !kinds.includes("scalar") && !kinds.includes("mask");
@@ -108,6 +121,8 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     howRow.hidden = other === null;
     wipeRow.hidden = other === null || how.value !== "wipe";
     mountHistogram(histogram, image.layer, view.info.codes, image.look, (range) => image.setLook(range));
+    if (over === null) overHistogram.replaceChildren();
+    else mountHistogram(overHistogram, over.layer, view.info.codes, over.look, (range) => over.setLook(range), " by the grey");
     draw();
   }
 
@@ -149,7 +164,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     const mine = ++looked;
     const pixel = pixelOf(x, y);
     if (pixel === null) return;
-    const shown = [image, other].filter((each) => each !== null && each.layer.name !== "status");
+    const shown = [image, other, over].filter((each) => each !== null && each.layer.name !== "status");
     const asked = [view.layer("status"), view.layer("mask")].map((layer) => (layer === undefined ? null : view.pixel(layer, ...pixel)));
     let found;
     try {
@@ -211,26 +226,27 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     keys[event.key]();
   });
   if (others.length > 0) otherSelect.value = `0/${(others[0].view.layer(layerSelect.value) ?? others[0].view.info.layers[0]).name}`;
-  const address = new ControlAddress({ layer: layerSelect, with: otherSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
+  const address = new ControlAddress({ layer: layerSelect, with: otherSelect, over: overSelect, how, "map-wipe": wipe, colours, "map-stops": stops });
   address.read();
+  for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
-  for (const each of [layerSelect, otherSelect, how]) each.addEventListener("change", select);
+  for (const each of [layerSelect, otherSelect, overSelect, how]) each.addEventListener("change", select);
   how.addEventListener("change", fit);
   wipe.addEventListener("input", draw);
+  axes.addEventListener("change", draw);
   for (const each of Object.values(hatched)) each.addEventListener("change", draw);
   colours.addEventListener("change", () => [image, other].forEach((each) => each?.setLook({ colours: colours.value })));
-  stops.addEventListener("input", () => {
-    stopsText.textContent = `${stops.value} stops`;
-    for (const each of [image, other]) each?.setLook({ stops: Number(stops.value) });
-  });
+  stops.addEventListener("input", () => [image, other].forEach((each) => each?.setLook({ stops: Number(stops.value) })));
   const resized = new ResizeObserver(() => {
     const box = canvas.getBoundingClientRect();
     const ratio = globalThis.devicePixelRatio ?? 1;
-    canvas.width = Math.max(1, Math.round(box.width * ratio));
-    canvas.height = Math.max(1, Math.round(box.height * ratio));
+    const size = [box.width, box.height].map((side) => Math.round(side * ratio));
+    if (Math.min(...size) === 0 || (size[0] === canvas.width && size[1] === canvas.height)) return; // hidden, or shown again as it was left
+    [canvas.width, canvas.height] = size;
     fit();
   });
   select();
+  fit();
   resized.observe(canvas);
   return { destroy: () => resized.disconnect() };
 }

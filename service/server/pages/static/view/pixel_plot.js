@@ -73,7 +73,7 @@ export function mount(parent, view) {
     const heads = ["Light", "Angle to the normal", "Measured", "Model", "Remark"].map((name) => element("th", { scope: "col" }, name));
     place.replaceChildren(element("h3", {}, `Row ${row}, column ${col}`), svg,
       element("p", { class: "help" }, "Dots: measured radiance. Lines: the fitted model. Hollow dots: readings that are clipped, in shadow or lit from behind.",
-        samples.step > 1 ? ` Readings of every ${samples.step}th pixel are kept; this is the nearest.` : ""),
+        samples.step > 1 ? ` Readings of every ${ordinal(samples.step)} pixel are kept; this is the nearest.` : ""),
       element("details", {}, element("summary", {}, "The numbers"), element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows))));
   }
 
@@ -83,6 +83,10 @@ export function mount(parent, view) {
   }
 
   return { show };
+}
+
+function ordinal(number) {
+  return `${number}${{ 2: "nd", 3: "rd" }[number] ?? "th"}`; // no step is above twenty
 }
 
 function triple(values, light) {

@@ -1,6 +1,6 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
-import { element, tell } from "../element.js";
+import { element, numberOf, tell } from "../element.js";
 import { ViewState } from "../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
@@ -28,13 +28,13 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
  *     light; `embedded`: the page moves the light, and the address is its own.
  * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void,
- *     canvas: HTMLCanvasElement|null, turn: function(number): void}>} `turn` turns the environment by degrees, or the light where there is none.
+ *     canvas: HTMLCanvasElement|null, over: object|null, turn: function(number): void}>} `over` is that of zoomed_picture.js; `turn` turns the environment by degrees, or the light where there is none.
  */
 export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, turn: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, over: null, turn: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
@@ -56,7 +56,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   };
   const speed = element("p", { class: "help", "data-shows": "speed" }, `${sizeOf(relight)}.`);
   const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false" }, "Spin");
-  const row = (text, each, ...more) => element("label", {}, `${text} `, each, ...more);
+  const row = (text, each) => element("label", {}, `${text} `, each, each.type === "range" ? numberOf(each) : null);
   const wipeRow = row("Wipe", control.wipe);
   const panel = element("div", { class: "panel" },
     element("fieldset", {}, element("legend", {}, "Light"), row("On", control.lit), dome, row("Brightness (stops)", control.brightness),
@@ -123,6 +123,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   }
 
   function change() {
+    for (const each of Object.values(control)) each.dispatchEvent(new Event("set"));
     domeControl.set(control.lit.checked ? place.light : null);
     address?.write();
     wipeRow.hidden = control.compare.value === "";
@@ -191,7 +192,6 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   }
 
   drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
-  if (!embedded) addEventListener("hashchange", () => location.reload()); // another link to this page was followed
   for (const each of [control.lit, control.brightness, control.colour, control.size, control.environmentStops, control.turn, control.exposure, control.wipe, control.compare]) {
     each.addEventListener("input", change);
   }
@@ -261,6 +261,7 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
     canvas,
+    over: { ...zoomed.over, step: relight.step },
     turn,
   };
 }

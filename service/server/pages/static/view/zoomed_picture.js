@@ -14,12 +14,16 @@ const LABEL = "The object under the chosen light. Drag or use the arrow keys to 
  * @param {import("../publish/view_state.js").ViewState} state Of the picture.
  * @param {{changed: function(object): void, pixelSize: number|null, still: boolean}} options `changed` is given what gestures change of the state; `pixelSize` of
  *   the source in metres; `still`: without gestures and buttons.
- * @returns {{canvas: HTMLCanvasElement, draw: function(string): void, destroy: function(): void}} `draw` is given the colour around the picture.
+ * @returns {{canvas: HTMLCanvasElement, draw: function(string): void, destroy: function(): void, over: object}} `draw` is given the colour around the picture;
+ *   `over`: what may lie over the picture, as object/annotations.js uses it.
  */
 export function mountZoomed(stage, source, state, { changed, pixelSize, still }) {
   const canvas = element("canvas", { class: "picture", tabindex: 0, role: "img", "aria-label": LABEL });
   const context = canvas.getContext("2d");
   const bar = element("p", { class: "scale-bar", hidden: true }, element("span"));
+  const notes = element("div", { class: "notes" });
+  const tools = element("p", { class: "actions view-tools" });
+  let put = () => {}; // puts what lies over the picture where a function from it to CSS pixels says
   let around = "";
   let moves = false;
 
@@ -35,10 +39,11 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
     context.fillRect(0, 0, ...size);
     context.imageSmoothingQuality = "high";
     context.drawImage(source, size[0] / 2 - state.centre[0] * scale, size[1] / 2 - state.centre[1] * scale, source.width * scale, source.height * scale);
+    put((u, v) => [canvas.clientLeft + width / 2 + ((u - state.centre[0]) * scale) / ratio, canvas.clientTop + height / 2 + ((v - state.centre[1]) * scale) / ratio]);
     if (pixelSize !== null) showScale(bar, (1000 * pixelSize * ratio) / scale);
   }
 
-  stage.append(element("div", { class: "framed" }, canvas, bar));
+  stage.append(element("div", { class: "framed" }, canvas, notes, bar));
   if (!still) {
     const { zoom } = listen(canvas, state, { moves: () => moves, changed });
     const button = (text, onclick, more = {}) => element("button", { type: "button", class: "quiet", onclick, ...more }, text);
@@ -47,11 +52,19 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
       drag.setAttribute("aria-pressed", String(moves));
       canvas.classList.toggle("moves", moves);
     }, { "aria-pressed": "false" });
-    stage.append(element("p", { class: "actions view-tools" }, drag, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)),
+    stage.append(tools);
+    tools.append(drag, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)),
       button("Show all", () => changed({ zoom: 1, centre: [state.width / 2, state.height / 2] })),
-      button("Full screen", () => (document.fullscreenElement === null ? stage.requestFullscreen() : document.exitFullscreen()))));
+      button("Full screen", () => (document.fullscreenElement === null ? stage.requestFullscreen() : document.exitFullscreen())));
   }
   const resized = new ResizeObserver(() => draw());
   resized.observe(canvas);
-  return { canvas, draw, destroy: () => resized.disconnect() };
+  const over = { notes, tools, width: state.width, height: state.height, show: changed,
+    onplace: (each) => { put = each; draw(); },
+    pixelOf: (x, y) => {
+      const { left, top, width, height } = canvas.getBoundingClientRect();
+      const scale = state.scale(canvas.clientWidth, canvas.clientHeight);
+      return [state.centre[0] + (x - left - width / 2) / scale, state.centre[1] + (y - top - height / 2) / scale];
+    } };
+  return { canvas, draw, over, destroy: () => resized.disconnect() };
 }

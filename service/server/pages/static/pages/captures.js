@@ -1,8 +1,8 @@
 /** The page of captures and environments: lists them, and uploads new ones. */
 
-import { listing, load } from "./api.js";
-import { askHowToImport, mountDropZone } from "./drop_zone.js";
-import { byId, element, time } from "./element.js";
+import { listing, load } from "../api.js";
+import { askHowToImport, mountDropZone } from "../upload/drop_zone.js";
+import { byId, element, time } from "../element.js";
 
 async function list(what) {
   const body = byId(what).tBodies[0];

@@ -1,10 +1,10 @@
 /** Shows the points of a depth in 3D, coloured by depth, confidence or photograph. */
 
 import { BufferAttribute, BufferGeometry, LinearSRGBColorSpace, Points, PointsMaterial, Vector3 } from "three";
-import { element, tell } from "../element.js";
-import { canRender } from "./basis_renderer.js";
-import { COLOUR_MAPS, colourTable } from "./display.js";
-import { mountHistogram, short } from "./histogram.js";
+import { element, numberOf, tell } from "../element.js";
+import { canRender } from "../view/basis_renderer.js";
+import { COLOUR_MAPS, colourTable } from "../view/display.js";
+import { mountHistogram, short } from "../view/histogram.js";
 import { OrbitScene } from "./orbit_scene.js";
 
 const NO_WEBGL = "This browser has no WebGL2, which the points need. The maps above show the same depth, and the job's points.ply holds the points.";
@@ -15,7 +15,7 @@ const MOST_SIZE = 8;
 /**
  * Show the points of a view.
  * @param {HTMLElement} parent Takes them.
- * @param {import("./view_file.js").ViewFile} view With `points`.
+ * @param {import("../view/view_file.js").ViewFile} view With `points`.
  * @returns {Promise<{destroy: function(): void, state: function(): any, picture: function(): {rows: number, cols: number, pixels: Uint8Array}}>}
  */
 export async function mount(parent, view) {
@@ -41,7 +41,7 @@ export async function mount(parent, view) {
     size: element("input", { type: "range", min: 1, max: MOST_SIZE, step: 0.5, value: 2 }),
     unsure: element("input", { type: "checkbox", checked: true }),
   };
-  const row = (text, each) => element("label", {}, `${text} `, each);
+  const row = (text, each) => element("label", {}, `${text} `, each, each.type === "range" ? numberOf(each) : null);
   const mapRow = row("Colour map", control.map);
   const counts = `${points.count.toLocaleString()} points${points.unsure === 0 ? ", none of them unsure" : `, and ${points.unsure.toLocaleString()} that are unsure`}.`;
   const every = points.step === 1 ? "" : ` One of ${points.step} × ${points.step} pixels is shown.`;

@@ -1,14 +1,16 @@
 /** Shows an asset as programs that open it do: in 3D, lit by a room, an environment map or one light of the rig, with the rig's lights around it. */
 
 import { Group, LinearToneMapping, Matrix4 } from "three";
-import { element, tell } from "../element.js";
+import { element, numberOf, tell } from "../element.js";
 import { openAsset } from "./asset_file.js";
 import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
-import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
-import { VIEW_TRANSFORM } from "./display.js";
-import { previewOf, readEnvironment } from "./environment_map.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
+import { VIEW_TRANSFORM } from "../view/display.js";
+import { previewOf, readEnvironment } from "../view/environment_map.js";
+import { Distance, lengthText } from "./distance.js";
 import { OrbitScene } from "./orbit_scene.js";
 import { RigLights } from "./rig_lights.js";
+import { SURFACES, Surfaces } from "./surfaces.js";
 
 const ROOM = "room";
 const MAP = "map";
@@ -37,17 +39,28 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     turn: element("input", { type: "range", min: 0, max: 360, step: 1, value: 0 }),
     exposure: element("input", { type: "range", min: -MOST_STOPS, max: MOST_STOPS, step: 0.1, value: 0 }),
     markers: element("input", { type: "checkbox", checked: true }),
+    shadows: element("input", { type: "checkbox", checked: true }),
+    surface: element("select", {}, ...Object.entries(SURFACES).map(([value, text]) => element("option", { value }, text))),
   };
-  const stopsText = element("output", {});
-  const row = (text, ...each) => element("label", {}, `${text} `, ...each);
+  const row = (text, each) => element("label", {}, `${text} `, each, each.type === "range" ? numberOf(each) : null);
   const turnRow = row("Turn (degrees)", control.turn);
+  const shadowsRow = row("Shadows", control.shadows);
+  const measured = element("output", { "aria-live": "polite" });
+  const measure = element("button", { type: "button", class: "quiet", "aria-pressed": "false", onclick: () => {
+    measures = !measures;
+    measure.setAttribute("aria-pressed", String(measures));
+    distance.clear();
+    measured.textContent = measures ? "Choose two points of the object, by a click or by Enter for the middle." : "";
+    view.changed();
+  } }, "Measure a distance");
+  let measures = false;
   const panel = element("div", { class: "panel" },
-    row("Lit by", control.lit),
+    row("Lit by", control.lit), shadowsRow, row("Surface", control.surface),
     element("fieldset", {}, element("legend", {}, "Environment"), environments.length > 0 ? row("Map", control.environment) : null,
       element("label", { class: "button quiet" }, "Open a file", control.file), preview, turnRow),
-    row("Exposure (stops)", control.exposure, stopsText),
+    row("Exposure (stops)", control.exposure),
     lights.length > 0 ? row("Lights of the rig", control.markers) : null,
-    element("p", { class: "actions" }, element("button", { type: "button", class: "quiet", onclick: () => view.reset() }, "As it was captured")),
+    element("p", { class: "actions" }, element("button", { type: "button", class: "quiet", onclick: () => view.reset() }, "As it was captured"), measure), measured,
     element("p", { class: "help" }, words(asset, lights)),
     ...asset.problems.map((problem) => element("p", { class: "fault" }, problem)));
   parent.replaceChildren(element("div", { class: "viewer" }, stage, panel));
@@ -58,12 +71,15 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   const view = new OrbitScene(stage, `The asset ${file.name} in 3D`, { onclick: pick, onfault: (sentence) => { fault.textContent = sentence; } });
   const { scene, renderer } = view;
   renderer.toneMapping = LinearToneMapping;
-  const lighting = new Lighting(scene, renderer);
   const inCameraFrame = new Group(); // as all of Relit's pictures are, wherever the capture says that the camera stood
   if (rig?.camera.world_from_camera) inCameraFrame.applyMatrix4(new Matrix4().set(...rig.camera.world_from_camera.flat()).invert());
   inCameraFrame.add(asset.object);
   scene.add(inCameraFrame);
   view.frame(inCameraFrame);
+  const lighting = new Lighting(scene, renderer, view.center, view.radius);
+  const surfaces = new Surfaces(asset.object);
+  const distance = new Distance(inCameraFrame, colourOf(parent, "--accent"));
+  scene.add(distance.shown);
   const markers = new RigLights(lights, view.center, view.radius, { light: colourOf(parent, "--accent"), suspect: colourOf(parent, "--warn") });
   scene.add(markers.object);
 
@@ -78,11 +94,12 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     } else {
       const { frame } = lights.find(({ index }) => index === Number(chosen));
       const shown = frame.irradiance === null ? [1, 1, 1] : converted(matrixBetween(rig.color_space, DISPLAY_SPACE), frame.irradiance);
-      lighting.byLight(frame.direction, shown);
+      lighting.byLight(frame.direction, shown, control.shadows.checked);
       irradiance = Math.max(...shown);
     }
     markers.choose(chosen === ROOM || chosen === MAP ? null : Number(chosen));
     turnRow.hidden = chosen !== MAP;
+    shadowsRow.hidden = chosen === ROOM || chosen === MAP;
     control.exposure.value = String(Math.max(-MOST_STOPS, Math.min(MOST_STOPS, stopsFor(irradiance))));
     change();
   }
@@ -90,13 +107,19 @@ export async function mount(parent, file, { rig = null, environments = [], load 
   function change() {
     lighting.turn(control.lit.value === MAP ? Number(control.turn.value) : 0);
     renderer.toneMappingExposure = 2 ** Number(control.exposure.value);
-    stopsText.textContent = Number(control.exposure.value).toFixed(1);
+    for (const each of [control.turn, control.exposure]) each.dispatchEvent(new Event("set"));
     markers.object.visible = control.markers.checked;
     view.changed();
   }
 
   function pick(place) {
-    const index = markers.at(place, view.camera);
+    if (measures) {
+      const count = distance.take(place, view.camera);
+      if (count !== null) measured.textContent = count === 1 ? "Choose the other point." : `${lengthText(distance.value)}${hasScale(rig) ? "" : ". The capture does not say its scale: this is true of a measured depth alone."}`;
+      view.changed();
+      return;
+    }
+    const index = markers.at(place, view.camera, inCameraFrame);
     if (index === null) return;
     control.lit.value = String(index);
     light();
@@ -119,6 +142,8 @@ export async function mount(parent, file, { rig = null, environments = [], load 
 
   view.canvas.addEventListener("webglcontextrestored", () => { lighting.forgetMaps(); light(); });
   control.lit.addEventListener("change", light);
+  control.shadows.addEventListener("change", light);
+  control.surface.addEventListener("change", () => { surfaces.show(control.surface.value); view.changed(); });
   for (const each of [control.turn, control.exposure, control.markers]) each.addEventListener("input", change);
   control.environment.addEventListener("change", () => {
     const id = control.environment.value;
@@ -135,12 +160,13 @@ export async function mount(parent, file, { rig = null, environments = [], load 
 
   return {
     destroy() {
+      surfaces.destroy();
       lighting.destroy();
       view.destroy();
       parent.replaceChildren();
     },
     state: () => ({ lit: control.lit.value, environment: map?.name ?? null, turn_degrees: Number(control.turn.value), exposure: Number(control.exposure.value),
-      triangles: asset.triangles, points: asset.points, textures: asset.textures, problems: asset.problems }),
+      triangles: asset.triangles, points: asset.points, textures: asset.textures, problems: asset.problems, distance: distance.value }),
     picture: () => view.picture(),
   };
 }
@@ -155,10 +181,15 @@ function colourOf(parent, token) {
   return color;
 }
 
+/** Return whether lengths of an asset are known in metres. */
+function hasScale(rig) {
+  return rig !== null && Boolean(rig.camera.projection === "orthographic" ? rig.camera.pixel_size_m : rig.camera.surface_z_m);
+}
+
 function words({ triangles, points, textures }, lights) {
   const count = (number, name) => `${number.toLocaleString()} ${name}${number === 1 ? "" : "s"}`;
   const has = points > 0 ? count(points, "point") : `${count(triangles, "triangle")}, ${count(textures, "texture")}`;
   const near = lights.filter(({ frame }) => frame.near).length;
   const around = lights.length === 0 ? "" : ` Around it are the ${count(lights.length, "light")} of the rig${near === 0 ? "" : `, ${near} of them near: they are shown by their direction`}; choose one to see the asset under it.`;
-  return `${has}.${around} Shown by three.js, without cast shadows, through ${VIEW_TRANSFORM}. White is a white surface that faces the light.`;
+  return `${has}.${around} Shown by three.js, with shadows of a chosen light alone, through ${VIEW_TRANSFORM}. White is a white surface that faces the light.`;
 }

@@ -1,12 +1,12 @@
 /** What is predicted of a drive: the balls and the object that the lamps light, and the environment as it turns. */
 
-import { element } from "./element.js";
-import { BasisRenderer, canRender } from "./view/basis_renderer.js";
-import { converted, DISPLAY_SPACE, matrixBetween } from "./view/colour_spaces.js";
-import { srgbByte, VIEW_TRANSFORM } from "./view/display.js";
-import { previewOf, readEnvironment } from "./view/environment_map.js";
-import { LightModel } from "./view/light_model.js";
-import { floats } from "./view/view_file.js";
+import { element, numberOf } from "../element.js";
+import { BasisRenderer, canRender } from "../view/basis_renderer.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
+import { srgbByte, VIEW_TRANSFORM } from "../view/display.js";
+import { previewOf, readEnvironment } from "../view/environment_map.js";
+import { LightModel } from "../view/light_model.js";
+import { floats } from "../view/view_file.js";
 
 const SIDE = 120; // of a ball, pixels
 const GREY = 0.6; // of the brightest place of the matte ball over all frames, before the display transform
@@ -96,7 +96,7 @@ export async function mountEnvironment(parent, file, step) {
 /**
  * Show a capture under the lamps: each stands for the captured light that is nearest, as for `relit twin`.
  * @param {HTMLElement} parent Takes the picture.
- * @param {import("./view/view_file.js").ViewFile} view Of the capture.
+ * @param {import("../view/view_file.js").ViewFile} view Of the capture.
  * @param {number[][]} directions To each lamp.
  * @param {number[][][]} frames As of `mountBalls`.
  * @param {string} space Of the light, scene-linear.
@@ -129,7 +129,7 @@ export async function mountObject(parent, view, directions, frames, space) {
     renderer.draw({ shown: model.ofCaptured(weights), compared: null, border: 1, gain: 2 ** Number(stops.value), backdrop: [0.2, 0.2, 0.2] });
   };
   stops.addEventListener("input", () => draw(shown));
-  parent.replaceChildren(canvas, element("label", {}, "Exposure (stops) ", stops), element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`));
+  parent.replaceChildren(canvas, element("label", {}, "Exposure (stops) ", stops, " ", numberOf(stops)), element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`));
   canvas.dataset.ready = "";
   return draw;
 }

@@ -1,10 +1,10 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, load, post, read, Refusal, remove, resultsOf, save } from "./api.js";
-import { byId, bytes, duration, element, show, time, words } from "./element.js";
-import { watch } from "./events.js";
-import { enableForms } from "./form.js";
-import { titleOf } from "./jobs_table.js";
+import { attempt, listing, load, post, read, Refusal, remove, resultsOf, save } from "../api.js";
+import { byId, bytes, duration, element, show, time, words } from "../element.js";
+import { watch } from "../events.js";
+import { enableForms } from "../form.js";
+import { titleOf } from "../jobs_table.js";
 
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];

@@ -1,7 +1,7 @@
 /** Where folders and files are dropped or chosen, uploaded, looked at and imported. */
 
-import { attempt, post, Refusal } from "./api.js";
-import { bytes, byId, element, rate } from "./element.js";
+import { attempt, post, Refusal } from "../api.js";
+import { bytes, byId, element, rate } from "../element.js";
 import { chosenFolder, droppedFiles, isCapture, isEnvironment } from "./local_files.js";
 import { proposalOf } from "./proposal.js";
 import { settled, Stopped, upload } from "./upload.js";

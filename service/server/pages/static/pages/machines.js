@@ -1,11 +1,12 @@
 /** The page for operators: workers and what each does, the queue, the space left, the last errors, and the audit log. */
 
-import { attempt, load, read, Refusal } from "./api.js";
-import { byId, bytes, element, icon, show, time, words } from "./element.js";
-import { progressOf, titleOf } from "./jobs_table.js";
+import { attempt, load, post, read, Refusal } from "../api.js";
+import { byId, bytes, element, icon, show, time, words } from "../element.js";
+import { progressOf, titleOf } from "../jobs_table.js";
 
 const REFRESH_MS = 5000;
 const ERRORS = 10;
+const QUESTIONS = { drain: "Let this worker finish its step, give its job back and end?", kill: "Kill this worker at once? Its step is lost; another worker goes on with the job." };
 const PAGES = { cap: "captures", job: "jobs" }; // of identifiers
 let next = null; // page of the audit log
 
@@ -31,9 +32,17 @@ function workerLine(worker) {
   const { job } = worker;
   const doing = job !== null ? [element("a", { href: `/jobs/${job.id}` }, titleOf(job)), ` ${progressOf(job)}`]
     : [worker.busy ? "does a job of another project" : "waits for work"];
+  const ask = (what) => attempt(async () => {
+    if (!confirm(QUESTIONS[what])) return;
+    await post(`/v1/machines/${encodeURIComponent(worker.id)}/${what}`);
+    await look();
+  });
+  const button = (what) => element("button", { type: "button", class: "quiet", "aria-label": `${words(what)} ${worker.device}, process ${worker.pid}`,
+    disabled: worker.asked === "kill" || worker.asked === what, onclick: () => ask(what) }, words(what));
   return element("li", {}, icon("machine"), element("div", {}, element("strong", {}, worker.device),
-    ` ${worker.host}, process ${worker.pid} `, element("span", { class: `state ${worker.state}` }, worker.state),
-    element("p", {}, ...doing), element("small", {}, "began ", time(worker.started_at), ", seen ", time(worker.seen_at))));
+    ` ${worker.host}, process ${worker.pid} `, element("span", { class: `state ${worker.state}` }, worker.state), worker.asked === null ? null : ` (asked to ${worker.asked === "kill" ? "end" : "drain"})`,
+    element("p", {}, ...doing), element("small", {}, "began ", time(worker.started_at), ", seen ", time(worker.seen_at))),
+    element("div", { class: "actions" }, button("drain"), button("kill")));
 }
 
 function errorLine(job) {

@@ -1,10 +1,10 @@
 /** The page of all jobs, with the forms of those that begin with neither a capture nor maps. */
 
-import { attempt, load, read } from "./api.js";
-import { byId, show } from "./element.js";
-import { watch } from "./events.js";
-import { enableForms } from "./form.js";
-import { JobsTable } from "./jobs_table.js";
+import { attempt, load, read } from "../api.js";
+import { byId, show } from "../element.js";
+import { watch } from "../events.js";
+import { enableForms } from "../form.js";
+import { JobsTable } from "../jobs_table.js";
 
 const table = new JobsTable(byId("jobs"));
 let next = null;

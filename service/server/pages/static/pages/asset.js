@@ -1,8 +1,8 @@
 /** The page of an exported asset. */
 
-import { load, read } from "./api.js";
-import { byId } from "./element.js";
-import { mountAsset } from "./object/asset.js";
+import { load, read } from "../api.js";
+import { byId } from "../element.js";
+import { mountAsset } from "../object/asset.js";
 
 const identifier = byId("main").dataset.identifier;
 

@@ -1,18 +1,20 @@
 /** The page of one capture: its facts, its frames on the dome, and the forms of the jobs that begin with it. */
 
-import { attempt, listing, load, read } from "./api.js";
-import { byId, element, factText, show, words } from "./element.js";
-import { watch } from "./events.js";
-import { enableForms } from "./form.js";
-import { JobsTable } from "./jobs_table.js";
-import { heldBy, litFacts, offerSteps } from "./object/next_steps.js";
-import { mountPhotographs } from "./object/photographs.js";
-import { removeLater } from "./object/removal.js";
-import { proposalOf } from "./proposal.js";
-import { chosenStep } from "./time_steps.js";
-import { settled } from "./upload.js";
-import { ViewFile } from "./view/view_file.js";
-import { openView } from "./view_jobs.js";
+import { attempt, listing, load, read } from "../api.js";
+import { byId, element, factText, show, words } from "../element.js";
+import { watch } from "../events.js";
+import { enableForms } from "../form.js";
+import { JobsTable } from "../jobs_table.js";
+import { heldBy, litFacts, offerSteps } from "../object/next_steps.js";
+import { mountPhotographs } from "../object/photographs.js";
+import { removeLater } from "../object/removal.js";
+import { proposalOf } from "../upload/proposal.js";
+import { calibrationList } from "./calibrations.js";
+import { offerPreview } from "./preview.js";
+import { chosenStep } from "../time_steps.js";
+import { settled } from "../upload/upload.js";
+import { ViewFile } from "../view/view_file.js";
+import { openView } from "../view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 const table = new JobsTable(byId("jobs"), (job) => job.request.capture === identifier || job.request.intake === identifier);
@@ -62,12 +64,16 @@ function offer(facts) {
     if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
     else if (first.includes(box.querySelector("form").dataset.kind)) byId("first").append(box);
   }
+  offerPreview(byId("preview"), byId("previewed"), identifier, facts, first[0]);
+  const list = calibrationList(facts, byId("more"));
+  if (list !== null) byId("calibrations").append(list);
+  show(byId("calibrations"), list !== null);
   show(byId("work"), true);
 }
 
 async function look(facts) {
   const step = await chosenStep(identifier);
-  const { files } = await openView(identifier, null, step);
+  const { files } = await openView(identifier, null, step, byId("preparing"));
   const view = await ViewFile.open(files);
   if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier);
   show(byId("relight"), view.info.relight !== null && step === null);

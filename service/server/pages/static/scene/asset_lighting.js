@@ -5,6 +5,9 @@ import { DataTexture, DirectionalLight, EquirectangularReflectionMapping, FloatT
 const LARGEST_COLS = 1024; // of a map: three.js makes cubes of a quarter of it
 const QUARTER = 4; // three.js has +x in the middle of a map, Relit +z: a quarter of the width
 const KEPT = 2; // filtered maps: the first, which is the room, and the one that was opened last
+const SHADOW_PX = 2048; // of the shadow map in each direction
+const SHADOW_BIAS = 0.01; // in radii of the object, along the normal: half a pixel of the map at 85° from the light
+const FAR = 3; // radii from the middle of the object to the light that casts shadows
 const ROOM = { cols: 64, rows: 32, sky: 1.35, floor: 0.45, lamp: 5, lampAt: [0.45, 0.6, 0.66], lampCosine: 0.94 };
 
 /** Return a neutral room as an environment map: light from above, and a lamp before the object, above and to the right. */
@@ -75,11 +78,23 @@ export class Lighting {
   #renderer;
   #filtered = new Map(); // of maps, for all roughnesses
   #light = new DirectionalLight();
+  #center;
+  #radius;
 
-  /** @param {import("three").Scene} scene @param {import("three").WebGLRenderer} renderer */
-  constructor(scene, renderer) {
+  /**
+   * @param {import("three").Scene} scene @param {import("three").WebGLRenderer} renderer
+   * @param {import("three").Vector3} center Of the object that casts shadows. @param {number} radius Of it.
+   */
+  constructor(scene, renderer, center, radius) {
     this.#scene = scene;
     this.#renderer = renderer;
+    this.#center = center;
+    this.#radius = radius;
+    renderer.shadowMap.enabled = true;
+    const { shadow } = this.#light;
+    shadow.mapSize.set(SHADOW_PX, SHADOW_PX);
+    shadow.normalBias = SHADOW_BIAS * radius;
+    Object.assign(shadow.camera, { left: -radius, right: radius, top: radius, bottom: -radius, near: (FAR - 1.5) * radius, far: (FAR + 1.5) * radius });
   }
 
   /** Light by an environment map, as `latLongTexture` takes it; a map that is used again is not filtered again. */
@@ -114,14 +129,17 @@ export class Lighting {
    * Light by one distant light.
    * @param {number[]} direction From the object to the light.
    * @param {number[]} irradiance Red, green and blue, on a surface that faces it.
+   * @param {boolean} casts Whether the object casts shadows on itself.
    */
-  byLight(direction, irradiance) {
+  byLight(direction, irradiance, casts) {
     this.#clear();
     const largest = Math.max(...irradiance, Number.MIN_VALUE);
     this.#light.color.setRGB(...irradiance.map((value) => value / largest), LinearSRGBColorSpace);
     this.#light.intensity = largest;
-    this.#light.position.set(...direction);
-    this.#scene.add(this.#light);
+    this.#light.position.set(...direction).multiplyScalar(FAR * this.#radius).add(this.#center);
+    this.#light.target.position.copy(this.#center);
+    this.#light.castShadow = casts;
+    this.#scene.add(this.#light, this.#light.target);
   }
 
   /** Give the filtered maps back, as after the graphics processor has lost them; nothing lights the scene then. */
@@ -139,5 +157,6 @@ export class Lighting {
   #clear() {
     this.#scene.environment = null;
     this.#light.removeFromParent();
+    this.#light.target.removeFromParent();
   }
 }

@@ -1,8 +1,8 @@
 /** What the server takes files for that are no capture yet: a sentence, what is left to be chosen, and the import. */
 
-import { post, Refusal, send } from "./api.js";
-import { element, show } from "./element.js";
-import { entered } from "./form.js";
+import { post, Refusal, send } from "../api.js";
+import { element, show } from "../element.js";
+import { entered } from "../form.js";
 
 const ASKED = ["color_space", "focal_px", "pixel_size_m"]; // what files seldom say, and results depend on
 

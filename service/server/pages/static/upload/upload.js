@@ -1,6 +1,6 @@
 /** Uploads of captures and environments by tus 1.0 (https://tus.io/protocols/resumable-upload), continued after an interruption. */
 
-import { listing, newToken, post, read, Refusal, send } from "./api.js";
+import { listing, newToken, post, read, Refusal, send } from "../api.js";
 
 const PIECE_BYTES = 8 << 20;
 const PARALLEL = 4;

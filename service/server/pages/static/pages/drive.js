@@ -1,13 +1,13 @@
 /** The page of a drive: the levels of the lamps, frame by frame, and the light that they give. */
 
-import { attempt, fetched, listing, load, read, resultsOf, save } from "./api.js";
-import { mountLamps } from "./dome.js";
+import { attempt, fetched, listing, load, read, resultsOf, save } from "../api.js";
+import { mountLamps } from "../dome.js";
 import { mountBalls, mountEnvironment, mountObject } from "./drive_preview.js";
-import { byId, element, show } from "./element.js";
-import { loadEnvironment } from "./environments.js";
-import { DISPLAY_SPACE } from "./view/colour_spaces.js";
-import { ViewFile } from "./view/view_file.js";
-import { openView } from "./view_jobs.js";
+import { byId, element, show } from "../element.js";
+import { loadEnvironment } from "../environments.js";
+import { DISPLAY_SPACE } from "../view/colour_spaces.js";
+import { ViewFile } from "../view/view_file.js";
+import { openView } from "../view_jobs.js";
 
 const identifier = byId("main").dataset.identifier;
 const FILES = ["cues.json", "cues.csv", "rig.json", "report.json"];
@@ -92,7 +92,7 @@ await load(async () => {
     object = null;
     byId("picture-of-object").replaceChildren();
     if (capture === "") return;
-    const { files } = await openView(capture, null);
+    const { files } = await openView(capture, null, null, byId("picture-of-object"));
     object = await mountObject(byId("picture-of-object"), await ViewFile.open(files), directions, light, rig.color_space ?? DISPLAY_SPACE);
     views.push(object);
     present();
