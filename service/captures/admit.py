@@ -71,7 +71,7 @@ def calibrations_of(capture: Capture) -> list[str]:
     manifest = capture.manifest
     there = {"dark": manifest.dark is not None, "flat": manifest.flat is not None,
              "lights": bool(capture.sources()) and not has_placeholders(capture),
-             "colours": any(each.color_matrix is not None for each in (manifest, *manifest.frames))}
+             "colours": manifest.color_matrix is not None or any(frame.color_matrix is not None for frame in manifest.frames)}
     return [name for name, is_there in there.items() if is_there]
 
 

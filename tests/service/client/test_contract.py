@@ -163,7 +163,7 @@ def test_the_shared_views_are_the_answers_of_the_document(document):
                for kind, content in response.get("content", {}).items() if kind == "application/json" and "$ref" in content["schema"]}
     shared = {model.__name__: model for model in vars(shared_answers).values()
               if isinstance(model, type) and issubclass(model, View) and model is not View}
-    assert answers - shared.keys() == {"Health"}
+    assert answers - shared.keys() == {"Health", "AnnotationPage", "AnnotationView"}  # annotations are models of their own, in W3C's form
     assert answers >= {"JobView", "JobPage", "IntakeView", "IntakePage", "ResultPage", "FileView", "FilePage"}
     for name, model in shared.items():
         promised = document["components"]["schemas"][name]
