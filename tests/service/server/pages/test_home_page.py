@@ -94,9 +94,9 @@ def test_jobs_say_why_they_wait_and_how_they_failed(page):
     page.goto("/")
     strip = page.locator("#strip")
     strip.get_by_text("normals 3 of 12, 9.0 s left").wait_for()
-    assert strip.get_by_text("behind Solve · bird 1, which runs").count() == 1  # of the highest priority
-    strip.get_by_text("behind 2 jobs, first Solve · bird 1, which runs").wait_for()
-    strip.get_by_text("behind 3 jobs, first Solve · bird 1, which runs").wait_for()
+    assert strip.get_by_text("behind Solve normals and materials · bird 1, which runs").count() == 1  # of the highest priority
+    strip.get_by_text("behind 2 jobs, first Solve normals and materials · bird 1, which runs").wait_for()
+    strip.get_by_text("behind 3 jobs, first Solve normals and materials · bird 1, which runs").wait_for()
     strip.get_by_text("bird: no frame can be read").wait_for()
     assert strip.locator("li").count() == 5 and strip.locator("img").count() == 0
 
