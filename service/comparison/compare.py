@@ -17,6 +17,7 @@ from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report
 from service.requests.register import Alignment, CompareRequest
 from service.scans.points.neighbours import neighbours_are_installed
+from stage.errors import ScanError
 from stage.files import replacing, write_text
 from stage.formats.ply import COLOUR, NORMAL, POSITION, header
 from stage.sets.scan_set import UNITS_M
@@ -30,6 +31,8 @@ PATCH_SPACINGS = 4.0
 """Side of a patch in distances of neighbouring points: it holds some sixteen."""
 SPACING_POINTS = 2000
 """Points whose distances to their neighbours are looked at."""
+NEIGHBOUR = 4
+"""The neighbour of a point that is one step away on a square grid."""
 WHOLE = "whole surface"
 FAR = 0.1
 """Part of the scan that does not belong to the design from which it is said."""
@@ -89,7 +92,7 @@ def compare(request: CompareRequest, progress: Progress | None = None) -> Compar
     patches = patches_of(found, design, placement, patch_m=patch, shared_m=request.shared_sigma_m)
     strange = standing_on(design, found, patches, patch_m=patch)
     verdicts, k = decide(regions, patches, strange, design, unit_m=unit_m, patch_m=patch, false_alarm=request.false_alarm,
-                         least_seen=request.least_seen)
+                         least_seen=request.least_seen, one_pose=not placement.rivals)
     warnings = _warnings(scan, placement, found)
     timings.stage("write", 1)
     span = span_of(found)
@@ -141,15 +144,18 @@ def _spacing(points: np.ndarray) -> float:
     """Return the median distance of a point to its fourth neighbour, which on a square grid is one step."""
     from scipy.spatial import cKDTree
 
+    points = np.unique(points, axis=0)  # files of triangles have corners more than once
+    if len(points) <= NEIGHBOUR:
+        raise ScanError(f"the scan has {len(points)} different points: too few to compare")
     chosen = points[np.random.default_rng(0).permutation(len(points))[:SPACING_POINTS]]
-    return float(np.median(cKDTree(points).query(chosen, k=5)[0][:, 4]))
+    return float(np.median(cKDTree(points).query(chosen, k=NEIGHBOUR + 1)[0][:, NEIGHBOUR]))
 
 
 def _warnings(scan: ScannedSurface, placement: Placement, found: Deviations) -> list[str]:
     warnings = []
     if placement.rivals:
         warnings.append(f"{placement.rivals} other poses fit about as well, as of a part that looks the same when it is turned: regions "
-                        "may be those of another side; place the scan roughly, and give --align refine")
+                        "may be those of another side, and none is decided; place the scan roughly, and give --align refine")
     if placement.held:
         warnings.append(f"the surface leaves {placement.held} of 6 motions of the scan open, as that of a cylinder about its axis: they "
                         "stay as they are, and what is shifted along the surface is not seen")

@@ -64,6 +64,7 @@ class _Fit(NamedTuple):
     pivot: np.ndarray
     covariance: np.ndarray
     held: int
+    open_still: np.ndarray  # [6, 6]: what is left of a motion after the fit: the part that is held
 
 
 Wanted = Callable[[Offsets], np.ndarray]
@@ -110,7 +111,10 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
         by_datum = _fit(design, scan, drawn[:MANY], fitted, reach_m, datum)
         if by_datum is None:
             raise ScanError("regions: too little of the datum regions is in the scan to lay it on them")
-        last = by_datum
+        turn = np.eye(6)
+        turn[3:, :3] = np.cross(np.eye(3), by_datum.pivot - last.pivot).T
+        open_still = by_datum.open_still @ turn
+        last = by_datum._replace(covariance=by_datum.covariance + open_still @ last.covariance @ open_still.T)
     return Placement(last.pose, last.pivot, last.covariance, rivals, last.held, _along_normals(design, scan, drawn[:SOME], last, reach_m))
 
 
@@ -181,7 +185,7 @@ def _matched(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.nd
 def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarray, reach: float, wanted: Wanted | None = None, *,
          still: float = STILL) -> _Fit | None:
     """Return the pose near another that brings points of a scan onto the design; None if too few can be matched."""
-    covariance, held, pivot = np.zeros((6, 6)), 6, np.zeros(3)
+    covariance, held, pivot, open_still = np.zeros((6, 6)), 6, np.zeros(3), np.eye(6)
     for _ in range(STEPS):
         found, points = _matched(design, scan, rows, pose, reach)
         if wanted is not None:
@@ -203,10 +207,11 @@ def _fit(design: Design, scan: ScannedSurface, rows: np.ndarray, pose: np.ndarra
         step = -inverse @ (jacobian.T @ (weight * found.distance))
         noise = jacobian * (weight * scan.sigma[points])[:, None]
         covariance, held = inverse @ (noise.T @ noise) @ inverse, int((~told).sum())
+        open_still = np.eye(6) - inverse @ jacobian.T @ (jacobian * weight[:, None])
         pose = moved(step, pivot, pose)
         if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < still * reach:
             break
-    return _Fit(pose, pivot, covariance, held)
+    return _Fit(pose, pivot, covariance, held, open_still)
 
 
 def gradient(points: np.ndarray, across: np.ndarray, pivot: np.ndarray) -> np.ndarray:

@@ -59,7 +59,7 @@ def inside(region: ToleranceRegion, points: np.ndarray, normals: np.ndarray, uni
 
 
 def decide(regions: Sequence[ToleranceRegion], patches: Patches, strange: tuple[np.ndarray, np.ndarray], design: Design, *,
-           unit_m: float, patch_m: float, false_alarm: float, least_seen: float) -> tuple[list[RegionVerdict], float]:
+           unit_m: float, patch_m: float, false_alarm: float, least_seen: float, one_pose: bool) -> tuple[list[RegionVerdict], float]:
     """Decide about every region, and return with how many σ.
 
     A region fails if the mean of any patch is more than k σ outside of a limit, and passes if all are more than k σ inside of both, the
@@ -68,12 +68,17 @@ def decide(regions: Sequence[ToleranceRegion], patches: Patches, strange: tuple[
 
     Args:
         strange: places and normals of `deviations.standing_on`.
+        one_pose: no other pose fits about as well: else nobody knows what lies in a part of the surface, and only the whole is decided.
     """
     of_region = [inside(region, patches.middle, patches.normal, unit_m) for region in regions]
     k = threshold(false_alarm, 2 * max(sum(int(each.sum()) for each in of_region), 1), sides=1)
     tree = cKDTree(_facing_points(patches.middle, patches.normal, patch_m)) if len(patches.middle) else None
-    return [_decide(region, patches, chosen, int(inside(region, *strange, unit_m).sum()), design, tree, k, unit_m, patch_m, least_seen)
-            for region, chosen in zip(regions, of_region, strict=True)], k
+    found = [_decide(region, patches, chosen, int(inside(region, *strange, unit_m).sum()), design, tree, k, unit_m, patch_m, least_seen)
+             for region, chosen in zip(regions, of_region, strict=True)]
+    if not one_pose:
+        found = [each if region.is_whole or each.verdict is Verdict.NOT_INSPECTED else each._replace(verdict=Verdict.UNDECIDED)
+                 for region, each in zip(regions, found, strict=True)]
+    return found, k
 
 
 def _decide(region: ToleranceRegion, patches: Patches, chosen: np.ndarray, strange: int, design: Design, tree: cKDTree | None, k: float,

@@ -16,6 +16,11 @@ from stage.formats.triangles import Triangles, read_triangles, without_empty_fac
 PLY = ".ply"
 ON_SURFACE = 1e-6
 """Points nearer than this part of the design's size lie on it: which way they are off is told by the face alone."""
+STRAY = 1e-3
+ON_EDGE = 1e-5
+"""A point lies on the edge across from a corner that has less than this weight."""
+NO_VOLUME = 1e-9
+"""The least volume of a closed design, in the cube of its size."""
 LEAST_SCAN = 100
 """The fewest points of a scan that is compared."""
 
@@ -32,8 +37,8 @@ class ScannedSurface(NamedTuple):
 
     @property
     def size(self) -> float:
-        """The diagonal of the box around the points, metres."""
-        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        """The diagonal of the box around the points, metres, without a thousandth of them at each side, as stray ones."""
+        return float(np.linalg.norm(np.ptp(np.quantile(self.points, (STRAY, 1 - STRAY), axis=0), axis=0)))
 
 
 class Offsets(NamedTuple):
@@ -58,6 +63,15 @@ class Design:
         self.areas: np.ndarray = length / 2
         self.size: float = float(np.linalg.norm(np.ptp(self.points, axis=0)))
         self._corners, self._search = corners, NearestOnMesh(self.points, self.faces, device=device)
+        welded = np.unique(self.points, axis=0, return_inverse=True)[1].reshape(-1)[self.faces]
+        start, end = welded[:, [1, 2, 0]], welded[:, [2, 0, 1]]  # the edges across from each corner
+        ahead, back = start * np.int64(len(self.points)) + end, end * np.int64(len(self.points)) + start
+        self._border: np.ndarray = ~np.isin(ahead, back)
+        self._rim: np.ndarray = np.isin(welded, np.concatenate([start[self._border], end[self._border]]))
+        middle = corners - self.points.mean(axis=0)
+        volume = float(np.einsum("fi,fi->", middle[:, 0], np.cross(middle[:, 1], middle[:, 2]))) / 6
+        self.inward: bool = np.array_equal(np.sort(ahead, axis=None), np.sort(back, axis=None)) and volume < NO_VOLUME * self.size**3
+        """The faces are closed, but their fronts do not turn outward."""
 
     def sample(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points [count, 3] that lie evenly on the surface, always the same, and the faces [count] that they lie on."""
@@ -70,9 +84,15 @@ class Design:
         return np.einsum("nk,nki->ni", share, self._corners[face]), face
 
     def offsets(self, points: np.ndarray, within: float) -> Offsets:
-        """Return where points [n, 3] in the frame of the design lie against it, those that are nearer than `within` metres."""
+        """Return where points [n, 3] in the frame of the design lie against it, those that are nearer than `within` metres, and not beyond
+        the border of an open surface."""
         found = self._search.search(points, within)
         near = np.flatnonzero(found.face >= 0)
+        face, share = found.face[near], found.share[near]
+        apart = points[near] - np.einsum("nk,nki->ni", share, self._corners[face])
+        aside = np.linalg.norm(apart - (apart * self.normals[face]).sum(axis=1, keepdims=True) * self.normals[face], axis=1)
+        ends = (self._border[face] & (share < ON_EDGE)) | (self._rim[face] & (share > 1 - ON_EDGE))
+        near = near[~ends.any(axis=1) | (aside <= ON_SURFACE * self.size)]
         face = found.face[near]
         at = np.einsum("nk,nki->ni", found.share[near], self._corners[face])
         apart = points[near] - at
@@ -93,7 +113,10 @@ def read_design(path: Path, unit_m: float, *, device: str) -> Design:
         mesh = without_empty_faces(points, faces, path)
     else:
         mesh = read_triangles(path)
-    return Design(mesh._replace(points=mesh.points * unit_m), device=device)
+    design = Design(mesh._replace(points=mesh.points * unit_m), device=device)
+    if design.inward:
+        raise ResultError(f"{path}: its faces turn their fronts inward, or both ways: turn them over, so that outside is known")
+    return design
 
 
 def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSurface:
@@ -114,11 +137,14 @@ def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSur
         raise ResultError(f"{file}: has {len(points)} points: {LEAST_SCAN} are the fewest that are compared")
     if normals is None:
         normals = _estimated_normals(points, file) if faces is None else _normals_of_faces(points, faces)
+    normals = np.nan_to_num(normals, posinf=0, neginf=0)
     outward = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     source = "declared" if sigma_m is not None else "measured" if sigma is not None else "estimated"
     if sigma_m is not None:
         spread = np.full(len(points), sigma_m)
     elif sigma is not None:
+        if not (np.isfinite(sigma) & (sigma > 0)).all():
+            raise ResultError(f"{file}: has a sigma that is not a positive number: give --sigma-m")
         spread = sigma * unit_m
     else:
         scatter = robust_scatter(local_planes(points.astype(np.float32), origin=points.mean(axis=0)))

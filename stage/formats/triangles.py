@@ -54,15 +54,17 @@ def _merged(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _stl(content: bytes, path: Path) -> np.ndarray:
     """Return the corners [F, 3, 3] of an STL file."""
     count = int.from_bytes(content[STL_HEADER - 4:STL_HEADER], "little")
-    if len(content) >= STL_HEADER + count * FACET.itemsize and (count or not content.lstrip().startswith(b"solid")):
+    if len(content) >= STL_HEADER + count * FACET.itemsize and (count or content.lstrip()[:5].lower() != b"solid"):
         return np.frombuffer(content, dtype=FACET, count=count, offset=STL_HEADER)["corners"].astype(np.float64)
-    if not content.lstrip().startswith(b"solid"):
+    if content.lstrip()[:5].lower() != b"solid":
         raise ResultError(f"{path}: is truncated, or no STL file: it announces {count} facets and has {len(content)} bytes")
-    lines = [line.split() for line in content.decode("ascii", "replace").splitlines()]
+    lines = [line.split() for line in content.decode("ascii", "replace").lower().splitlines()]
     try:
         corners = np.array([words[1:4] for words in lines if words[:1] == ["vertex"]], dtype=np.float64)
     except ValueError as error:
         raise ResultError(f"{path}: has a vertex that is not three numbers") from error
+    if corners.size and corners.shape[1:] != (3,):
+        raise ResultError(f"{path}: has a vertex that is not three numbers")
     if corners.size % 9 or not [words for words in lines if words[:1] == ["endsolid"]]:
         raise ResultError(f"{path}: is truncated: its last facet or its endsolid is missing")
     return corners.reshape(-1, 3, 3)
@@ -72,18 +74,26 @@ def _obj(content: bytes, path: Path) -> np.ndarray:
     """Return the corners [F, 3, 3] of an OBJ file."""
     points: list[list[str]] = []
     faces: list[tuple[int, int, int]] = []
+    polygons: list[int] = []
     try:
         for words in (line.split() for line in content.decode("utf-8", "replace").splitlines()):
             if words[:1] == ["v"]:
                 points.append(words[1:4])
             elif words[:1] == ["f"]:
                 polygon = [int(word.partition("/")[0]) for word in words[1:]]
-                at = [number - 1 if number > 0 else len(points) + number for number in polygon]
+                at = [number - 1 if number > 0 else len(points) + number if number else -1 for number in polygon]
                 faces += [(at[0], at[k], at[k + 1]) for k in range(1, len(at) - 1)]
+                polygons += [len(polygons)] * (len(at) - 2)
         places = np.array(points, dtype=np.float64).reshape(-1, 3)
     except ValueError as error:
         raise ResultError(f"{path}: has a line that is not understood: {error}") from error
     index = np.array(faces, dtype=np.int64).reshape(-1, 3)
     if index.size and (index.min() < 0 or index.max() >= len(places)):
         raise ResultError(f"{path}: has a face of a vertex that is not there")
-    return places[index]
+    corners = places[index]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    of, whole = np.array(polygons, dtype=np.int64), np.zeros((len(index), 3))
+    np.add.at(whole, of, across)
+    if (np.einsum("fi,fi->f", across, whole[of]) < -1e-9 * (whole[of] ** 2).sum(axis=1)).any():
+        raise ResultError(f"{path}: has a polygon that is not convex: export it as triangles")
+    return corners

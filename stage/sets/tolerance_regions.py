@@ -27,6 +27,11 @@ class ToleranceRegion(Strict):
     datum: bool = False
     """Whether the scan is laid on the design by this region, and others like it, alone."""
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all of the surface."""
+        return self.box is None and self.facing is None
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.tolerance[0] >= self.tolerance[1]:

@@ -116,10 +116,7 @@ def test_a_datum_carries_the_scan(tmp_path, part):
 
 def test_what_the_surface_leaves_open_is_said(tmp_path):
     random = np.random.default_rng(1)
-    corners = np.array([[x, y, z] for x in (-20, 20) for y in (-12, 12) for z in (-3, 3)], float)
-    plate = Part(corners, np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-                                    [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
-    for number, made in enumerate((cylinder(), plate)):
+    for number, made in enumerate((cylinder(), box(40, 24, 6))):
         scan = write_scan(tmp_path / "scan.ply", scan_of(made, random, 10_000, any_pose(random)))
         result = compare(request(tmp_path, scan, write_stl(tmp_path / "design.stl", made), tolerance_m=(-1e-4, 1e-4)))
         placement = reported(result)["placement"]
@@ -191,3 +188,86 @@ def test_bare_points_have_the_side_from_which_they_were_seen(tmp_path):
     assert facts["compared"] > 0.95 * facts["points"] and seen.rms_m == pytest.approx(SIGMA_M, rel=0.05)
     with pytest.raises(ResultError, match="neither faces nor normals"):
         compare(request(tmp_path, bare(None), design))
+
+
+def box(x, y, z) -> Part:
+    """Return a closed box about the origin, from z = 0 upward, mm."""
+    corners = np.array([[i, j, k] for i in (-x / 2, x / 2) for j in (-y / 2, y / 2) for k in (0, z)], float)
+    return Part(corners, np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+                                   [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]))
+
+
+@pytest.mark.parametrize(("thick", "depth"), [(1, 0.7), (3, 2.5)])
+def test_the_floor_of_a_pocket_near_the_other_side_of_a_wall_is_not_overlooked(tmp_path, thick, depth):
+    made = box(80, 50, thick)
+    scan = scan_of(made, np.random.default_rng(7), 40_000, None, None,
+                   lambda points, normals: np.where((np.hypot(points[:, 0], points[:, 1]) < 7) & (normals[:, 2] > 0.9), -depth, 0))
+    (top,) = compare(request(tmp_path, write_scan(tmp_path / "scan.ply", scan), write_stl(tmp_path / "design.stl", made), align="none",
+                             regions=regions(tmp_path, REGIONS[:1]))).regions
+    assert top.verdict == "undecided" and top.strange > 0 and top.seen > 0.9
+
+
+def test_regions_of_a_part_that_looks_the_same_when_turned_are_not_decided(tmp_path):
+    """A cube of which one side is half a millimetre too high in its middle: the pose may lay any side on the one that is judged."""
+    made, random = box(40, 40, 40), np.random.default_rng(7)
+    scan = scan_of(made, random, 20_000, any_pose(random), None,
+                   lambda points, normals: np.where((np.hypot(points[:, 0] - 10, points[:, 1] - 5) < 3) & (normals[:, 2] > 0.9), 0.5, 0))
+    result = compare(request(tmp_path, write_scan(tmp_path / "scan.ply", scan), write_stl(tmp_path / "design.stl", made),
+                             regions=regions(tmp_path, REGIONS[:1]), tolerance_m=(-1e-4, 1e-4)))
+    assert [str(region.verdict) for region in result.regions] == ["undecided", "fail"]  # the whole surface is decided in any pose
+
+
+def test_stray_points_decide_nothing(tmp_path, part):
+    made, design = part
+    random = np.random.default_rng(7)
+    scan = scan_of(made, random, 30_000)
+    stray = random.choice(len(scan.points), 300, replace=False)
+    scan.points[stray] += scan.normals[stray] * random.normal(0, 1e-3, (300, 1))
+    scan.points[0] = [5, 0, 0]
+    (top,) = compare(request(tmp_path, write_scan(tmp_path / "scan.ply", scan), design, regions=regions(tmp_path, REGIONS[:1]))).regions
+    assert top.verdict == "undecided" and max(-top.least_m, top.most_m) > 0.8e-4
+
+
+def test_points_beyond_the_border_of_an_open_design_are_not_compared(tmp_path, part):
+    made, _ = part
+    kept = (made.normals()[:, 2] > 1e-9) & (made.points[made.faces][:, :, 0].max(axis=1) < 20)
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(7), 30_000))
+    result = compare(request(tmp_path, scan, write_stl(tmp_path / "open.stl", made._replace(faces=made.faces[kept])), align="none"))
+    assert result.rms_m == pytest.approx(SIGMA_M, rel=0.05)
+
+
+def test_inputs_that_say_no_outside_or_no_σ_are_refused(tmp_path, part):
+    made, design = part
+    plain = scan_of(made, np.random.default_rng(7), 5000)
+    scan = write_scan(tmp_path / "scan.ply", plain)
+    for number, faces in enumerate((made.faces[:, ::-1], np.concatenate([made.faces, made.faces[:, ::-1]]))):
+        with pytest.raises(ResultError, match="fronts inward"):
+            compare(request(tmp_path, scan, write_stl(tmp_path / f"{number}.stl", made._replace(faces=faces)), align="none"))
+    with pytest.raises(ScanError, match="no point comes within"):
+        compare(request(tmp_path, write_scan(tmp_path / "in.ply", plain._replace(normals=-plain.normals)), design, align="none"))
+    with pytest.raises(ResultError, match="sigma that is not a positive"):
+        compare(request(tmp_path, write_scan(tmp_path / "negative.ply", plain, -1e-5), design))
+    concave = tmp_path / "concave.obj"
+    concave.write_text("v 0 0 0\nv 4 0 0\nv 4 4 0\nv 3 4 0\nv 3 1 0\nv 0 1 0\nf 1 2 3 4 5 6\n")
+    with pytest.raises(ResultError, match="not convex"):
+        compare(request(tmp_path, scan, concave))
+
+
+def test_points_that_a_file_holds_often_count_by_their_places(tmp_path, part):
+    made, design = part
+    plain = scan_of(made, np.random.default_rng(7), 5000)
+    found = [compare(request(tmp_path, write_scan(tmp_path / "scan.ply", plain._replace(
+        points=np.repeat(plain.points, often, axis=0), normals=np.repeat(plain.normals, often, axis=0))), design, align="none"))
+        for often in (1, 6)]
+    assert 0.8 < found[1].smallest_fault_m / found[0].smallest_fault_m < 1.2  # medians of 2000 points
+
+
+def test_what_a_datum_leaves_open_keeps_the_σ_of_the_rest(tmp_path, part):
+    """The plane below holds no shift along itself: the sides are as sure as the fit of all surfaces is."""
+    made, design = part
+    scan = write_scan(tmp_path / "scan.ply", scan_of(made, np.random.default_rng(2), 20_000))
+    given = [{"name": "plate", "facing": [0, 0, -1], "tolerance": [-1, 1], "datum": True}]
+    free, held = (np.array(reported(compare(request(tmp_path, scan, design, align="refine", **more)))["placement"]["covariance"])
+                  for more in ({}, {"regions": regions(tmp_path, given)}))
+    assert np.diag(held)[3:5] == pytest.approx(np.diag(free)[3:5], rel=0.5)  # about another pivot
+    assert held[5, 5] > free[5, 5]
