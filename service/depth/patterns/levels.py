@@ -12,6 +12,8 @@ import numpy as np
 
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
+from kernels.structured.response import bent_wave, fitted_curve
+from service.depth.patterns.decoders import PatternProjector
 from service.depth.patterns.pattern_checks import ENOUGH, Sample
 from stage.patterns.binary import BinaryCode
 from stage.patterns.codes import Collected
@@ -28,6 +30,9 @@ LIT_SIGMAS = 20.0
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 
+UNKNOWN_RESPONSE = "; if the projector is far from linear, measure it with relit calibrate response: its waves of three steps look so too"
+"""What is said besides where no response is declared."""
+
 
 class EvenLevels(NamedTuple):
     """Sums of frames that are the same at a pixel, as weights [sums, frames]; None without two of a kind."""
@@ -38,10 +43,15 @@ class EvenLevels(NamedTuple):
     """Waves over their shifts."""
     bits: np.ndarray | None
     """Differences of the bits and their inverses."""
+    bend: float = 0.0
+    """Largest difference of the sums of waves of the declared response, as a part of white: three shifts do not even out its third
+    harmonic."""
 
     @classmethod
-    def of(cls, collected: Collected, frames: int) -> "EvenLevels":
+    def of(cls, collected: Collected, frames: int, response: Sequence[float] | None) -> "EvenLevels":
         """Return the sums that a capture has; where no code has waves none, because stripes are read rightly from mixed frames."""
+        light: np.ndarray = bent_wave(response)
+        means: list[float] = []
         pairs: list[tuple[int, int]] = []
         waves: list[np.ndarray] = []
         phases = [code for code in collected.codes if isinstance(code, PhaseCode)]
@@ -52,12 +62,15 @@ class EvenLevels(NamedTuple):
             for period in dict.fromkeys(phase.periods_px):
                 members = [index for index, other in enumerate(phase.periods_px) if other == period]
                 if len(members) >= FULL_STEPS:
-                    mean = weights(np.array([phase.shifts[index] for index in members]), period)[:, 0]
-                    waves.append(_row(frames, [phase.frames[index] for index in members], mean))
+                    shifts = np.array([phase.shifts[index] for index in members])
+                    table = weights(shifts, period)
+                    waves.append(_row(frames, [phase.frames[index] for index in members], table[:, 0]))
+                    means.extend(fitted_curve(light, table, shifts)[1] if response is not None else ())
         several = len(pairs) > 1
         return cls(np.stack([_row(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
                    np.stack(waves) if len(waves) > 1 else None,
-                   np.stack([_row(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None)
+                   np.stack([_row(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None,
+                   float(np.ptp(means)) if means else 0.0)
 
     def mixed(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return where readings [frames, pixels] have levels that no pattern has, [pixels] bool.
@@ -74,7 +87,7 @@ class EvenLevels(NamedTuple):
 
         if self.waves is not None:
             sums = self.waves.astype(np.float32) @ grey
-            found |= clear(np.ptp(sums, axis=0), self.waves, sums.mean(axis=0), WAVE_PART)
+            found |= clear(np.ptp(sums, axis=0), self.waves, sums.mean(axis=0), WAVE_PART + self.bend)
         if self.pairs is not None and self.bits is not None:
             sums, bits = self.pairs.astype(np.float32) @ grey, self.bits.astype(np.float32) @ grey
             seen = np.abs(bits) >= CLEAR_BIT * np.abs(bits).max(axis=0)
@@ -91,17 +104,15 @@ def _row(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:
     return row
 
 
-def check_levels(sample: Sample, collected: Collected, noise: NoiseModel) -> str | None:
+def check_levels(sample: Sample, collected: Collected, projector: PatternProjector, noise: NoiseModel) -> str | None:
     """Return a sentence if much of a sample has levels that no pattern has."""
     grey = sample.grey
-    lit = sample.mask.ravel() & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
-    if sample.saturated is not None:
-        lit &= ~sample.saturated.any(axis=0)
+    lit = sample.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
     if lit.sum() < ENOUGH:
         return None
-    share = float(EvenLevels.of(collected, len(grey)).mixed(grey[:, lit], noise).mean())
+    share = float(EvenLevels.of(collected, len(grey), projector.response).mixed(grey[:, lit], noise).mean())
     if share < MOST_MIXED:
         return None
     return (f"frames: {100 * share:.0f} % of the lit pixels have levels that no pattern has (bits and their inverses, or waves over their "
             "shifts, do not add up to the same light): the camera has recorded parts of two patterns, or what it sees has moved: wait "
-            "longer for each pattern, or synchronise projector and camera")
+            f"longer for each pattern, or synchronise projector and camera{'' if projector.response else UNKNOWN_RESPONSE}")

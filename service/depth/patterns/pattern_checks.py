@@ -46,6 +46,8 @@ EXPONENTS = (0.45, 0.6, 0.8, 1.0, 1.25, 1.5, 1.8, 2.2, 2.6)
 """Exponents of light = level^γ that are compared."""
 BAD_FIT, BETTER_FIT = 3.0, 0.5
 """Mean squared residual of unbent waves, in variances of noise, above which bent ones are tried, and what part these may leave."""
+FULL_PART = 0.999
+"""Part of the largest reading of a sample from which on one may be clipped: corrections of the frames leave clipped ones that even."""
 LEAST_SIGNAL = 20.0
 """Least white minus black, in deviations of a reading, of pixels whose levels are compared."""
 
@@ -65,6 +67,14 @@ class Sample(NamedTuple):
         if self.values.shape[1] == 1:
             return self.values[:, 0]
         return np.tensordot(self.values, np.array(GREY_WEIGHTS, np.float32), ([1], [0]))
+
+    @property
+    def whole(self) -> np.ndarray:
+        """Return [pixels] bool: in the mask and clipped in no frame, neither as marked nor at the largest reading of all: nothing need
+        declare where 8-bit files end."""
+        bright = self.values.max(axis=(0, 1))
+        inside = self.mask.ravel() & (bright < FULL_PART * bright.max(initial=0.0))
+        return inside if self.saturated is None else inside & ~self.saturated.any(axis=0)
 
 
 def sample_of(planes: Planes, camera: Camera, mask: np.ndarray) -> Sample:
@@ -231,9 +241,7 @@ def _exponent_of_mean(sample: Sample, code: PhaseCode, collected: Collected, noi
             return None
         span = np.max([np.abs(grey[a] - grey[b]) for a, b in zip(pair.frames, pair.inverses, strict=True)], axis=0)
         dark = 0.5 * (grey[pair.frames[-1]] + grey[pair.inverses[-1]] - span)
-    good = sample.mask.ravel() & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
-    if sample.saturated is not None:
-        good &= ~sample.saturated.any(axis=0)
+    good = sample.whole & (span > LEAST_SIGNAL * np.sqrt(2 * noise.read**2 + noise.gain * np.maximum(2 * dark + span, 0)))
     if good.sum() < ENOUGH:
         return None
     shifts, periods = np.array(code.shifts), np.array(code.periods_px)
@@ -255,9 +263,8 @@ def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, proj
     """Return the exponent whose waves fit the readings best, where unbent waves do not fit them."""
     grey = sample.grey[list(code.frames)].astype(np.float64)
     if len(code.frames) < 5:  # offset, amplitude and place leave one reading over at most
-        whole = sample.mask.ravel() if sample.saturated is None else sample.mask.ravel() & ~sample.saturated[list(code.frames)].any(axis=0)
         alone = len(set(code.periods_px)) == 1
-        return exponent_of_swing(grey[:, whole], code.shifts, code.periods_px[0], EXPONENTS, noise) if alone else 1.0
+        return exponent_of_swing(grey[:, sample.whole], code.shifts, code.periods_px[0], EXPONENTS, noise) if alone else 1.0
     variance = noise.read**2 + noise.gain * np.maximum(grey.mean(axis=0), 0)
     misfit = {}
     for exponent in EXPONENTS:

@@ -160,7 +160,7 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     patterns = [frame.pattern for frame in frames if frame.pattern is not None]
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
-    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, noise)
+    wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, noise)
     if wrong is not None:
         return [wrong], codes
     if shown.response is None:

@@ -148,7 +148,8 @@ NO_SIGNAL = (Status.UNSOLVED, Status.LOW_MODULATION, Status.SATURATED)
 MOST_OF_SCENE = 0.5
 """Part of the pixels from which a disagreement of the frequencies is told of."""
 SCATTERED_RAD = 0.1
-"""Median disagreement of the frequencies beyond noise above which no range is believed: a third harmonic of 8 % bends phases by no more."""
+"""Median disagreement of the frequencies beyond noise above which no range is believed: the third harmonic
+of square waves, 11 %, bends phases by two thirds of it."""
 
 
 def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
@@ -208,7 +209,8 @@ def solve_correlations(frames: CorrelationImages, options: TofOptions, calibrati
     sure = (np.isin(status, SOLVED) & lit).reshape(rows, cols)
     if wrong is None:
         wrong = misread_direction(ranges.range.numpy()[:pixels].reshape(rows, cols),
-                                  found.amplitude.numpy()[-1, :pixels].reshape(rows, cols), sure)
+                                  found.amplitude.numpy()[-1, :pixels].reshape(rows, cols), sure, nearest_m=nearest,
+                                  repeat_m=common_range_m(frames.modulation_hz, SPEED_OF_LIGHT))
     if wrong is None:
         size_rad, wrong = _disagreement(further[usable.reshape(-1)], len(straight) == len(found.modulation_hz))
     if wrong is not None and size_rad > SCATTERED_RAD:
@@ -248,7 +250,7 @@ def _disagreement(further: np.ndarray, calibrated: bool) -> tuple[float, str | N
     size_rad = float(np.sqrt(np.median(further[further > 0])))
     advice = ("check that the calibration is of this camera" if calibrated
               else "measure the wiggling with relit calibrate tof and give --tof-calibration")
-    so = ("no range is believed, because wiggling alone bends phases less than that" if size_rad > SCATTERED_RAD
+    so = ("no range is believed, because wiggling seldom bends phases by that much" if size_rad > SCATTERED_RAD
           else "the standard deviations hold what the frequencies disagree by, not an error that they share")
     return size_rad, (f"frames[].tof: the phases of the frequencies disagree by {1000 * size_rad:.0f} mrad more than noise at "
                       f"{100 * part:.0f} % of the pixels, by wiggling or by light that comes over several ways, as in fog: {advice}, and "
