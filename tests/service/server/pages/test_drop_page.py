@@ -70,10 +70,10 @@ def test_what_files_do_not_say_is_asked_for(server, page, tmp_path):
     folder = write_four_phases(tmp_path / tmp_path.name)
     page.goto("/captures")
     page.set_input_files("#folder", folder)
-    field = page.get_by_label("Frequencies hz")
+    field = page.get_by_label("Frequencies (Hz)")
     field.wait_for(timeout=UPLOAD_MS)
     page.get_by_role("button", name="Import", exact=True).click()
-    page.get_by_text("Frequencies hz: choose one").wait_for()
+    page.get_by_text("Frequencies (Hz): choose one").wait_for()
     page.reload()  # what was looked at can be imported later
     page.get_by_role("row", name=folder.name).get_by_role("button", name="Choose and import").click()
     field.fill("60e6")

@@ -158,7 +158,7 @@ def test_forms_of_several_captures_and_images(page, capture, patterns):
     page.goto(f"/captures/{patterns}")
     form = opened_form(page, "Calibrate camera and projector", options=False)
     form.get_by_label("Board").fill("9x6")
-    form.get_by_label("Square m").fill("0.03")
+    form.get_by_label("Square (metres)").fill("0.03")
     command = form.locator("[data-shows=command]").inner_text()
     assert f"calibrate-procam {patterns} " in command and command.endswith("--board 9x6 --square-m 0.03")  # the page's capture is entered
     page.goto(f"/captures/{capture}")
