@@ -30,8 +30,8 @@ LIT_SIGMAS = 20.0
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 
-UNKNOWN_RESPONSE = "; if the projector is far from linear, measure it with relit calibrate response: its waves of three steps look so too"
-"""What is said besides where no response is declared."""
+UNKNOWN_RESPONSE = "; if the projector is far from linear, measure it with relit calibrate response, for waves of three steps look so too then"
+"""What is said besides of waves of three steps where no response is declared."""
 
 
 class EvenLevels(NamedTuple):
@@ -110,9 +110,11 @@ def check_levels(sample: Sample, collected: Collected, projector: PatternProject
     lit = sample.whole & (np.ptp(grey, axis=0) > LIT_SIGMAS * np.sqrt(noise.read**2 + noise.gain * np.maximum(grey.max(axis=0), 0)))
     if lit.sum() < ENOUGH:
         return None
-    share = float(EvenLevels.of(collected, len(grey), projector.response).mixed(grey[:, lit], noise).mean())
+    levels = EvenLevels.of(collected, len(grey), projector.response)
+    share = float(levels.mixed(grey[:, lit], noise).mean())
     if share < MOST_MIXED:
         return None
+    unknown = projector.response is None and levels.waves is not None and ((levels.waves != 0).sum(axis=1) == FULL_STEPS).any()
     return (f"frames: {100 * share:.0f} % of the lit pixels have levels that no pattern has (bits and their inverses, or waves over their "
             "shifts, do not add up to the same light): the camera has recorded parts of two patterns, or what it sees has moved: wait "
-            f"longer for each pattern, or synchronise projector and camera{'' if projector.response else UNKNOWN_RESPONSE}")
+            f"longer for each pattern, or synchronise projector and camera{UNKNOWN_RESPONSE if unknown else ''}")

@@ -7,11 +7,12 @@ import pytest
 
 from service.depth.depth import depth
 from service.requests.depth import DepthRequest
-from tests.scenes.captures import write_exr
+from tests.scenes.captures import write_exr, write_image
 from tests.scenes.depth import AMBIENT, gray_patterns, make_scene, manifest, phase_patterns, shown
 
 NUMBERED = [*phase_patterns("column", 16.0), *gray_patterns("column", stripe=8)]
 SEVERAL = [*phase_patterns("column", 16.0), *phase_patterns("column", 18.0), *phase_patterns("column", 21.0)]
+THREE = [*phase_patterns("column", 16.0, 3), *phase_patterns("column", 18.0, 3), *phase_patterns("column", 21.0, 3)]
 NOISE = 0.003
 
 
@@ -47,3 +48,34 @@ def test_whole_frames_raise_no_doubt(tmp_path, scene, patterns, gamma):
     result = measured(tmp_path, scene, patterns, 0.0, gamma=gamma)
     assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
     assert gamma != 1.0 or result.maps.mask[~scene.shaded].mean() > 0.9
+
+
+def test_three_steps_of_a_declared_response_raise_no_doubt(tmp_path, scene):
+    """Three shifts do not even out the third harmonic of a response that is steep in the middle: their sums differ as it says."""
+    frames = []
+    rng = np.random.default_rng(4)
+    for number, pattern in enumerate(THREE):
+        level = shown(pattern, scene.uv)
+        light = scene.albedo[..., 1] * (0.8 * level**2 * (3 - 2 * level) * ~scene.shaded + AMBIENT) + rng.normal(0, NOISE, level.shape)
+        write_exr(tmp_path / f"{number:02d}.exr", np.repeat(light[..., None], 3, axis=-1))
+        frames.append({"image": f"{number:02d}.exr", "pattern": pattern})
+    data, levels = manifest(frames), np.linspace(0, 1, 33)
+    data["projector"]["response"] = (levels**2 * (3 - 2 * levels)).tolist()
+    (tmp_path / "capture.json").write_text(json.dumps(data))
+    result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
+    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)
+    assert result.maps.mask[~scene.shaded].mean() > 0.9
+
+
+def test_frames_that_are_clipped_are_not_called_mixed(tmp_path, scene):
+    """8-bit files end at 255, whatever the manifest says: a white wall behind a dark sphere reaches it."""
+    frames = []
+    albedo = np.where(scene.depth < 1.3, 0.06, 0.7)
+    for number, pattern in enumerate(THREE):
+        light = albedo * (1.3 * (0.1 + 0.9 * shown(pattern, scene.uv)) * ~scene.shaded + 0.3)
+        name = f"{number:02d}.png"
+        write_image(tmp_path / name, np.repeat(np.rint(np.clip(light, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=-1))
+        frames.append({"image": name, "pattern": pattern})
+    (tmp_path / "capture.json").write_text(json.dumps(manifest(frames, color_space="lin_rec709_scene")))
+    result = depth(DepthRequest(capture=tmp_path, out=tmp_path / "out", device="cpu"))
+    assert not any("levels that no pattern has" in sentence for sentence in result.warnings)

@@ -15,6 +15,24 @@ VIEW = tof.room(ROWS, COLS)
 HZ = (20e6, 50e6, 60e6)
 
 
+def bowl():
+    """The inside of half a sphere, its middle 1.5 m away, whose walls are darker where they come nearer; around it a black wall."""
+    y, x = np.mgrid[0:ROWS, 0:COLS] + 0.5
+    ray = np.stack([(x - COLS / 2) / 90, (y - ROWS / 2) / 90, np.ones((ROWS, COLS))], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    root = ray[..., 2]**2 - (1 - 0.5**2)
+    distance = ray[..., 2] + np.sqrt(np.maximum(root, 0))
+    normal = (ray * distance[..., None] - [0, 0, 1]) / 0.5
+    return tof.View(np.where(root > 0, distance, 1.5), np.where(root > 0, 0.6, 0.02), np.where(root > 0, (normal * ray).sum(axis=-1), 1))
+
+
+def painted():
+    """A relief whose hollows are painted bright."""
+    y, x = np.mgrid[0:ROWS, 0:COLS] / np.array([ROWS, COLS]).reshape(2, 1, 1)
+    distance = 2 + 0.05 * np.sin(12 * x) * np.cos(9 * y)
+    return tof.View(distance, 0.2 + 7 * (distance - 1.95), np.ones(distance.shape))
+
+
 def measured(folder, images, settings):
     """What relit depth makes of correlation images under these declarations."""
     frames = []
@@ -70,6 +88,16 @@ def test_fog_is_not_believed(tmp_path):
     error = np.abs(result.maps.range - VIEW.distance)[result.maps.mask]
     assert (error > 0.1).sum() < 0.01 * VIEW.distance.size
     assert "as in fog" in result.warnings[0]
+
+
+@pytest.mark.parametrize("view", [bowl(), painted()], ids=["bowl", "painted"])
+@pytest.mark.parametrize("hz", [HZ, (60e6,)], ids=["three", "one"])
+def test_surfaces_that_grow_brighter_with_the_distance_are_believed(tmp_path, view, hz):
+    """Light does not fall with the distances that they have if the phases run backwards."""
+    settings = tof.even(hz, 4)
+    result = measured(tmp_path, tof.correlations(view, 2e5, settings, ambient=30, seed=3), settings)
+    assert not result.warnings
+    assert result.maps.mask[view.albedo > 0.1].mean() > 0.95
 
 
 @pytest.mark.parametrize("more", [{}, {"harmonics": {3: 0.06}}], ids=["cosine", "wiggling"])
