@@ -38,8 +38,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "register": ("scans", "Find the poses of scans of one object by their surfaces, and say how sure each is and which scans "
                  "could not be joined."),
     "fuse": ("scans", "Fuse the scans of a set, whose poses are known, into one surface."),
-    "compare": ("scans", "Compare a scan with the design of the part: deviations with their σ, and whether regions are within their "
-                         "tolerances."),
+    "compare": ("scans", "Compare a scan with the design of the part: its deviations with their σ, and whether regions are within their "
+                "tolerances."),
     "relight": ("light", "Frames under HDR environments and animated lights."),
     "shade": ("light", "A picture of solved maps under near lights, area lights and an environment, with cast shadows."),
     "drive": ("rig", "Levels at which the lamps of a rig light a subject as environments and animated lights would."),
