@@ -30,7 +30,8 @@ LIT_SIGMAS = 20.0
 MOST_MIXED = 0.25
 """Share of these pixels with levels that no pattern has, from which on the frames are named: what moves has its edges alone."""
 
-UNKNOWN_RESPONSE = "; if the projector is far from linear, measure it with relit calibrate response, for waves of three steps look so too then"
+UNKNOWN_RESPONSE = ("; if the projector is far from linear, measure it with relit calibrate response, for waves of three steps look so "
+                    "too then")
 """What is said besides of waves of three steps where no response is declared."""
 
 
