@@ -9,7 +9,6 @@ A kernel loads a pack by an assignment of its own: `x = values[0, p]` copies it 
 refer to memory, and each lane that reads one of them loads its whole pack again, which keeps the compiler from using SIMD.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -235,7 +234,7 @@ def to_half(values: np.ndarray) -> np.ndarray:
     return found.reshape(values.shape)
 
 
-@cache
+@once
 def _half_kernel(pack: int) -> Any:
     float_pack, half_pack = pack_type(pack, wp.float32), pack_type(pack, wp.float16)
 

@@ -17,13 +17,13 @@ light", Graphics Interface 2007 (bits that direct light proves).
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.structured.decoded import MAX_SPREAD, Decoded, place_stripe, unwritten_decoded
@@ -168,7 +168,7 @@ def proven_xor(d: float, stray: float, finest: float, contrast: float, limit: fl
 _NUMBERS = {"binary": (number_binary, proven_binary), "gray": (number_gray, proven_gray), "xor": (number_xor, proven_xor)}
 
 
-@cache
+@once
 def _stripe_kernel(pack: int, code: Literal["binary", "gray", "xor"] = "gray", inverses: bool = True, references: bool = True) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     number_of, proven = _NUMBERS[code]

@@ -6,11 +6,11 @@ the readings (t by least squares over the finer digits, the best pair of levels 
 best is weighed against the nearest levels (kary.py). In a reflected code one digit changes by one at every edge, and no carry exists.
 """
 
-from functools import cache
 from typing import Any, Literal
 
 import warp as wp
 
+from kernels.device import once
 from kernels.packs import pack_type
 
 EMPTY_CHI2 = 1.0e30
@@ -45,7 +45,7 @@ def weight_of_reading(on: float, off: float, reading: float, level_error: float,
                   + code.gain * (wp.max(on, 0.0) + wp.max(off, 0.0) + wp.max(reading, 0.0)))
 
 
-@cache
+@once
 def carry_kernel(pack: int, channels: Literal[1, 3]) -> Any:
     """Return the kernel that fits levels and carries."""
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)

@@ -9,13 +9,13 @@ its inverse).
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, as_pixels, pack_type, unwritten
 from kernels.status import OK
@@ -112,7 +112,7 @@ def find_edge(readings: wp.array2d(dtype=float), rows: wp.array2d(dtype=int), nu
     return edge
 
 
-@cache
+@once
 def _number_kernel(pack: int) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 

@@ -14,13 +14,13 @@ Vision Computing 1999 (grey levels); Caspi, Kiryati and Shamir, "Range imaging w
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.carries import EMPTY_CHI2, LEVEL_ERROR, NO_EDGE, Code, carry_kernel, weight_of_reading
@@ -121,7 +121,7 @@ def append_digit(digit: int, base: int, reflected: int, number: wp.ref[int], dig
     digits += digit
 
 
-@cache
+@once
 def _kary_kernel(pack: int, channels: Literal[1, 3] = 1) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)

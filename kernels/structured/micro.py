@@ -8,13 +8,13 @@ Source: Gupta and Nayar, "Micro Phase Shifting", CVPR 2012, equations 5 to 10.
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.elementary import TURN, cosine_of_turns, sine_of_turns
 from kernels.errors import ArrayError
 from kernels.normal_equations import add_reading
@@ -130,7 +130,7 @@ def bent_slope(light: wp.array(dtype=float), x: float) -> float:
     return light_slope(light, 0.5 + 0.5 * x)
 
 
-@cache
+@once
 def _micro_kernel(pack: int, bent: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)

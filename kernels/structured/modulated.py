@@ -7,13 +7,13 @@ Source: Chen, Seidel and Lensch, "Modulated phase-shifting for 3D scanning", CVP
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.structured.pattern_frames import NoiseModel, check_noise, cut_in, require_frames, saturation_masks
@@ -61,7 +61,7 @@ def decode_modulated(frames: Band, numbers: Sequence[Sequence[int]], *, period_p
     return WrappedPhase(*rows, (float(period_px),), frames.pixel_count, device)
 
 
-@cache
+@once
 def _modulated_kernel(pack: int) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of, write_phases = cut_in(pack), write_phases_in(pack)

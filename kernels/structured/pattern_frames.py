@@ -1,12 +1,12 @@
 """Frames under projected patterns, on a device: readings as packs, which of them saturate, and how noisy they are."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, band_of, pack_type
 
@@ -78,7 +78,7 @@ def saturated_bits(saturated: np.ndarray) -> np.ndarray:
     return np.packbits(np.pad(saturated, ((0, -len(saturated) % 8), (0, 0))), axis=0, bitorder="little")
 
 
-@cache
+@once
 def cut_in(pack: int) -> Any:
     """Return the Warp function that gives the bits of the frames of a mask that saturate at each pixel of a pack; 0 where none does."""
     int_pack, byte_pack = pack_type(pack, wp.int32), pack_type(pack, wp.uint8)

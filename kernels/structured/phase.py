@@ -9,7 +9,6 @@ shifts); Surrel, Applied Optics 1997 (noise).
 """
 
 from collections.abc import Sequence
-from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.elementary import angle_of
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
@@ -185,7 +185,7 @@ def phase_of(cut: int, mean: float, along: float, across: float, vaa: float, vcc
     return found
 
 
-@cache
+@once
 def write_phases_in(pack: int) -> Any:
     """Return the Warp function that writes the phase of every pixel of a pack, one row of a WrappedPhase, from its sums."""
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
@@ -212,7 +212,7 @@ def write_phases_in(pack: int) -> Any:
     return write_phases
 
 
-@cache
+@once
 def _phase_kernel(pack: int, ambient: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of, write_phases = cut_in(pack), write_phases_in(pack)

@@ -6,13 +6,13 @@ With ambient light b subtracted, q = up / (up + down), or up / white, or 1 - the
 Source: Carrihill and Hummel, "Experiments with the intensity ratio depth sensor", CVGIP 1985.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type
 from kernels.status import OK, Status
@@ -78,7 +78,7 @@ def ratio_table(response: np.ndarray | None, *, pair: bool) -> np.ndarray:
     return light / (light + light[::-1]) if pair else light
 
 
-@cache
+@once
 def _ramp_kernel(pack: int, pair: bool = True, ambient: bool = True) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)

@@ -9,13 +9,13 @@ Engineering 2007 (table of the error over the phase); here it follows from the m
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.elementary import TURN
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
@@ -157,7 +157,7 @@ def light_slope(table: wp.array(dtype=float), level: float) -> float:
     return (table[cell + 1] - table[cell]) * float(LIGHT_STEPS)
 
 
-@cache
+@once
 def _straighten_kernel(pack: int) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
 

@@ -15,13 +15,13 @@ illumination", ACM Transactions on Graphics (SIGGRAPH) 2006, equations 2 to 5; s
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import Band, as_packs, pack_type, unwritten
 from kernels.status import OK, Status
@@ -98,7 +98,7 @@ def light_of(cut: int, mean: float, along: float, across: float, leak: float) ->
     return found
 
 
-@cache
+@once
 def _separation_kernel(pack: int, ambient: bool = False) -> Any:
     float_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     cut_of = cut_in(pack)

@@ -7,13 +7,13 @@ u(s) is a ratio of two linear functions and s follows at once; from there Gauss-
 u, v or both are those decoded, weighted by their variances. The inverse depth is what a projector coordinate is nearly linear in.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type, padded_count, zeros
 from kernels.status import OK, Status
@@ -233,7 +233,7 @@ def _projection(model: ProjectorModel) -> Any:
     return g
 
 
-@cache
+@once
 def _kernel(pack: int, with_u: bool, with_v: bool) -> Any:
     float_pack, code_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
 

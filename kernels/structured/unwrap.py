@@ -9,13 +9,13 @@ Sources: Gushov and Solodkin, Optics and Lasers in Engineering 1991 (number-theo
 (Gray code and phase).
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.elementary import TURN
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
@@ -157,7 +157,7 @@ def keeps_place(code: int) -> bool:
     return code == OK or (code - _UNDECIDED) * (code - _MULTIPATH) == 0
 
 
-@cache
+@once
 def _joint_kernel(pack: int) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
 
@@ -248,7 +248,7 @@ def _joint_kernel(pack: int) -> Any:
     return joint_kernel
 
 
-@cache
+@once
 def _numbered_kernel(pack: int) -> Any:
     float_pack, int_pack, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32), pack_type(pack, wp.uint8)
 

@@ -22,13 +22,13 @@ Sources: Quéau, Durou & Aujol, "Normal Integration: A Survey", 2018, for log-de
 "Bilateral Normal Integration", ECCV 2022, for residuals weighted by the cosine.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.surface.grid import EdgeWeights, Grid
 from kernels.surface.normal_map import NormalMap
 
@@ -83,7 +83,7 @@ def _normal_at(normal: wp.array3d(dtype=wp.float32), r: int, c: int):
     return wp.normalize(wp.vec3(normal[0, r, c], normal[1, r, c], normal[2, r, c]))
 
 
-@cache
+@once
 def _edge_kernel(perspective: bool) -> Any:
     """Return the kernel over all edges for one projection."""
     pair = perspective_slope if perspective else orthographic_slope

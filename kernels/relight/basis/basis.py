@@ -13,13 +13,13 @@ Source: Eckart and Young, "The approximation of one matrix by another of lower r
     "Clustered principal components for precomputed radiance transfer", SIGGRAPH 2003, section 4.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load
 from kernels.packs import Band, as_packs, pack_type, zeros
@@ -192,7 +192,7 @@ def tile_bases(images: np.ndarray, factor: np.ndarray, count: int) -> TileBases:
     return TileBases(np.linalg.solve(factor, vectors), coefficients, squares)
 
 
-@cache
+@once
 def gram_kernel(pack: int) -> Any:
     """Return the kernel, one thread for a tile of light pairs, a channel and a pixel range.
 
@@ -241,7 +241,7 @@ def gram_kernel(pack: int) -> Any:
     return gram_tiles
 
 
-@cache
+@once
 def residual_kernel(pack: int) -> Any:
     """Return the kernel: one thread for a pack of one channel."""
     half_pack, float_pack, load = pack_type(pack, wp.float16), pack_type(pack, wp.float32), pack_load(pack, wp.float16)

@@ -11,13 +11,13 @@ Source: IEC 61966-2-1:1999, equations for the sRGB transfer function; Malzbender
 2001: the colour is constant, the luminance follows the light.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, as_packs, pack_type, zeros
@@ -165,7 +165,7 @@ def srgb(linear: float) -> float:
     return 1.055 * wp.pow(value, 1.0 / 2.4) - 0.055
 
 
-@cache
+@once
 def encode_kernel(pack: int) -> Any:
     """Return the kernel: one thread for a pack of one light, all three channels."""
     half_pack, load, store = pack_type(pack, wp.float16), pack_load(pack, wp.float16), pack_store(pack, wp.float16)

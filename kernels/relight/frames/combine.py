@@ -12,13 +12,13 @@ adds its lights one after another, and is the same to the last bit whichever oth
 Source: Debevec et al., "Acquiring the Reflectance Field of a Human Face", SIGGRAPH 2000, section 3.3.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.pack_access import pack_load, pack_store
 from kernels.packs import Band, as_packs, new_array, pack_type, zeros
@@ -134,7 +134,7 @@ def _check_weights(weights: np.ndarray, shape: tuple[int, ...]) -> None:
         raise ArrayError(f"weights hold {int((~np.isfinite(weights)).sum())} values that are not finite")
 
 
-@cache
+@once
 def frame_chunk_kernel(pack: int) -> Any:
     """Return the CPU kernel: one thread for a chunk of packs."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
@@ -172,7 +172,7 @@ def frame_chunk_kernel(pack: int) -> Any:
     return combine_chunk
 
 
-@cache
+@once
 def frame_register_kernel(pack: int) -> Any:
     """Return the CUDA kernel: one thread for a pack, its sum in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
@@ -199,7 +199,7 @@ def frame_register_kernel(pack: int) -> Any:
     return combine_register
 
 
-@cache
+@once
 def batch_chunk_kernel(pack: int) -> Any:
     """Return the CPU kernel: one thread for a chunk of packs, eight frames of one pack at a time, their sums in registers."""
     half_pack, float_pack = pack_type(pack, wp.float16), pack_type(pack, wp.float32)
@@ -235,7 +235,7 @@ def batch_chunk_kernel(pack: int) -> Any:
     return batch_chunk
 
 
-@cache
+@once
 def batch_register_kernel(pack: int, half: bool = True) -> Any:
     """Return the CUDA kernel for half or float32 rows: one thread for a pack and eight frames, their sums in registers."""
     scalar = wp.float16 if half else wp.float32

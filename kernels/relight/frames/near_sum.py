@@ -4,13 +4,13 @@ captured lights around that direction, as smooth weighting does.
 The same sum is taken of a model of the surface under the captured lights, so that the model can say what the sum of images misses.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.relight.directions.latlong import first_of_equals
@@ -116,7 +116,7 @@ def _weights_kernel(first: int,
                 weights[2 * count + light, pixel] = weights[2 * count + light, pixel] + amount[2]
 
 
-@cache
+@once
 def _sum_kernel(pack: int) -> Any:
     lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
 

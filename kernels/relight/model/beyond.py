@@ -10,12 +10,12 @@ regression coefficient of a control variate, as in kernels.relight.model.guide.
 """
 
 import math
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.packs import bit_of, pack_type
 from kernels.relight.directions.latlong import first_of_equals
 from kernels.relight.model.captured import Captured, images_type
@@ -98,7 +98,7 @@ def _told(before: float, after: float, reading: float) -> float:
     return change
 
 
-@cache
+@once
 def _compare_kernel(pack: int) -> Any:
     lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
 

@@ -9,12 +9,12 @@ light remains the captured image.
 Source: brightness as a ratio to that of an image under other light, Shashua and Riklin-Raviv, "The quotient image", TPAMI 2001.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import channels_type, pack_type
@@ -66,7 +66,7 @@ def sum_shown(captured: Captured, energy: np.ndarray) -> ShownModel:
     return ShownModel(whole, ratio)
 
 
-@cache
+@once
 def _sum_kernel(pack: int) -> Any:
     lane_type, images_struct, channels, evaluate = pack_type(pack, wp.float32), images_type(pack), channels_type(pack), lobes(pack)
 

@@ -9,12 +9,12 @@ Source: the model as a control variate with regression coefficient, Glasserman, 
 section 4.1; here over lights in place of samples.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.pack_access import pack_load
@@ -78,7 +78,7 @@ def fit_trust(sums: np.ndarray, pixels: np.ndarray, shape: tuple[int, int]) -> n
     return np.clip(np.divide(top, bottom, out=np.zeros(len(pixels)), where=bottom > 1e-12), 0, 1).astype(np.float32)
 
 
-@cache
+@once
 def _compare_kernel(pack: int) -> Any:
     lane_type, images_struct, channels, evaluate = pack_type(pack, wp.float32), images_type(pack), channels_type(pack), lobes(pack)
     load, load_half, load_byte = (pack_load(pack, kind) for kind in (wp.float32, wp.float16, wp.uint8))

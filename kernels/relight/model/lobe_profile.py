@@ -11,12 +11,12 @@ Source: lobes as sums of narrower ones, Ashikhmin and Premože, "Distribution-ba
 "Pattern Recognition and Machine Learning", equations 3.50 and 3.51.
 """
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from kernels.device import once
 from kernels.microfacet import INVERSE_PI
 from kernels.pack_access import pack_load
 from kernels.packs import bit_of, pack_type
@@ -85,7 +85,7 @@ def fit_profile(moments: np.ndarray, pixels: np.ndarray, shape: tuple[int, int])
     return np.asarray(np.array(PLAIN) + fitted, dtype=np.float32)
 
 
-@cache
+@once
 def _moments_kernel(pack: int) -> Any:
     lane_type, images_struct, evaluate = pack_type(pack, wp.float32), images_type(pack), lobes(pack)
     load, load_half, load_byte = (pack_load(pack, kind) for kind in (wp.float32, wp.float16, wp.uint8))

@@ -7,12 +7,12 @@ Source: precomputed light transport, Ng, Ramamoorthi and Hanrahan, "All-frequenc
 approximation", SIGGRAPH 2003, here without wavelets.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.microfacet import INVERSE_PI
 from kernels.packs import pack_type
 from kernels.relight.model.captured import Captured, images_type
@@ -58,7 +58,7 @@ def shown_gloss(captured: Captured, responses: Responses) -> wp.array:
     return shown
 
 
-@cache
+@once
 def _respond_kernel(pack: int) -> Any:
     lane_type, byte_pack = pack_type(pack, wp.float32), pack_type(pack, wp.uint8)
     evaluate, seen = lobes(pack), visibility(pack)
@@ -91,7 +91,7 @@ def _respond_kernel(pack: int) -> Any:
     return respond_kernel
 
 
-@cache
+@once
 def _shown_kernel(pack: int) -> Any:
     lane_type, images_struct = pack_type(pack, wp.float32), images_type(pack)
 

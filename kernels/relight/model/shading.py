@@ -7,13 +7,13 @@ vector.
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.microfacet import INVERSE_PI
 from kernels.pack_access import pack_load
@@ -132,7 +132,7 @@ def _shade(surface: Surface, sources: SourcesOnDevice, visible: wp.array, *, far
     return out
 
 
-@cache
+@once
 def lobes(pack: int) -> Any:
     """Return the Warp function that evaluates the lobes of every pixel of a pack under a sample at one place."""
     lane_type, channels, load = pack_type(pack, wp.float32), channels_type(pack), pack_load(pack, wp.float32)
@@ -250,7 +250,7 @@ def modelled(lit: float, albedo: float, facing: float, gloss: float) -> float:
     return lit * (albedo * INVERSE_PI * facing + gloss)
 
 
-@cache
+@once
 def visibility(pack: int) -> Any:
     """Return the Warp function that interpolates the visibility of a sample between the occluders around it."""
     lane_type, byte_pack, load_byte = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), pack_load(pack, wp.uint8)
@@ -273,7 +273,7 @@ def visibility(pack: int) -> Any:
     return seen
 
 
-@cache
+@once
 def _shade_kernel(pack: int, far: bool) -> Any:
     lane_type, byte_pack, channels = pack_type(pack, wp.float32), pack_type(pack, wp.uint8), channels_type(pack)
     evaluate, seen, load = lobes(pack), visibility(pack), pack_load(pack, wp.float32)

@@ -13,13 +13,13 @@ Source: Max, "Horizon mapping: shadows for bump-mapped surfaces", The Visual Com
 """
 
 import math
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.relight.model.shading import Surface
@@ -170,7 +170,7 @@ def see_above(direction: np.ndarray, surface: Surface, horizons: Horizons) -> wp
     return visible
 
 
-@cache
+@once
 def _horizon_kernel(pack: int) -> Any:
     lane_type, half_pack = pack_type(pack, wp.float32), pack_type(pack, wp.float16)
 
@@ -241,7 +241,7 @@ def _horizon_kernel(pack: int) -> Any:
     return horizon_kernel
 
 
-@cache
+@once
 def _above_kernel(pack: int) -> Any:
     lane_type, half_pack, byte_pack = (pack_type(pack, dtype) for dtype in (wp.float32, wp.float16, wp.uint8))
 

@@ -1,12 +1,12 @@
 """Find the lights that each pixel sees over the solved height."""
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
 from kernels.surface.shadows import NO_REACH, Extent, Projection, Relief, in_shadow_within, relief_of, surface_point
@@ -40,7 +40,7 @@ def see_lights(place: np.ndarray, pixels: np.ndarray, height: wp.array, mask: wp
     return visible
 
 
-@cache
+@once
 def _see_kernel(pack: int) -> Any:
     byte_pack = pack_type(pack, wp.uint8)
 

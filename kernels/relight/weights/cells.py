@@ -8,13 +8,13 @@ Source: Debevec et al., SIGGRAPH 2000, section 3.3.
 """
 
 from collections.abc import Iterator
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import pack_type
 from kernels.relight.directions.latlong import SampleGrid, check, first_of_equals
 from kernels.relight.weights.borders import LatLongSamples, Shares, divide, reach
@@ -80,7 +80,7 @@ def nearest_light(grid: SampleGrid, directions: np.ndarray, *, device: str) -> N
     return Nearest(np.where(crossed, ~found, found), crossed)
 
 
-@cache
+@once
 def _nearest_kernel(pack: int) -> Any:
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
 

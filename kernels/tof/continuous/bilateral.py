@@ -5,13 +5,13 @@ edge is drawn into the depth. A plane has no such error.
 """
 
 import math
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.status import Status
@@ -91,7 +91,7 @@ def _packs(array: wp.array, pack: int, step: int, count: int) -> wp.array:
     return wp.array(ptr=array.ptr, shape=(count,), strides=(4 * step,), dtype=pack_type(pack, array.dtype), device=array.device, copy=False)
 
 
-@cache
+@once
 def frame_kernel(pack: int) -> Any:
     """Return the kernel for packs of this many pixels, which divide a row."""
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)
@@ -132,7 +132,7 @@ def frame_kernel(pack: int) -> Any:
     return inset_kernel
 
 
-@cache
+@once
 def smooth_kernel(pack: int) -> Any:
     """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)

@@ -5,13 +5,13 @@ more different reference phases δ give all three, and ambient light, which is t
 """
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type, place, unwritten
 from kernels.tof.continuous.modulation import require_frequencies
@@ -144,7 +144,7 @@ def phase_of(a: float, b: float):
     return wp.where(b < 0.0, 2.0 * wp.pi - angle, angle)
 
 
-@cache
+@once
 def decode_kernel(pack: int) -> Any:
     """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)

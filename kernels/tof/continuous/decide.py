@@ -1,11 +1,11 @@
 """The most probable wrap of each pixel, and a status that tells why there is none, or why it cannot be trusted."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.packs import as_packs, pack_type
 from kernels.status import Status
 from kernels.tof.continuous.continuous import Correlation, quantile, signal_limits
@@ -61,7 +61,7 @@ def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agree
     return result
 
 
-@cache
+@once
 def decide_kernel(pack: int) -> Any:
     """Return the kernel for packs of this many pixels."""
     float_pack, int_pack = pack_type(pack, wp.float32), pack_type(pack, wp.int32)

@@ -5,13 +5,13 @@ all frequencies, and its cost is the sum of squared phase errors over their vari
 stay with their probabilities, so that neighbours can decide between them.
 """
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.device import once
 from kernels.errors import ArrayError
 from kernels.packs import as_packs, pack_type
 from kernels.tof.continuous.continuous import Correlation
@@ -84,7 +84,7 @@ def decay(x: float):
     return power * wp.cast((127 - int(halvings)) << 23, float)  # the exponent of a float32
 
 
-@cache
+@once
 def unwrap_kernel(pack: int) -> Any:
     """Return the kernel for packs of this many pixels."""
     float_pack = pack_type(pack, wp.float32)
