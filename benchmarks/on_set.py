@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from service.acquisition.acquire import acquire, refuse_to_ask
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.preview import PREVIEW_FILE
 from service.requests.acquire import AcquireRequest

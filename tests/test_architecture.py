@@ -99,7 +99,7 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
 
 @pytest.mark.parametrize(("library", "homes"), [
     ("pxr", ["service.asset.usd"]), ("pygltflib", ["service.asset.gltf"]), ("typer", ["service.cli"]), ("rich", ["service.cli"]),
-    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.page", "service.acquisition.projector"]),
+    ("fastapi", ["service.server.api", "service.server.pages", "service.twin.twin", "service.acquisition.projector"]),
     ("sacn", ["service.play.sacn_output"]),
     ("serial", ["service.acquisition.lights.serial_line"]), ("gphoto2", ["service.acquisition.cameras"]),
     ("pygdtf", ["service.rigs.gdtf"]), ("pymvr", ["service.rigs.mvr"]),
@@ -115,8 +115,8 @@ def test_a_library_lives_in_its_places(library, homes):
 
 
 def test_opencv_lives_where_motion_is_tracked_rigs_calibrated_distances_measured_and_avif_camera_raw_and_video_decoded():
-    allowed = ("stage.motion", "service.calibrate.solvers", "stage.results.mask_border", "stage.formats.avif", "stage.formats.camera_raw",
-               "stage.importers", "service.scans.registration.found_targets",
+    allowed = ("stage.motion", "service.calibrate.solvers", "service.calibrate.stereo", "stage.results.mask_border", "stage.formats.avif",
+               "stage.formats.camera_raw", "stage.importers", "service.scans.registration.found_targets",
                "service.acquisition.cameras.video_device", "service.acquisition.cameras.aravis_camera")
     assert {i.importer for i in imports() if top(i.target) == "cv2" and not under(i.importer, *allowed)} == set()
 

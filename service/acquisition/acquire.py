@@ -11,7 +11,7 @@ import numpy as np
 
 from service.acquisition.cameras.camera import SPOOL, Camera, NoPictureError, Picture, Setup, open_camera
 from service.acquisition.capture_files import CaptureFiles
-from service.acquisition.checks.fault import Fault, FaultKind, said
+from service.acquisition.checks.expectation import Fault, FaultKind, said
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.journal import Journal

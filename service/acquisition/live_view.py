@@ -10,8 +10,10 @@ import sys
 import threading
 import time
 from contextlib import closing
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from service.acquisition.meter import BINS, bars, focus_of, zebra
 from service.acquisition.plans.shots import even_levels
 from service.errors import USER_ERRORS, RequestError, sentence
 from service.play.play import ended_by_signals
+from service.twin.local_page import HEADERS
 from stage.colour.colour import linearise
 from stage.files import replacing
 from stage.formats.images import write_png
@@ -37,6 +40,9 @@ HISTOGRAM_PART = 5
 """The height of a picture over that of the histogram below it."""
 END_S = 10.0
 """The longest time until the lamps are dark and the camera is free."""
+STATIC = Path(str(files("service"))) / "acquisition" / "static"
+FILES = {"/": ("live.html", "text/html; charset=utf-8"), "/live.js": ("live.js", "text/javascript")}
+POLL_S = 0.05
 
 
 class LiveView:
@@ -130,3 +136,67 @@ def main(rig: str, camera: str, folder: str) -> int:
 
 if __name__ == "__main__":
     sys.exit(main(*sys.argv[1:]))
+
+
+class LivePage:
+    """Serves the page on the loopback as long as it is open; afterwards the lamps are dark and the camera is free."""
+
+    def __init__(self, rig: Path, camera: str, folder: Path) -> None:
+        """Take what a live view takes; nothing begins yet."""
+        self._given = rig, camera, folder
+
+    def __enter__(self) -> Self:
+        """Start the live view, and serve the page at any free port.
+
+        Raises:
+            RequestError: the kind of camera has no live view.
+        """
+        self._view = LiveView(*self._given)
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self._view))
+        self._server.daemon_threads = True
+        self.address = f"http://127.0.0.1:{self._server.server_port}"
+        """The address of the page."""
+        threading.Thread(target=self._server.serve_forever, name="relit-live-page", daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End both."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._view.close()
+
+    def wait(self) -> str | None:
+        """Return None when there is a picture, or why there is none."""
+        while (state := self._view.state())["number"] == 0 and state["refused"] is None:
+            time.sleep(POLL_S)
+        refused: str | None = state["refused"]
+        return refused
+
+
+def _handler(view: LiveView) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        """Answers with the page, what the live view tells, and its picture."""
+
+        def do_GET(self) -> None:
+            path = self.path.partition("?")[0]
+            if path in FILES:
+                name, kind = FILES[path]
+                self._answer((STATIC / name).read_bytes(), kind)
+            elif path == "/state.json":
+                self._answer(json.dumps(view.state()).encode(), "application/json")
+            elif path == "/live.png" and (picture := view.picture()) is not None:
+                self._answer(picture, "image/png")
+            else:
+                self.send_error(404)
+
+        def log_message(self, *_: object) -> None:
+            """Say nothing."""
+
+        def _answer(self, content: bytes, kind: str) -> None:
+            self.send_response(200)
+            for name, value in {**HEADERS, "Content-Type": kind, "Content-Length": str(len(content))}.items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(content)
+
+    return Handler

@@ -19,8 +19,7 @@ from service.calibrate.results import (
     write_lights,
 )
 from service.calibrate.solvers.apply import LitFrame, SingleLight, as_direction, as_position, lit_frames, with_brightness
-from service.calibrate.solvers.light_positions import MISSES, nearest_point
-from service.calibrate.solvers.mirror_ball import find_spot
+from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_point
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction

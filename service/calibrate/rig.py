@@ -12,14 +12,16 @@ from service.calibrate.results import LightCaptures, digits, three_numbers, writ
 from service.calibrate.solvers.apply import LitFrame
 from service.calibrate.solvers.chart_patches import ChartPatches, find_patches
 from service.calibrate.solvers.lamp_readings import (
+    LEAST_DRIVES,
     LambertTemplate,
+    MeasuredPrimary,
     MirrorTemplate,
     card_template,
     facing_cosine,
+    fit_primary,
     grey_ball_template,
     mirror_ball_template,
 )
-from service.calibrate.solvers.lamp_response import LEAST_DRIVES, MeasuredPrimary, fit_primary
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, view_ball
 from service.reporting.progress import Progress, Timings

@@ -13,7 +13,7 @@ from stage.capture.sequence import SEQUENCE_FILE, is_sequence, read_sequence
 from stage.colour.environment_maps import SUFFIXES
 from stage.errors import ImageError, ManifestError, storage
 from stage.files import resolved
-from stage.formats import images, jxl
+from stage.formats import images, integrity
 from stage.formats.npy import array_shape
 from stage.records import read_record
 from stage.results.depth_maps import DEPTH_FILE
@@ -185,7 +185,7 @@ def _check_place(path: Path, folder: Path, named: str) -> None:
 
 def _check_image(path: Path, max_pixels: int) -> images.ImageHeader:
     if path.suffix.lower() == ".jxl":
-        _check_size(path, *jxl.resolution(path), 1, max_pixels)
+        _check_size(path, *integrity.jxl_resolution(path), 1, max_pixels)
     header = images.read_header(path)
     _check_size(path, header.width, header.height, header.stored, max_pixels)
     return header

@@ -25,7 +25,7 @@ from stage.colour.configuration import current
 from stage.colour.radiance import clipping_sentences
 from stage.errors import StageError, StorageError
 from stage.formats import images
-from stage.formats.orientation import TURNS, UPRIGHT
+from stage.formats.exif import TURNS, UPRIGHT
 from stage.stack.correction import Correction
 from stage.tof.raw_frames import check_frames, read_frame
 

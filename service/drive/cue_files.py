@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from service.drive.chart_view import ChartView
-from service.drive.dilation import Dilated
 from service.drive.judgement import Judgement
+from service.drive.levels import Dilated, Quantised, WantedLevels
 from service.drive.light import Light
-from service.drive.primaries import WantedLevels
-from service.drive.quantisation import Quantised
 from service.relight.environments import Environments
 from service.reporting.progress import Timings
 from service.reporting.provenance import REPORT_FILE, report

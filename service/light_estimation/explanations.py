@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.light_estimation.encodings import ENCODINGS, other_readings
+from service.light_estimation.grey_ball import ENCODINGS, other_readings
 from service.light_estimation.lambertian import SHADOW, Fit, bright_readings, fit_lambertian, least_squares, median_of
 from service.light_estimation.semi_calibrated import TINY, fit_intensities
 from stage.colour.colour import GREY_WEIGHTS

@@ -8,13 +8,15 @@ Source: Lambert's law as in Woodham, "Photometric method for determining surface
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from service.light_estimation.ball import BallView
-from service.light_estimation.encodings import other_readings
 from stage.capture.light import DistantLight, PointLight
+from stage.colour.colour import convert, linearise
+from stage.colour.colour_spaces import is_linear, linear_space
 from stage.errors import CalibrationError
 from stage.spread import MAD_TO_SIGMA
 
@@ -31,6 +33,11 @@ LEAST_MISFIT, TIMES = 0.05, 2.5
 an encoding must leave, which has no free parameter."""
 ROUNDS = 20
 """The iterations of the re-weighted least squares."""
+ENCODINGS = {"srgb_texture": "sRGB", "g22_rec709_scene": "a power of 2.2"}
+"""Display encodings that images declared linear may have, in words; both have the primaries of Rec.709, which do not matter for the
+curve."""
+MOST_ENCODED = 1.001
+"""The largest value of display-encoded images, but for rounding."""
 
 
 class Brightness(NamedTuple):
@@ -169,3 +176,18 @@ def _cauchy(residual: np.ndarray, sample: np.ndarray | None = None) -> np.ndarra
     spread = MAD_TO_SIGMA * np.median(np.abs(residual if sample is None else sample), axis=0)
     floor = 1e-12 * np.abs(residual).max(axis=0) + 1e-300  # exact readings have no scatter
     return 1 / (1 + (residual / (WEIGHT_SCALE * spread + floor)) ** 2)
+
+
+def other_readings(radiance: np.ndarray, exposure: np.ndarray | float, declared: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the radiance that the same recorded values stand for under other encodings, with the colour space that declares each.
+
+    Args:
+        radiance: [..., rows, cols, 3], scene-linear as declared; if it is declared linear, other encodings need values up to 1.
+        exposure: recorded values over radiance; has the dimensions of `radiance` or fewer.
+    """
+    recorded = (radiance * exposure).astype(np.float32)
+    if not is_linear(declared):
+        yield linear_space(declared), convert(recorded, linear_space(declared), declared).astype(np.float64) / exposure
+    elif recorded.max(initial=0) <= MOST_ENCODED:
+        for space in ENCODINGS:
+            yield space, linearise(recorded, space).astype(np.float64) / exposure

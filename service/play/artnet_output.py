@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from stupidArtnet import StupidArtnet
 
-from service.play.datagrams import BROADCAST, Datagrams
-from service.play.outputs import Node
+from service.play.outputs import BROADCAST, Datagrams, Node
 from service.requests.play import PlayRequest
 from stage.rig.rig import CHANNELS
 

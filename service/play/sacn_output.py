@@ -13,8 +13,7 @@ from sacn.messages.sync_packet import SyncPacket
 from sacn.sending.sender_socket_base import DEFAULT_PORT, SenderSocketBase
 
 from service.errors import RequestError
-from service.play.datagrams import Datagrams
-from service.play.outputs import Node
+from service.play.outputs import Datagrams, Node
 from service.requests.play import PlayRequest
 
 SYNC_UNIVERSE = 63999

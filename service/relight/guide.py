@@ -40,8 +40,7 @@ from service.reporting.provenance import other_inputs
 from stage.capture.point_lights import DistantLights
 from stage.errors import ResultError
 from stage.results.maps import SurfaceMaps
-from stage.stack.replaced import ReplacedStack
-from stage.stack.stack import Stack
+from stage.stack.stack import ReplacedStack, Stack
 
 NOTHING = np.zeros((0, 4), dtype=np.float32)
 """An empty list of places to march to."""

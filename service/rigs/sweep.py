@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.drive.cue_files import TABLE_FILE, cues_of, write_table
-from service.drive.quantisation import Quantised
+from service.drive.levels import Quantised
 from service.errors import RequestError
 from service.requests.rig import RigSweepRequest
 from stage.rig.cues import CUES_FILE, write_cues

@@ -12,8 +12,7 @@ from service.reporting.provenance import REPORT_FILE, report
 from service.requests.depth import DepthRequest
 from service.requests.solve import SolveRequest
 from service.sequences.joined_steps import DepthJoiner, MapsJoiner, moved_points
-from service.sequences.steps import ALONE, StepProgress, check_outputs, step_report
-from service.sequences.time_step import depth_alone, shared_lights, solve_alone
+from service.sequences.steps import ALONE, StepProgress, check_outputs, depth_alone, shared_lights, solve_alone, step_report
 from stage.capture.light import PointLight
 from stage.capture.sequence import SEQUENCE_FILE, Sequence, TimeStep, check_alike, is_sequence, read_sequence, write_sequence
 from stage.errors import ResultError

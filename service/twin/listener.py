@@ -10,8 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from service.errors import RequestError
-from service.twin.fixtures import Fixtures, UniverseId
-from service.twin.packets import ARTNET_PORT, SACN_PORT, read_artnet, read_sacn
+from service.twin.fixtures import ARTNET_PORT, SACN_PORT, Fixtures, UniverseId, read_artnet, read_sacn
 
 ANY = "0.0.0.0"
 RECEIVE_BYTES = 4 << 20

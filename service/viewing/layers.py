@@ -1,13 +1,18 @@
-"""The layers of maps in view.bin and view.json: tiles of every level, range and histogram."""
+"""The layers of maps in view.bin and view.json: tiles of every level, range and histogram.
+
+The levels of a layer are the whole image, then one of half the size after another, cut into tiles.
+
+A pixel of a lower level has the mean of those of its four pixels that are solved, else of those that are estimated. Of status codes it has
+the worst, and it is in the mask only if all of its pixels are that are on the object: a pixel that is unsure stays visible at every size.
+"""
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from kernels.status import ESTIMATED, Status
+from kernels.status import ESTIMATED, SOLVED, Status
 from service.reporting.progress import Timings
-from service.viewing import pyramid
 from service.viewing.block_file import BlockFile
 from service.viewing.result_layers import CODES, MASK, VECTOR, ResultLayers
 from stage.results.light_basis import numbers
@@ -17,6 +22,15 @@ RANGE_PERCENTILES = (1, 99)
 """Percentiles of the values that a display maps to black and white at first."""
 HISTOGRAM_PERCENTILES = (0.1, 99.9)
 """Percentiles at which a histogram begins and ends, so that a few wild values do not squeeze the rest into one bin."""
+TILE = 256
+"""Rows and columns of a tile."""
+NONE, UNSURE, SURE = range(3)
+"""Classes of pixels: without an estimate, with one outside the mask, and in the mask."""
+OUTSIDE, IN_MASK, NOT_IN_MASK = range(3)
+"""Grades of pixels, the worst last: those outside the object, and those of the object by whether they are in the mask."""
+SEVERITY = (Status.UNSOLVED, *SOLVED, Status.UNSURE, Status.UNDECIDED, Status.MULTIPATH, Status.FLYING,
+            *(status for status in Status if status not in (Status.UNSOLVED, *ESTIMATED)))
+"""Status codes from those that other codes hide to the worst; UNSOLVED is the background, which hides nothing."""
 
 
 def statistics_of(values: np.ndarray, valid: np.ndarray) -> dict[str, Any]:
@@ -83,9 +97,9 @@ def status_codes() -> dict[str, dict[str, Any]]:
 
 def _class_levels(found: ResultLayers) -> list[np.ndarray]:
     """Return the class of every pixel of every level."""
-    levels = [np.where(found.mask, pyramid.SURE, np.where(found.estimated, pyramid.UNSURE, pyramid.NONE)).astype(np.uint8)]
-    for _ in pyramid.level_sizes(*found.mask.shape)[1:]:
-        levels.append(pyramid.halve_classes(levels[-1]))
+    levels = [np.where(found.mask, SURE, np.where(found.estimated, UNSURE, NONE)).astype(np.uint8)]
+    for _ in level_sizes(*found.mask.shape)[1:]:
+        levels.append(halve_classes(levels[-1]))
     return levels
 
 
@@ -104,20 +118,20 @@ def _write_layer(found: ResultLayers, name: str, classes: list[np.ndarray], file
     facts["levels"] = []
     for level in _levels(found, name, shown.kind, values, classes):
         rows, cols = level.shape[1:]
-        cut = (level[:, tile.rows, tile.cols].astype(stored) for tile in pyramid.tiles(rows, cols))
-        facts["levels"].append({"rows": rows, "cols": cols, "tile": pyramid.TILE, "tiles": list(file.append_all(cut))})
+        cut = (level[:, tile.rows, tile.cols].astype(stored) for tile in tiles(rows, cols))
+        facts["levels"].append({"rows": rows, "cols": cols, "tile": TILE, "tiles": list(file.append_all(cut))})
     return facts
 
 
 def _levels(found: ResultLayers, name: str, kind: str, values: np.ndarray, classes: list[np.ndarray]) -> Iterator[np.ndarray]:
     """Yield the levels of a layer, each [channels, rows, cols]."""
     if kind == MASK:
-        yield from (grade == pyramid.IN_MASK for grade in _codes(pyramid.mask_grades(found.mask, found.on_object)[None], classes,
-                                                                 pyramid.halve_numbers))
+        yield from (grade == IN_MASK for grade in _codes(mask_grades(found.mask, found.on_object)[None], classes,
+                                                                 halve_numbers))
     elif kind == CODES:
-        yield from _codes(values, classes, pyramid.halve_status if name == "status" else pyramid.halve_numbers)
+        yield from _codes(values, classes, halve_status if name == "status" else halve_numbers)
     else:
-        halve = pyramid.halve_vectors if kind == VECTOR else pyramid.halve_values
+        halve = halve_vectors if kind == VECTOR else halve_values
         yield values
         for each in classes[:-1]:
             values = halve(values, each)
@@ -130,3 +144,73 @@ def _codes(codes: np.ndarray, classes: list[np.ndarray], halve: Callable[[np.nda
     for _ in classes[:-1]:
         codes = halve(codes)
         yield codes
+
+
+class Tile(NamedTuple):
+    """The rows and columns of its level that a tile covers."""
+
+    rows: slice
+    cols: slice
+
+
+def level_sizes(rows: int, cols: int) -> list[tuple[int, int]]:
+    """Return rows and columns of every level: the image, then halves, rounded up, until one fits into a tile."""
+    sizes = [(rows, cols)]
+    while max(sizes[-1]) > TILE:
+        sizes.append((-(-sizes[-1][0] // 2), -(-sizes[-1][1] // 2)))
+    return sizes
+
+
+def tiles(rows: int, cols: int) -> Iterator[Tile]:
+    """Yield the tiles of a level row by row; those at the edges are as small as the level ends."""
+    for row in range(0, rows, TILE):
+        for col in range(0, cols, TILE):
+            yield Tile(slice(row, min(row + TILE, rows)), slice(col, min(col + TILE, cols)))
+
+
+def halve_classes(classes: np.ndarray) -> np.ndarray:
+    """Return the best class [rows, cols] of each four pixels."""
+    return np.maximum.reduce(_quarters(classes))
+
+
+def halve_values(values: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Return the mean of the pixels of the best class among each four, [channels, ⌈rows / 2⌉, ⌈cols / 2⌉] float32; 0 without estimate."""
+    corners = _quarters(classes)
+    best = np.maximum.reduce(corners)
+    counted = [(corner == best) & (best > NONE) for corner in corners]
+    count = np.maximum(np.add.reduce([each.astype(np.float32) for each in counted]), 1)
+    halved = np.zeros((len(values), *best.shape), dtype=np.float32)
+    for channel, plane in enumerate(values):
+        for quarter, each in zip(_quarters(plane), counted, strict=True):
+            np.add(halved[channel], quarter, out=halved[channel], where=each)
+        halved[channel] /= count
+    return halved
+
+
+def halve_vectors(values: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Return as `halve_values`, with the means of unit vectors made unit vectors again."""
+    halved = halve_values(values, classes)
+    length = np.sqrt(np.einsum("crq,crq->rq", halved, halved))
+    return np.divide(halved, length, out=halved, where=length > 0)
+
+
+def mask_grades(mask: np.ndarray, on_object: np.ndarray) -> np.ndarray:
+    """Return the grade of each pixel, [rows, cols] uint8; at lower levels `halve_numbers` gives the worst of each four."""
+    return np.where(mask, IN_MASK, np.where(on_object, NOT_IN_MASK, OUTSIDE)).astype(np.uint8)
+
+
+def halve_status(codes: np.ndarray) -> np.ndarray:
+    """Return the worst status [1, rows, cols] of each four pixels, by SEVERITY."""
+    worst = np.maximum.reduce(_quarters(np.argsort(SEVERITY)[codes[0].astype(np.intp)]))
+    return np.array(SEVERITY, dtype=np.float32)[worst][None]
+
+
+def halve_numbers(codes: np.ndarray) -> np.ndarray:
+    """Return the largest number [1, rows, cols] of each four pixels."""
+    return np.asarray(np.maximum.reduce(_quarters(codes[0])))[None]
+
+
+def _quarters(plane: np.ndarray) -> list[np.ndarray]:
+    """Return the upper left, upper right, lower left and lower right pixel of each four; where the image ends, 0."""
+    padded = np.pad(plane, ((0, plane.shape[0] % 2), (0, plane.shape[1] % 2)))
+    return [padded[row::2, col::2] for row in (0, 1) for col in (0, 1)]

@@ -16,9 +16,8 @@ from stage.colour.colour_spaces import is_linear
 from stage.errors import MOST_FAULTS, ImageError, ManifestError, ResultError, StageError, listed, storage
 from stage.formats import images
 from stage.formats.camera_raw import path_is_raw
-from stage.formats.exif import Exposure, exposure_times, unused_exposures
+from stage.formats.exif import Exposure, check_agreement, exposure_times, unused_exposures
 from stage.formats.images import ImageHeader
-from stage.formats.orientation import check_agreement
 from stage.pixels import AS_RECORDED, Crop, PixelChoices
 
 SOURCES = (DistantLight, PointLight, ExtendedLight, GradientLight)

@@ -17,8 +17,7 @@ import numpy as np
 
 from stage import inputs
 from stage.errors import ImageError
-from stage.formats.exif import Exposure, sound
-from stage.formats.orientation import upright, upright_size
+from stage.formats.exif import Exposure, sound, upright, upright_size
 
 SUFFIXES = {".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dcr", ".dng", ".erf", ".fff", ".iiq", ".kdc", ".mef", ".mos", ".mrw", ".nef", ".nrw",
             ".orf", ".pef", ".raf", ".rw2", ".rwl", ".sr2", ".srf", ".srw"}
@@ -40,7 +39,7 @@ class RawHeader(NamedTuple):
 
     width: int  # of the upright image
     height: int
-    orientation: int  # a key of `stage.formats.orientation.TURNS`
+    orientation: int  # a key of `stage.formats.exif.TURNS`
     exposure: Exposure
 
 

@@ -1,17 +1,21 @@
-"""The exposure that cameras record in image files: exposure time, f-number and sensitivity.
+"""What cameras record in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright.
 
-Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tags ExposureTime, FNumber and
-PhotographicSensitivity.
+Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tag Orientation, which TIFF 6.0 defines; in Radiance
+files the order of the rows and columns says the same.
 """
 
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
+
 from stage.errors import ManifestError
 
 SAME = 0.01
 """Part by which two recorded values of one setting may differ: they are fractions of small integers."""
+UPRIGHT = 1
+"""The orientation of images whose first row is the top and whose first column is the left."""
 
 
 class Exposure(NamedTuple):
@@ -54,3 +58,54 @@ def unused_exposures(exposures: Mapping[str, Exposure]) -> list[str]:
         return []
     return [f"frames[].exposure_s: is missing, and EXIF says that frames were exposed for {min(times):.4g} to {max(times):.4g} s: with "
             "\"exposure_from\": \"exif\" the readings are divided by these times"]
+
+
+class _Turn(NamedTuple):
+    """The turn that makes an image upright: rows and columns are exchanged first, then reversed."""
+
+    exchanged: bool
+    rows_reversed: bool
+    cols_reversed: bool
+    words: str
+
+
+TURNS = {
+    1: _Turn(False, False, False, "as recorded"),
+    2: _Turn(False, False, True, "mirrored left to right"),
+    3: _Turn(False, True, True, "turned by 180°"),
+    4: _Turn(False, True, False, "mirrored top to bottom"),
+    5: _Turn(True, False, False, "mirrored along the diagonal from the top left"),
+    6: _Turn(True, False, True, "turned by 90° clockwise"),
+    7: _Turn(True, True, True, "mirrored along the diagonal from the top right"),
+    8: _Turn(True, True, False, "turned by 90° counterclockwise"),
+}
+"""The eight orientations."""
+
+
+def upright(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Return an image, [rows, cols, ...], as it is seen upright; `image`: as recorded; `orientation`: 1 to 8."""
+    turn = TURNS[orientation]
+    turned = image.swapaxes(0, 1) if turn.exchanged else image
+    turned = turned[::-1] if turn.rows_reversed else turned
+    turned = turned[:, ::-1] if turn.cols_reversed else turned
+    return np.ascontiguousarray(turned)
+
+
+def upright_size(width: int, height: int, orientation: int) -> tuple[int, int]:
+    """Return the width and the height of an image that is seen upright."""
+    return (height, width) if TURNS[orientation].exchanged else (width, height)
+
+
+def check_agreement(where: str, orientations: Mapping[str, int]) -> None:
+    """Check that all frames of a capture are turned in the same way.
+
+    A camera that looks straight down guesses its orientation anew for each photograph.
+    """
+    first: dict[int, str] = {}
+    for name, orientation in orientations.items():
+        first.setdefault(orientation, name)
+    if len(first) > 1:
+        (one, name), (other, second) = list(first.items())[:2]
+        raise ManifestError(f"{where}: frames: {name} is to be {TURNS[one].words} (EXIF orientation {one}), {second} to be "
+                            f"{TURNS[other].words} ({other}), but one camera took all from one position: write one orientation into "
+                            "all of them")

@@ -11,9 +11,8 @@ import OpenImageIO as oiio
 
 from stage import inputs
 from stage.errors import ImageError
-from stage.formats import avif, camera_raw, exr, integrity, jxl
-from stage.formats.exif import Exposure, sound
-from stage.formats.orientation import TURNS, UPRIGHT, upright, upright_size
+from stage.formats import avif, camera_raw, exr, integrity
+from stage.formats.exif import TURNS, UPRIGHT, Exposure, sound, upright, upright_size
 from stage.pixels import Crop
 
 OIIO_SUFFIXES = {".png", ".tif", ".tiff", ".hdr", ".jpg", ".jpeg", ".jxl", ".dpx", ".tga", ".bmp", ".ppm", ".pgm"}
@@ -33,7 +32,7 @@ class ImageHeader(NamedTuple):
     channels: int  # 1 for grey, 3 for RGB; alpha is not counted
     stored: int  # the count of all channels in the file, which are decoded together
     integer: bool  # integers, whose largest value a camera writes for everything brighter too
-    orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.formats.orientation.TURNS`; they are read upright
+    orientation: int = UPRIGHT  # in which the pixels are recorded, a key of `stage.formats.exif.TURNS`; they are read upright
     exposure: Exposure = Exposure()  # as EXIF says
     half: bool = False  # whether all colour channels hold half values
 
@@ -81,7 +80,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
     if suffix == ".png":
         integrity.check_png(path, source.file, contents=False)
     elif suffix == ".jxl":
-        source.check_pixels(*jxl.resolution_of(path, source.file))
+        source.check_pixels(*integrity.jxl_resolution_of(path, source.file))
     elif suffix == ".avif":
         found = avif.header_of(path, source.file)
         return ImageHeader(found.width, found.height, found.channels, found.channels + 1, True)
@@ -146,7 +145,7 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
     elif suffix in (".jpg", ".jpeg"):
         integrity.check_jpeg(source.path, source.file)
     elif suffix == ".jxl":
-        source.check_pixels(*jxl.resolution_of(source.path, source.file))
+        source.check_pixels(*integrity.jxl_resolution_of(source.path, source.file))
     elif suffix == ".avif":
         found = avif.header_of(source.path, source.file)
         source.check_pixels(found.width, found.height)

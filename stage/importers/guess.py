@@ -16,13 +16,12 @@ from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.content import Pictures
 from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, lit, made, tried
-from stage.importers.laser import OFF_WORDS
+from stage.importers.laser import NAMES as PLANES
+from stage.importers.laser import OFF_WORDS, read_planes
 from stage.importers.layout import image_names, natural_order, read_lines
 from stage.importers.light_rig import CAMERA_MATRIX, read_rig
 from stage.importers.light_table import SUFFIXES as TABLES
 from stage.importers.light_table import read_light_table
-from stage.importers.plane_table import NAMES as PLANES
-from stage.importers.plane_table import read_planes
 from stage.importers.raw_arrays import ArrayFiles
 from stage.importers.video import is_video
 from stage.tof.raw_frames import read_array

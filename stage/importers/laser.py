@@ -1,13 +1,19 @@
-"""Import of images of the stripe of a laser, one for each place of its plane, with the planes in a file or without."""
+"""Import of images of the stripe of a laser, one for each place of its plane, with the planes in a file or without.
 
+A file of planes has rows of coefficients or of a point and a normal, or is a calibration file with entries of them.
+"""
+
+import csv
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from stage.capture.manifest import SCHEMA
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError
+from stage.formats.images import SUFFIXES as IMAGE_SUFFIXES
+from stage.formats.mat_file import read_mat_arrays
 from stage.importers.camera_options import (
     AMBIENT_WORDS,
     Axes,
@@ -19,13 +25,153 @@ from stage.importers.camera_options import (
     select,
     view_of_file,
 )
-from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_names, image_resolution, write_capture
-from stage.importers.plane_table import PlaneTable, read_planes
+from stage.importers.layout import (
+    Imported,
+    assumed_encoding,
+    color_space_of,
+    first_of,
+    image_names,
+    image_resolution,
+    read_json,
+    read_lines,
+    write_capture,
+)
+from stage.importers.opencv_file import read_matrices
+from stage.tof.raw_frames import read_array
 
+NAMES = ("laser_planes", "planes", "laser_plane", "laserPlane", "plane", "plane_coefficients", "plane_params", "laser", "coefficients")
+"""Names of the planes in calibration files, in order of preference."""
+NORMALS, DISTANCES, POINTS = ("normal", "normals", "n"), ("distance", "d", "offset"), ("point", "points", "origin")
+"""Names of the parts of one plane, or of all."""
+TEXT = (".csv", ".txt", ".tsv", ".dat")
+FORMS = {"zero": "a x + b y + c z + d = 0", "equals": "a x + b y + c z = d"}
+"""Meanings of the four coefficients of a plane."""
 OFF_WORDS = AMBIENT_WORDS | {"background", "off", "nolaser"}
 """Words in the name of the image without the laser."""
 PLACEHOLDER: dict[str, Any] = {"type": "plane", "point_m": [0, 0, 0], "normal": [1, 0, 0]}
 """The plane of a frame that relit calibrate laser-planes is to measure."""
+
+
+class PlaneTable(NamedTuple):
+    """The planes of a file, in its own axes and unit."""
+
+    values: np.ndarray
+    """[planes, 4] float64, coefficients a, b, c, d; or [planes, 6], a point and the normal."""
+    names: tuple[str, ...] | None
+    """The image of each plane, where the file names them."""
+
+    def points_and_normals(self, form: str | None, path: Path) -> tuple[np.ndarray, np.ndarray]:
+        """Return a point of each plane and its unit normal, [planes, 3] float64 each.
+
+        Args:
+            form: one of FORMS, for coefficients; None: not told.
+        """
+        normals = self.values[:, :3] if self.values.shape[1] == 4 else self.values[:, 3:]
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        if (length == 0).any():
+            raise ManifestError(f"{path}: plane {int(np.argmin(length)) + 1}: its normal is zero")
+        if self.values.shape[1] == 6:
+            return self.values[:, :3], normals / length
+        if form is None:
+            raise ManifestError(f"{path}: holds four coefficients of each plane: say what they mean, "
+                                + " or ".join(f"--form {name} for {words}" for name, words in FORMS.items()))
+        along = self.values[:, 3:] / length * (-1 if form == "zero" else 1)
+        return normals / length * along, normals / length
+
+
+def read_planes(path: Path) -> PlaneTable:
+    """Read the planes of a file.
+
+    Args:
+        path: text or CSV with a row for each plane, an image name before it or none; .npy or .mat with such an array; or a calibration file
+            of OpenCV or JSON (.yml, .xml, .json) with one of NAMES, or with a normal and a distance or a point.
+    """
+    suffix = path.suffix.lower()
+    if suffix in TEXT:
+        return _from_text(path)
+    if suffix == ".npy":
+        return _table(path, read_array(path), None)
+    if suffix == ".json":
+        objects = _objects(path)
+        if objects is not None:
+            return objects
+    matrices = read_mat_arrays(path) if suffix == ".mat" else read_matrices(path)
+    return _of_parts(path, matrices)
+
+
+def _from_text(path: Path) -> PlaneTable:
+    rows: list[list[float]] = []
+    names: list[str] = []
+    for number, line in read_lines(path):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        parts = next(csv.reader([text], skipinitialspace=True)) if "," in text else text.replace(";", " ").split()
+        name = parts.pop(0) if Path(parts[0]).suffix.lower() in IMAGE_SUFFIXES else None
+        try:
+            values = [float(part) for part in parts]
+        except ValueError:
+            if not rows:
+                continue  # headings
+            values = []
+        if len(values) not in (4, 6):
+            raise ManifestError(f"{path}: line {number}: {text[:60]!r} is no plane: give four coefficients, or a point and a normal")
+        rows.append(values)
+        names += [] if name is None else [name]
+    if not rows:
+        raise ManifestError(f"{path}: holds no planes: give a row of four coefficients for each, or of a point and a normal")
+    if len({len(row) for row in rows}) > 1 or len(names) not in (0, len(rows)):
+        raise ManifestError(f"{path}: its rows differ: each has four numbers or each has six, and all have an image name or none")
+    return _table(path, np.array(rows), tuple(names) or None)
+
+
+def _objects(path: Path) -> PlaneTable | None:
+    """Return the planes of a list of objects in a JSON file; None where it holds something else."""
+    data = read_json(path)
+    if isinstance(data, dict):
+        data = next((data[name] for name in NAMES if isinstance(data.get(name), dict | list)), data)
+    planes: list[Any] = [data] if isinstance(data, dict) else data if isinstance(data, list) else []
+    if not planes or not all(isinstance(plane, dict) and any(name in plane for name in NORMALS) for plane in planes):
+        return None
+    try:
+        parts = [{str(key): np.atleast_1d(np.array(value, np.float64)) for key, value in plane.items()
+                  if key in (*NORMALS, *DISTANCES, *POINTS)} for plane in planes]
+    except (TypeError, ValueError) as error:
+        raise ManifestError(f"{path}: its planes must have numbers as normal and as distance or point") from error
+    tables = [_of_parts(path, held) for held in parts]
+    images = [next((str(plane[key]) for key in ("image", "file", "name") if key in plane), None) for plane in planes]
+    names = tuple(image for image in images if image is not None)
+    if len({table.values.shape[1] for table in tables}) > 1 or len(names) not in (0, len(planes)):
+        raise ManifestError(f"{path}: its planes differ: each has a distance or each has a point, and all name an image or none")
+    return PlaneTable(np.concatenate([table.values for table in tables]), names or None)
+
+
+def _of_parts(path: Path, matrices: dict[str, np.ndarray]) -> PlaneTable:
+    """Return the planes that a calibration file holds under the usual names."""
+    whole = first_of(matrices, NAMES)
+    if whole is not None:
+        return _table(path, whole, None)
+    normal, distance, point = (first_of(matrices, names) for names in (NORMALS, DISTANCES, POINTS))
+    if normal is None or (distance is None and point is None):
+        raise ManifestError(f"{path}: holds {', '.join(matrices) or 'nothing'}: there must be the planes of the laser, as "
+                            f"{', '.join(NAMES[:3])}, or as normal and distance or point")
+    try:
+        normals = normal.reshape(-1, 3)
+        if point is not None:
+            return _table(path, np.hstack([point.reshape(-1, 3), normals]), None)
+        assert distance is not None
+        return _table(path, np.hstack([normals, distance.reshape(-1, 1)]), None)
+    except ValueError as error:
+        raise ManifestError(f"{path}: its planes need a normal of three numbers each, and as many distances or points") from error
+
+
+def _table(path: Path, values: np.ndarray, names: tuple[str, ...] | None) -> PlaneTable:
+    table = np.asarray(values, np.float64)
+    table = table.reshape(1, -1) if table.ndim < 2 or table.shape in ((4, 1), (6, 1)) else table
+    if table.ndim != 2 or table.shape[1] not in (4, 6) or not np.isfinite(table).all():
+        raise ManifestError(f"{path}: holds {' x '.join(map(str, np.shape(values)))} numbers: planes are rows of four coefficients, or of "
+                            "a point and a normal, all finite")
+    return PlaneTable(table, names)
 
 
 def import_folder(source: Path, destination: Path, *, view: View, camera: Path | None = None, planes: Path | None = None,
@@ -36,7 +182,7 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
     Args:
         view: the camera, as far as options say it.
         planes: the file of the planes; None: every frame gets a placeholder.
-        form: what four coefficients of a plane mean, one of `plane_table.FORMS`.
+        form: what four coefficients of a plane mean, one of `FORMS`.
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.
         unit_m: the metres in one unit of the planes; needed with `planes`.
         selection: which images are frames; None: all but the mask and the one without the laser.

@@ -12,7 +12,7 @@ import pytest
 
 from stage.capture.manifest import read_manifest
 from stage.errors import ImageError, ManifestError, StageError
-from stage.formats import exr, jxl
+from stage.formats import exr, integrity
 from stage.tof.raw_frames import read_array
 from tests.service.server.api.captures import lying_exr, lying_jxl, lying_npy, manifest
 
@@ -30,17 +30,17 @@ def test_the_size_of_a_jxl_is_read_without_decoding_it(tmp_path, size, bare):
     out.close()
     content = path.read_bytes()
     if bare:  # the codestream alone, as far as its size is
-        path.write_bytes(content[content.index(jxl.CODESTREAM):])
-    assert jxl.resolution(path) == size
-    for length in (0, 1, 12, 20, len(content) - len(content[content.index(jxl.CODESTREAM):]) + 3):
+        path.write_bytes(content[content.index(integrity.CODESTREAM):])
+    assert integrity.jxl_resolution(path) == size
+    for length in (0, 1, 12, 20, len(content) - len(content[content.index(integrity.CODESTREAM):]) + 3):
         path.write_bytes(content[:length])
         with pytest.raises(ImageError, match=r"a\.jxl"):
-            jxl.resolution(path)
+            integrity.jxl_resolution(path)
 
 
 def test_a_jxl_may_claim_any_size(tmp_path):
     (tmp_path / "a.jxl").write_bytes(lying_jxl(1 << 30, 1 << 29))
-    assert jxl.resolution(tmp_path / "a.jxl") == (1 << 30, 1 << 29)
+    assert integrity.jxl_resolution(tmp_path / "a.jxl") == (1 << 30, 1 << 29)
 
 
 @pytest.mark.parametrize("content", [

@@ -1,19 +1,65 @@
-"""What a picture should be: under one lamp, the prediction from the lamps around it; under several, the median of those of equal levels."""
+"""What a picture should be: under one lamp, the prediction from the lamps around it; under several, the median of those of equal levels.
 
+Per pixel, the light of a distant lamp is linear in the unit vector towards it where a matte surface faces it; near the borders of shadows
+it is so over small angles only. So the prediction at a direction is a fit, linear in the vector, to the pictures of the lamps, weighted by
+their distance on the sphere (local linear regression, Cleveland 1979). It is linear in the pictures, and the weights follow from directions
+alone.
+"""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from service.acquisition.checks.fault import Fault
 from service.acquisition.checks.motion import Bands
-from service.acquisition.checks.prediction import prediction_weights, rough_weights
 from service.acquisition.checks.sample import Sample
 from service.acquisition.plans.shots import Shot
+from service.requests.base.base import Choice
 
 LEAST_MISFIT = 1e-4
 """A misfit below this is as good as none."""
 LEAST_WEIGHT = 1e-3
 """Pictures with less weight are left out of a prediction."""
+LEAST_LAMPS = 8
+"""The fewest lamps from which a picture is predicted."""
+WIDTH_SPACINGS = 1.2
+"""The standard deviation of the weights over the distance to the fourth nearest lamp."""
+NEIGHBOUR = 4
+MOST_CONDITION = 1e6
+MOST_GAIN = 2.0
+"""The largest sum of the sizes of weights: beyond it the direction lies outside of those of the lamps, an extrapolation."""
+FAR_DEGREES = 45.0
+"""The largest angle to the fourth nearest lamp at which the lamps on one side say roughly what a picture should be."""
+
+
+class FaultKind(Choice):
+    """What is wrong with a picture."""
+
+    CLIPPED = "clipped", "too many readings of the object are at full scale"
+    DARK = "too_dark", "the brightest readings are near the noise"
+    UNLIT = "did_not_light", "the light did not come on"
+    WRONG_LIGHT = "wrong_light", "another light shone than the plan says"
+    DOUBLED = "doubled", "the picture is one that was taken before"
+    MISSING = "missing", "no picture came"
+    LATE = "late", "a picture came when none was asked for"
+    MOVED = "moved", "the object or the camera moved"
+    UNSHARP = "focus", "the focus fell off"
+    AMBIENT = "ambient", "light that is not the rig's changed"
+
+
+class Fault(NamedTuple):
+    """A fault of the picture of one shot."""
+
+    shot: str
+    """The key of the shot."""
+    kind: FaultKind
+    sentence: str
+    """What was found, with its figures."""
+
+
+def said(faults: Sequence[Fault]) -> dict[str, list[list[str]]]:
+    """Return what a line of the journal says of the faults of a picture."""
+    return {"faults": [[str(fault.kind), fault.sentence] for fault in faults]} if faults else {}
 
 
 class Seen(NamedTuple):
@@ -96,3 +142,47 @@ def same_kind(shot: Shot, other: Shot) -> bool:
     if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.projected:
         return False
     return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)
+
+
+def prediction_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
+    """Return the weight of the picture of each lamp in the prediction at a direction.
+
+    Args:
+        wanted: [3] unit vector.
+        directions: [lamps, 3] unit vectors of the lamps whose pictures there are.
+
+    Returns:
+        [lamps] float64, or None where there are too few, or all lie on one side of the direction.
+    """
+    if len(directions) < LEAST_LAMPS:
+        return None
+    angle = np.arccos(np.clip(directions @ wanted, -1, 1))
+    width = WIDTH_SPACINGS * np.sort(angle)[NEIGHBOUR - 1]
+    weight = np.exp(-0.5 * (angle / max(width, 1e-3)) ** 2)
+    basis = directions @ np.column_stack([wanted, _tangents(wanted)])
+    normal = basis.T @ (weight[:, None] * basis)
+    if np.linalg.cond(normal) > MOST_CONDITION:
+        return None
+    found: np.ndarray = np.linalg.solve(normal, (weight[:, None] * basis).T)[0]
+    return found if np.abs(found).sum() <= MOST_GAIN else None
+
+
+def _tangents(direction: np.ndarray) -> np.ndarray:
+    """Return two unit vectors across a direction, [3, 2]."""
+    other = np.eye(3)[np.abs(direction).argmin()]
+    first = np.cross(direction, other)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first)])
+
+
+def rough_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
+    """Return weights as `prediction_weights` does, of a weighted mean, which also stands for lamps on one side; None where all are far."""
+    if len(directions) < NEIGHBOUR:
+        return None
+    angle = np.arccos(np.clip(directions @ wanted, -1, 1))
+    spacing = np.sort(angle)[NEIGHBOUR - 1]
+    if spacing > np.radians(FAR_DEGREES):
+        return None
+    weight = np.exp(-0.5 * (angle / max(spacing, 1e-3)) ** 2)
+    found: np.ndarray = weight / weight.sum()
+    return found

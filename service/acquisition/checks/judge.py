@@ -9,8 +9,11 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 
 from service.acquisition.checks.expectation import (
+    LEAST_LAMPS,
     LEAST_MISFIT,
     Expectation,
+    Fault,
+    FaultKind,
     Seen,
     comparable,
     expected_bands,
@@ -19,9 +22,7 @@ from service.acquisition.checks.expectation import (
     same_kind,
     unit_root,
 )
-from service.acquisition.checks.fault import Fault, FaultKind
 from service.acquisition.checks.motion import Motion, bands_of, motion_between
-from service.acquisition.checks.prediction import LEAST_LAMPS
 from service.acquisition.checks.sample import place_of_tile, sample_of
 from service.acquisition.checks.unreached import glows, unreached_faults
 from service.acquisition.plans.shots import Shot

@@ -4,9 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from service.acquisition.checks.expectation import LEAST_MISFIT, Seen, unit_root
-from service.acquisition.checks.fault import Fault, FaultKind
-from service.acquisition.checks.prediction import LEAST_LAMPS
+from service.acquisition.checks.expectation import LEAST_LAMPS, LEAST_MISFIT, Fault, FaultKind, Seen, unit_root
 from service.acquisition.plans.shots import Shot
 
 RELATED = 0.15

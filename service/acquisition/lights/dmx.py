@@ -7,10 +7,9 @@ import numpy as np
 
 from service.acquisition.lights.lights import Ask
 from service.errors import RequestError
-from service.play.addresses import driven_universes, hosts_of
 from service.play.outputs import Output, open_output
 from service.play.play import KEEP_ALIVE_S, black_out, send
-from service.play.show import Values, dark_values
+from service.play.show import Values, dark_values, driven_universes, hosts_of
 from service.requests.play import PlayRequest
 from stage.rig.patch import drive_steps, universe_values
 from stage.rig.rig import Rig

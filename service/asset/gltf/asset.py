@@ -9,8 +9,18 @@ from service.asset.content.depth import UNCERTAINTY, colour_image, colour_warnin
 from service.asset.content.metallic import GLASS_IOR, loss_warnings
 from service.asset.content.surface import AssetReport, surface_of
 from service.asset.gltf.container import Glb, writing_glb
-from service.asset.gltf.materials import NORMAL, add_material, add_unlit_material, check_textures, write_textures
-from service.asset.gltf.scene import add_attribute, add_points, add_scene, add_surface, camera_warnings
+from service.asset.gltf.scene import (
+    NORMAL,
+    add_attribute,
+    add_material,
+    add_points,
+    add_scene,
+    add_surface,
+    add_unlit_material,
+    camera_warnings,
+    check_textures,
+    write_textures,
+)
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat
 from stage.formats.ply import PointCloud
 from stage.results.depth_maps import DepthMaps

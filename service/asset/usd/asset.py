@@ -2,16 +2,14 @@
 
 from pathlib import Path
 
-from service.asset.content.camera import SCALE_NOTE
 from service.asset.content.levels import level_meshes, with_smooth_normals
 from service.asset.content.metallic import loss_warnings
-from service.asset.content.surface import AssetReport, surface_of
+from service.asset.content.surface import SCALE_NOTE, AssetReport, surface_of
 from service.asset.content.textures import space_warnings, write_textures
-from service.asset.usd.camera import define_cameras
 from service.asset.usd.files import check_textures
 from service.asset.usd.layers import Description
 from service.asset.usd.materials import define_openpbr_looks
-from service.asset.usd.scene import define_mesh
+from service.asset.usd.scene import define_cameras, define_mesh
 from service.asset.usd.surroundings import Surroundings, define_surroundings, writing_asset
 from service.errors import AssetError
 from service.requests.export import FIRST_VERSION, TextureFormat

@@ -25,11 +25,10 @@ from service.asset.content.depth import (
 )
 from service.asset.content.mesh import SurfaceMesh
 from service.asset.content.textures import write_textures
-from service.asset.usd.camera import define_cameras
 from service.asset.usd.files import check_textures, write_layer
 from service.asset.usd.layers import AssetLayers, Description, define_root, describe_root, prim_name, set_extents_hint
 from service.asset.usd.materials import define_display_color_material, define_looks
-from service.asset.usd.scene import define_mesh, define_points, set_primvar
+from service.asset.usd.scene import define_cameras, define_mesh, define_points, set_primvar
 from service.asset.usd.surroundings import writing_asset
 from service.errors import AssetError
 from service.requests.export import FIRST_VERSION, Geometry, TextureFormat

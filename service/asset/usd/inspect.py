@@ -14,9 +14,9 @@ import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
 from service.asset.content.inspection import Inspection, Part, image_facts
-from service.asset.usd.camera import APERTURE_UNIT
 from service.asset.usd.files import reason_of
 from service.asset.usd.layers import PURPOSES
+from service.asset.usd.scene import APERTURE_UNIT
 from service.errors import AssetError
 from stage.errors import storage
 

@@ -14,11 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from service.asset.usd.camera import define_cameras
 from service.asset.usd.files import write_layer
 from service.asset.usd.layers import CAMERA_FRAME, Description, define_root, describe_root, pose_matrix, prim_name, set_extents_hint
 from service.asset.usd.materials import define_display_color_material
-from service.asset.usd.scene import distinct
+from service.asset.usd.scene import define_cameras, distinct
 from service.errors import AssetError
 from service.requests.export import TIME_SAMPLED
 

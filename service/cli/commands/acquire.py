@@ -79,7 +79,7 @@ def _capture(request: AcquireRequest) -> None:
 def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
     """Meter the light, and print what to set."""
     from service.acquisition.cameras.camera import LIVE, SPOOL
-    from service.acquisition.live_page import LivePage
+    from service.acquisition.live_view import LivePage
     from service.acquisition.meter import SHARE, meter
 
     if request.live and request.rig is not None and sys.stdin.isatty() and request.camera.partition(":")[0] in LIVE:

@@ -41,7 +41,7 @@ def look(request: jobs.CheckJob, files: StepFiles) -> None:
 def import_files(request: jobs.CheckJob, files: StepFiles) -> None:
     """Import the files of a capture as the request says, check what was made, and let the capture be ready with it."""
     from service.captures.check_process import check_in_process, import_in_process
-    from service.captures.proposals import still_assumed
+    from service.captures.importing import still_assumed
 
     context, job, choices = files.context, files.job, request.importing
     row = intakes.find(context.database, request.intake, job.project)

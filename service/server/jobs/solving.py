@@ -38,7 +38,7 @@ def steps(job: Job, request: SolveJob | DepthJob, context: WorkerContext) -> lis
 
 
 def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
-    from service.sequences.time_step import solve_number
+    from service.sequences.steps import solve_number
     from service.sharing.sharing import SharedSolve
     from service.solve.solve import solve
 
@@ -54,7 +54,7 @@ def _solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
 
 
 def _help_solve(request: SolveJob, number: int | None, files: StepFiles) -> None:
-    from service.sequences.time_step import help_solve_number
+    from service.sequences.steps import help_solve_number
     from service.sharing.sharing import SharedSolve
     from service.solve.solve import help_solve
 
@@ -69,7 +69,7 @@ def _help_solve(request: SolveJob, number: int | None, files: StepFiles) -> None
 
 def _depth(request: DepthJob, number: int | None, files: StepFiles) -> None:
     from service.depth.depth import depth
-    from service.sequences.time_step import depth_number
+    from service.sequences.steps import depth_number
 
     wanted = _depth_request(request, number, files)
     if number is None:
@@ -94,8 +94,7 @@ def _join(request: SolveJob | DepthJob, files: StepFiles) -> None:
 
 def _fetch(request: "SolveRequest | DepthRequest", files: StepFiles, names: tuple[str, ...] = ()) -> None:
     """Put onto this machine what the time steps that are done have left for others, and some of their files."""
-    from service.sequences.steps import DONE_FILE
-    from service.sequences.time_step import result_folder
+    from service.sequences.steps import DONE_FILE, result_folder
     from stage.capture.sequence import read_sequence
 
     folders = [result_folder(request, step).relative_to(request.out) for step in read_sequence(request.capture).steps]

@@ -15,8 +15,8 @@ from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, ra
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
 from service.solve.lights.other_lights import find_other_lights
 from stage.capture.capture import Capture
-from stage.capture.extended_lights import ExtendedLights
 from stage.capture.gradients import GradientFrames
+from stage.capture.lighting import ExtendedLights
 from stage.capture.point_lights import DistantLights, PlacedLights
 
 UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)

@@ -23,7 +23,7 @@ from service.solve.base.batches import Batch, View, each_batch, readable, view_d
 from service.solve.base.solution import Solution, SolveInput
 from service.solve.methods.open_sources import OpenSources, open_sources
 from stage.capture.camera import Camera
-from stage.capture.extended_lights import ExtendedLights
+from stage.capture.lighting import ExtendedLights
 
 PART_DEGREES = 8.0
 """Width of a part of a perspective view that shares a table: at its edge, 4° from its middle, the normal of a metal of roughness

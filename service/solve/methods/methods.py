@@ -14,10 +14,9 @@ from service.solve.methods.diffuse import solve_diffuse
 from service.solve.methods.near import MATERIAL_ROUNDS, NormalSolver, Rounds, solve_near
 from service.solve.methods.reference_ball import ReferenceBall, reference_ball
 from stage.capture.capture import Capture
-from stage.capture.extended_lights import ExtendedLights
 from stage.capture.gradients import GradientFrames, gradient_frames, has_gradients
 from stage.capture.light import DistantLight, ExtendedLight, PointLight
-from stage.capture.lighting import check_solvable
+from stage.capture.lighting import ExtendedLights, check_solvable
 from stage.capture.point_lights import DistantLights, PlacedLights
 
 Solver = Callable[[SolveInput, Any], Solution]

@@ -26,7 +26,7 @@ from service.solve.base.solution import SolveInput
 from service.solve.height.direct_light import LARGEST_ALBEDO
 from service.solve.height.height import integrate, projection_of
 from service.solve.height.interreflection import ArrivingLight, arriving_light
-from stage.capture.extended_lights import ExtendedLights
+from stage.capture.lighting import ExtendedLights
 from stage.colour.colour import GREY_WEIGHTS
 from stage.transforms import fibonacci_sphere
 

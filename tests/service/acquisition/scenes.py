@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
 from service.acquisition.plans.shots import Shot, shots_of

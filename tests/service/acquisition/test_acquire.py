@@ -22,7 +22,7 @@ import pytest
 import service
 from service.acquisition.acquire import Acquisition, acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from service.cli.main import main
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render

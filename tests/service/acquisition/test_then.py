@@ -6,7 +6,7 @@ import shlex
 import numpy as np
 import pytest
 
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.preview import PREVIEW_FILE, write_preview
 from service.errors import RequestError
 from service.relight.sheet import MARGIN, TITLE

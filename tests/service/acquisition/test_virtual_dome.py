@@ -13,7 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from service.acquisition.checks.fault import FaultKind
+from service.acquisition.checks.expectation import FaultKind
 from stage.formats import images
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render, write_capture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.captures.proposals import import_chosen, propose
+from service.captures.importing import import_chosen, propose
 from service.requests.base.import_choices import ImportChoices
 from stage.errors import ManifestError
 

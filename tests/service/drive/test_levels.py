@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from service.drive.dilation import dilate, fill
-from service.drive.primaries import levels_for_light, nonnegative_least_squares
-from service.drive.quantisation import quantise
+from service.drive.levels import dilate, fill, levels_for_light, nonnegative_least_squares, quantise
 from stage.errors import ManifestError
 from stage.rig.chart import read_chart
 from stage.rig.rig import read_rig

@@ -18,8 +18,8 @@ from service.errors import RequestError
 from service.play import play as module
 from service.play.play import play
 from service.requests.play import PlayRequest
+from service.twin.fixtures import DataPacket, SyncPacket, read_artnet, read_sacn
 from service.twin.listener import Listener
-from service.twin.packets import DataPacket, SyncPacket, read_artnet, read_sacn
 from stage.errors import ManifestError
 from stage.rig.patch import levels_of_universes
 from stage.rig.rig import read_rig
@@ -221,7 +221,7 @@ def test_a_network_that_refuses_multicast_is_one_sentence(tmp_path, monkeypatch)
         def sendto(self, data, address):
             raise OSError(101, "Network is unreachable")
 
-    monkeypatch.setattr("service.play.datagrams.socket.socket", Refusing)
+    monkeypatch.setattr("service.play.outputs.socket.socket", Refusing)
     with pytest.raises(RequestError, match=r"^the network refuses multicast to 239\.255\.0\.1, port 5568: network is unreachable: give"):
         play(PlayRequest(cues=cues, rig=rig))
     with pytest.raises(RequestError, match=r"^the network refuses broadcast to 255\.255\.255\.255"):

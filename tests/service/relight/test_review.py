@@ -11,7 +11,7 @@ from service.acquisition.preview import write_preview
 from service.relight import sheet
 from service.reporting.progress import Timings
 from service.requests.play import TwinRequest
-from service.twin.picture import TwinPicture
+from service.twin.camera import TwinPicture
 from stage.capture.capture import Capture
 from stage.colour.colour_spaces import Review
 from stage.formats import images

@@ -8,7 +8,7 @@ import pytest
 from service.errors import RequestError
 from service.requests.depth import DepthRequest
 from service.requests.solve import LightsKnown, Method, SolveRequest
-from service.sequences import time_step
+from service.sequences import steps
 from service.sequences.run import depth_sequence, solve_sequence
 from stage.errors import ManifestError
 from stage.formats.ply import read_ply
@@ -153,7 +153,7 @@ def test_intensities_of_the_first_step_are_those_of_all(tmp_path):
 @pytest.mark.long
 def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
     write_sequence(tmp_path / "in", [None] * 3, noise=NOISE, size=24)
-    solved, whole = [], time_step.solve
+    solved, whole = [], steps.solve
 
     def counted(request, *arguments, **options):
         solved.append(request.capture.name)
@@ -161,7 +161,7 @@ def test_steps_that_are_done_are_not_solved_again(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return whole(request, *arguments, **options)
 
-    monkeypatch.setattr(time_step, "solve", counted)
+    monkeypatch.setattr(steps, "solve", counted)
     with pytest.raises(KeyboardInterrupt):
         solve_sequence(request(tmp_path))
     assert solved == ["step00", "step01"] and "step00/alone/step.json" in files_in(tmp_path / "out")

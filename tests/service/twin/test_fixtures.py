@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from service.twin.fixtures import ARTSYNC_S, LOSS_S, Fixtures
-from service.twin.packets import DataPacket, SyncPacket, read_artnet, read_sacn
+from service.twin.fixtures import ARTSYNC_S, LOSS_S, DataPacket, Fixtures, SyncPacket, read_artnet, read_sacn
 
 ONE, TWO = ("sacn", 1), ("sacn", 2)
 

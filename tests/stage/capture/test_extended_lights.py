@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from stage.capture.capture import Capture
-from stage.capture.extended_lights import ExtendedLights, extended_lights
-from stage.capture.lighting import check_solvable
+from stage.capture.lighting import ExtendedLights, check_solvable, extended_lights
 from stage.errors import ManifestError
 from tests.scenes.captures import write_exr, write_manifest
 

@@ -6,9 +6,8 @@ import pytest
 from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError
 from stage.formats import camera_raw
-from stage.formats.exif import Exposure
+from stage.formats.exif import TURNS, Exposure, upright
 from stage.formats.images import read_header, read_pixels
-from stage.formats.orientation import TURNS, upright
 from stage.importers.camera_options import Selection
 from stage.importers.olat import import_photos
 from stage.stack.correction import Correction

@@ -9,8 +9,8 @@ from service.captures.info import inspect
 from service.requests.captures import InfoRequest
 from stage.capture.capture import Capture
 from stage.errors import ImageError, ManifestError
+from stage.formats.exif import TURNS
 from stage.formats.images import read_header, read_recorded
-from stage.formats.orientation import TURNS
 from stage.stack.ingest import open_stack
 from tests.scenes.captures import edit_manifest, make_scene, manifest_of, write_image, write_manifest
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from stage.capture.capture import Capture
 from stage.stack.ingest import open_stack
-from stage.stack.replaced import ReplacedStack
+from stage.stack.stack import ReplacedStack
 from tests.scenes.captures import make_scene, write_capture
 
 SCENE = make_scene(size=12, lights=4)

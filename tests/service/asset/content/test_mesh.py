@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.asset.content.cells import BORDER_PX
 from service.asset.content.links import Links, surface_links
-from service.asset.content.mesh import height_mesh
+from service.asset.content.mesh import BORDER_PX, height_mesh
 from service.errors import AssetError
 from tests.scenes.surfaces import RADIUS_M, make_ball, make_sheet, make_wave
 

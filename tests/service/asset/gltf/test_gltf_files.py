@@ -5,7 +5,7 @@ import errno
 import numpy as np
 import pytest
 
-from service.asset.gltf import container, materials
+from service.asset.gltf import container, scene
 from service.asset.gltf.asset import write_asset
 from service.asset.gltf.container import read_glb
 from service.errors import AssetError
@@ -30,14 +30,14 @@ def test_full_disk_in_a_texture_leaves_no_trace(older, tmp_path, monkeypatch):
     if older:
         write_asset(SURFACES["diffuse only"], target, name="A")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    written = materials.write_png
+    written = scene.write_png
 
     def fail(path, codes, *, srgb):
         if path.name == "normal.png":  # the last
             raise OSError(errno.ENOSPC, "No space left on device")
         written(path, codes, srgb=srgb)
 
-    monkeypatch.setattr(materials, "write_png", fail)
+    monkeypatch.setattr(scene, "write_png", fail)
     with pytest.raises(StorageError, match="no space left on device") as raised:
         write_asset(SURFACES["everything"], target, name="A")
     assert str(target) in str(raised.value)

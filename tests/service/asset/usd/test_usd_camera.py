@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 
 from service.asset.content.mesh import height_mesh
 from service.asset.usd.asset import write_asset
-from service.asset.usd.camera import PARALLAX_PX
+from service.asset.usd.scene import PARALLAX_PX
 from tests.scenes.surfaces import make_ball, make_wave
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))

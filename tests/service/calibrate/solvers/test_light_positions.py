@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.calibrate.solvers.light_positions import nearest_point
+from service.calibrate.solvers.mirror_ball import nearest_point
 from stage.errors import CalibrationError
 from tests.reference.light_directions import least_error_degrees
 from tests.service.calibrate.solvers.balls import unit

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.calibrate.solvers.procam import BoardView, board_points, calibrate, find_corners, outliers, projector_corners
-from service.calibrate.solvers.stereo import SharedView, alike_order, calibrate_lens, calibrate_pose
+from service.calibrate.stereo import SharedView, alike_order, calibrate_lens, calibrate_pose
 from stage.errors import CalibrationError
 from tests.reference import projector as reference
 

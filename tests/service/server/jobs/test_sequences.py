@@ -11,7 +11,7 @@ from service.requests.base.base import SequenceOptions
 from service.requests.base.identifiers import CAPTURE, new_id
 from service.requests.jobs import DepthJob, SolveJob
 from service.requests.solve import SolveOptions, SolveRequest
-from service.sequences import time_step
+from service.sequences import steps
 from service.sequences.run import solve_sequence
 from service.server.base.settings import Settings
 from service.server.database import jobs
@@ -75,8 +75,8 @@ def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence
                 for name in ("one", "other")]
     names = [step.name for step in steps_of(job, contexts[0])]
     assert names == [*(f"step {number}" for number in range(1, STEPS + 1)), "sequence"]
-    solved, whole = [], time_step.solve
-    monkeypatch.setattr(time_step, "solve", lambda request, *args, **options: (solved.append(request.capture.name),
+    solved, whole = [], steps.solve
+    monkeypatch.setattr(steps, "solve", lambda request, *args, **options: (solved.append(request.capture.name),
                                                                            whole(request, *args, **options)))
     for number, name in enumerate(names):
         run(job, contexts[number % 2], name)
