@@ -66,13 +66,13 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
 
 
 def propose_in_process(folder: Path, *, max_pixels: int, progress: Progress) -> dict[str, Any]:
-    """Return what `service.captures.proposals.propose` returns for a folder; errors are those of `check_in_process`."""
+    """Return what `service.captures.importing.propose` returns for a folder; errors are those of `check_in_process`."""
     return _ask({"do": "propose", "folder": str(folder), "max_pixels": max_pixels}, progress)
 
 
 def import_in_process(folder: Path, choices: ImportChoices, assumed: tuple[str, ...], name: str, *, max_pixels: int,
                       progress: Progress) -> None:
-    """Do `service.captures.proposals.import_chosen` in a process of its own; errors are those of `check_in_process`."""
+    """Do `service.captures.importing.import_chosen` in a process of its own; errors are those of `check_in_process`."""
     _ask({"do": "import", "folder": str(folder), "choices": choices.model_dump(mode="json"), "assumed": assumed, "name": name,
           "max_pixels": max_pixels}, progress)
 
@@ -180,7 +180,7 @@ def _done(folder: Path, asked: dict[str, Any]) -> dict[str, Any]:
                 held.enter_context(inputs.confined(top, Path(asked["root"]), max_pixels=asked["max_pixels"]))
             return (admit_environment(folder, max_pixels=asked["max_pixels"]) if asked["environment"] else
                     admit_capture(folder, max_pixels=asked["max_pixels"], progress=_Lines()))
-    from service.captures.proposals import import_chosen, propose
+    from service.captures.importing import import_chosen, propose
 
     inputs.enclose()
     with inputs.confined(folder, folder, max_pixels=asked["max_pixels"]):

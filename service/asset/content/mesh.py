@@ -5,9 +5,10 @@ One vertex per masked pixel (or every `step`-th one), four-sided faces between n
 for half a pixel, to the edge of its outermost pixels, so that seen by the camera the mesh covers its pixels and nothing else, and both
 sides of a break meet.
 
-The faces are marching squares over links. A cell lies between four neighbouring pixels. Its corners that are linked along its sides lie on one surface and get one patch of faces,
-which ends half-way to the corners of other surfaces. Every side of a patch that does not lie on the border belongs to the patches of
-two neighbouring cells, and around each pixel four patches meet: without a step no vertex has more than one fan of faces.
+The faces are marching squares over links. A cell lies between four neighbouring pixels. Its corners that are linked along its sides lie on
+one surface and get one patch of faces, which ends half-way to the corners of other surfaces. Every side of a patch that does not lie on the
+border belongs to the patches of two neighbouring cells, and around each pixel four patches meet: without a step no vertex has more than one
+fan of faces.
 
 Source: Lorensen and Cline, "Marching cubes", SIGGRAPH 1987, in two dimensions and with links in place of a threshold.
 """
