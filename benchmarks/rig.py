@@ -17,7 +17,7 @@ from service.depth.depth import depth
 from service.relight.sheet import write_sheet
 from service.requests.depth import DepthRequest
 from stage.capture.capture import Capture
-from stage.capture.ranging import LaserPlane, LaserRay
+from stage.capture.light import LaserPlane, LaserRay
 from stage.formats import exr
 from stage.formats.images import read_pixels
 from stage.formats.ply import read_ply

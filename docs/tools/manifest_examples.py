@@ -3,10 +3,21 @@
 from typing import Any
 
 from stage.capture.camera import Camera, Distortion, OtherCamera, StereoImages
-from stage.capture.light import DistantLight, EnvironmentLight, ExtendedLight, FullLight, GradientLight, OffLight, PointLight
+from stage.capture.light import (
+    ContinuousWave,
+    DistantLight,
+    EnvironmentLight,
+    ExtendedLight,
+    FullLight,
+    GradientLight,
+    LaserPlane,
+    LaserRay,
+    OffLight,
+    PointLight,
+    Pulsed,
+)
 from stage.capture.manifest import SCHEMA, Frame, Manifest
 from stage.capture.projector import Projector, UncalibratedProjector
-from stage.capture.ranging import ContinuousWave, LaserPlane, LaserRay, Pulsed
 from stage.model import Strict
 from stage.patterns.base import UniformPattern
 from stage.patterns.binary import BinaryPattern, XorPattern

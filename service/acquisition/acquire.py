@@ -10,11 +10,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from service.acquisition.cameras.camera import SPOOL, Camera, NoPictureError, Picture, Setup, open_camera
-from service.acquisition.capture_files import CaptureFiles
+from service.acquisition.capture_files import CaptureFiles, Journal
 from service.acquisition.checks.expectation import Fault, FaultKind, said
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.checks.unreached import ADVICE
-from service.acquisition.journal import Journal
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
 from service.acquisition.plans.shots import Shot, shots_of

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from service.acquisition.cameras.camera import LIVE
-from service.acquisition.journal import JOURNAL_FILE, lines_of, record
+from service.acquisition.capture_files import JOURNAL_FILE, lines_of, record
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.live_view import LiveView
 from service.acquisition.meter import PICTURE_FILE

@@ -20,8 +20,7 @@ from kernels.packs import Band
 from kernels.relight.basis.basis import Basis, gram, principal, projection, squared_residual
 from kernels.relight.basis.rti import HSH_TERMS, PTM_TERMS, WHITE, biquadratic, fit_weights, hemispherical_harmonics, separate
 from kernels.relight.frames.combine import combine_batch
-from service.basis.capture import BasisCapture, BasisResult, open_capture, stack_bands
-from service.basis.display import WHITE_PERCENTILE, Display, display_of, stored_sample
+from service.basis.capture import WHITE_PERCENTILE, BasisCapture, BasisResult, Display, display_of, open_capture, stack_bands, stored_sample
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.basis import BasisKind, BasisRequest

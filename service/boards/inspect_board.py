@@ -12,14 +12,12 @@ import numpy as np
 
 from kernels import device as devices
 from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
-from service.boards.height_files import BOARD_FILE, Nominal, read_design, read_golden, write_board
+from service.boards.height_files import BOARD_FILE, Match, Nominal, check_size, match, read_design, read_golden, write_board
 from service.boards.inspection_picture import PICTURE_FILE, write_picture
-from service.boards.matching import Match, check_size, match
-from service.boards.stitching.comparison import Form, bow_and_twist, compare, fit_form
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
 from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
-from service.boards.stitching.significance import Scan, scan_windows
+from service.boards.stitching.significance import Form, Scan, bow_and_twist, compare, fit_form, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
 from service.boards.tiles import BoardTiles, read_tiles
 from service.depth.base.solution import statistics

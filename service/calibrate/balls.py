@@ -12,8 +12,7 @@ from service.calibrate.solvers.apply import LitFrame, as_direction
 from service.calibrate.solvers.ball_search import find_outlines
 from service.calibrate.solvers.mirror_ball import find_spot
 from service.errors import RequestError
-from service.light_estimation.ball import Ball, BallView, ball_from_circle, project, view_ball
-from service.light_estimation.ball_outline import ball_from_mask
+from service.light_estimation.ball import Ball, BallView, ball_from_circle, ball_from_mask, project, view_ball
 from service.light_estimation.grey_ball import fit_brightness, fit_direction
 from service.requests.calibrate import BallRequest
 from service.requests.rig import RigCalibrationRequest

@@ -21,8 +21,8 @@ from service.depth.laser.stripes import Signal, stripe_signal
 from service.reporting.progress import Progress, Timings
 from service.requests.calibrate import LaserPlanesRequest
 from stage.capture.capture import Capture
+from stage.capture.light import LaserPlane
 from stage.capture.manifest import FILE_NAME, Frame
-from stage.capture.ranging import LaserPlane
 from stage.colour.colour import GREY_WEIGHTS
 from stage.errors import CalibrationError, ManifestError
 from stage.patterns.base import UniformPattern

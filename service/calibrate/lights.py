@@ -1,4 +1,4 @@
-"""Calibration of lights from images of balls: directions, positions and brightness, with residuals."""
+"""Calibration of lights from images of balls (directions, positions, brightness) or of the object (brightness), with residuals."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -23,8 +23,9 @@ from service.calibrate.solvers.mirror_ball import MISSES, find_spot, nearest_poi
 from service.errors import RequestError
 from service.light_estimation.ball import Ball, BallView, view_ball
 from service.light_estimation.grey_ball import better_encoding, fit_brightness, fit_direction
+from service.light_estimation.semi_calibrated import check_directions, fit_intensities
 from service.reporting.progress import Progress, Timings
-from service.requests.calibrate import GreyBallRequest, LightPositionsRequest, MirrorBallRequest
+from service.requests.calibrate import GreyBallRequest, IntensityRequest, LightPositionsRequest, MirrorBallRequest
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.manifest import FILE_NAME
 from stage.errors import CalibrationError, ManifestError
@@ -34,6 +35,8 @@ ANALYSER_GAIN = 2.0
 """Irradiance of a light over what a matt ball behind an analyser shows of it: its light has no polarisation left, half passes."""
 READERS = 4
 """Images that are decoded at the same time: bounds the memory."""
+BEHIND_Z = -0.2
+"""A light with z below this, more than 101° from the view axis, is flagged: the object shows it at grazing angles only."""
 
 
 class BallPixels(NamedTuple):
@@ -209,3 +212,48 @@ def _scaled(results: Sequence[MeasuredLight], albedo: tuple[float, float, float]
         else:
             scaled.append(result)
     return scaled
+
+
+def intensity(request: IntensityRequest, progress: Progress | None = None) -> LightCalibration:
+    """Measure the irradiance of each light of known direction from images of a mostly Lambertian object; the mean is 1."""
+    captures, timings = open_captures(request, progress)
+    source = captures.source
+    for lit in captures.lit:
+        if not isinstance(lit.light, DistantLight):
+            raise ManifestError(f"{source.folder / FILE_NAME}: frames[{lit.number}].light: is {lit.light.type}: "
+                                "intensity is for distant lights of known direction")
+    directions = np.array([lit.light.direction for lit in captures.lit if isinstance(lit.light, DistantLight)])
+    try:
+        check_directions(directions)
+    except CalibrationError as error:
+        raise CalibrationError(f"{source.folder / FILE_NAME}: frames: {error}") from error
+    inside = np.flatnonzero(source.mask())
+    chosen = np.random.default_rng(0).choice(inside, min(request.pixels, len(inside)), replace=False)
+    correction = Correction.of(source)
+    timings.stage("frames", len(captures.lit))
+    readings, usable = np.empty((len(captures.lit), len(chosen), 3)), np.ones((len(captures.lit), len(chosen)), dtype=bool)
+    for number, lit in enumerate(captures.lit):
+        radiance = correction.apply(lit.frame)
+        readings[number] = radiance.pixels.reshape(-1, 3)[chosen]
+        if radiance.saturated is not None:
+            usable[number] = ~radiance.saturated.reshape(-1)[chosen]
+        timings.advance(number + 1)
+    timings.stage("fit", 1)
+    try:
+        found = fit_intensities(readings, usable, directions)
+    except CalibrationError as error:
+        raise CalibrationError(f"{source.folder}: {error}") from error
+    results: list[MeasuredLight | CalibrationError] = []
+    for lit, rgb, residual, sigma in zip(captures.lit, found.irradiance, found.residual, found.uncertainty, strict=True):
+        assert isinstance(lit.light, DistantLight)
+        if np.isnan(rgb).any():
+            results.append(CalibrationError("too few pixels of the object are lit by this light to tell its brightness"))
+            continue
+        flags = ["behind: seen at grazing angles only"] if lit.light.direction[2] < BEHIND_Z else []
+        entry = {"irradiance": digits(rgb), "uncertainty": digits(sigma), "residual": digits(residual), "flags": flags}
+        row = (three_numbers(rgb), f"{100 * sigma.max():.2g} %", f"{residual.max():.3f}")
+        results.append(MeasuredLight(with_brightness(lit.light, rgb), entry, row, float(sigma.max())))
+    timings.close()
+    measured = leave_out_failures(captures, results, drop_failed=request.drop_failed)
+    return write_lights("intensity", request, captures, measured, headings=("irradiance", "sure to", "residual"),
+                        summary={"pixels": found.pixels}, relative=True)

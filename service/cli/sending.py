@@ -6,7 +6,7 @@ import queue
 import threading
 from pathlib import Path
 
-from service.acquisition.journal import JOURNAL_FILE
+from service.acquisition.capture_files import JOURNAL_FILE
 from service.client import Client, ClientError
 from service.errors import RequestError
 from service.requests.states import READY

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kernels.relight.frames.combine import combine_batch
-from service.basis.capture import BasisCapture, stack_bands
-from service.basis.display import Display, srgb
+from service.basis.capture import BasisCapture, Display, srgb, stack_bands
 from service.errors import RequestError
 from service.publish.annotations import Annotation
 from service.publish.components import light_spacing, light_weights

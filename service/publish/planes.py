@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from kernels.relight.frames.combine import combine_batch
-from service.basis.capture import BasisCapture, stack_bands
-from service.basis.display import Display
+from service.basis.capture import BasisCapture, Display, stack_bands
 from service.publish.components import Components, components_of
 from service.publish.pyramid import TILE, Pyramid, TilePath, halvings
 from service.publish.strips import Strips

@@ -8,8 +8,7 @@ import numpy as np
 
 from kernels import device as devices
 from service import __version__
-from service.basis.capture import open_capture
-from service.basis.display import display_of, stored_sample
+from service.basis.capture import display_of, open_capture, stored_sample
 from service.errors import RequestError
 from service.publish.annotations import read_annotations
 from service.publish.iiif import MANIFEST_FILE, write_iiif

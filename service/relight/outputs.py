@@ -22,7 +22,7 @@ from service.requests.relight import RelightRequest
 from stage.colour.configuration import current
 from stage.colour.location import BUILT_IN, location
 from stage.errors import StageError, StorageError
-from stage.formats import exr, exr_checksum
+from stage.formats import exr, exr_scan
 from stage.stack import fingerprint
 
 ARITHMETIC = 3
@@ -113,7 +113,7 @@ def is_complete(path: Path, request_hash: str) -> bool:
     if not path.is_file():
         return False
     try:
-        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash) and exr_checksum.is_intact(path)
+        return bool(exr.read_header(path).metadata.get(REQUEST_ATTRIBUTE) == request_hash) and exr_scan.is_intact(path)
     except StageError:  # not an EXR, truncated or unreadable: the frame is made again
         return False
 

@@ -9,9 +9,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from stage.capture.camera import Camera, OtherCamera, StereoImages
-from stage.capture.light import Light
+from stage.capture.light import Laser, Light, TimeOfFlight
 from stage.capture.projector import AnyProjector
-from stage.capture.ranging import Laser, TimeOfFlight
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.files import write_text
 from stage.model import FirstFault, Positive, Strict, Text, Vector

@@ -13,7 +13,7 @@ import OpenEXR
 from stage import inputs
 from stage.errors import ImageError, StorageError, storage
 from stage.files import replacing
-from stage.formats import exr_checksum
+from stage.formats import exr_scan
 from stage.formats.exr_scan import missing_bytes, scan_header
 
 HALF_MAX = 65504.0
@@ -146,10 +146,10 @@ def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[st
     Args:
         parts: with names that differ, and channels that differ and have one size.
         metadata: further attributes of the first part; `pixelAspectRatio` and `framesPerSecond` are written to every part.
-        checksum: True to write a checksum of the file too, by which `stage.formats.exr_checksum` finds every change of it.
+        checksum: True to write a checksum of the file too, by which `stage.formats.exr_scan` finds every change of it.
     """
     if checksum:
-        metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
+        metadata = {**metadata, exr_scan.CHECKSUM_ATTRIBUTE: exr_scan.UNSET_CHECKSUM}
     with replacing(path) as temporary:
         encode(temporary, parts, metadata=metadata, path=path)
         finish(temporary, path=path, checksum=checksum)
@@ -191,7 +191,7 @@ def finish(temporary: Path, *, path: str | Path, checksum: bool) -> None:
     except ImageError as error:
         raise StorageError(f"cannot write {path}: the disk took only part of it") from error
     if checksum:
-        exr_checksum.write_checksum(temporary)
+        exr_scan.write_checksum(temporary)
 
 
 SHARED = ("pixelAspectRatio", "framesPerSecond")

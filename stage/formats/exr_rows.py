@@ -18,7 +18,7 @@ import numpy as np
 
 from stage.errors import storage
 from stage.files import replacing
-from stage.formats import exr, exr_checksum
+from stage.formats import exr, exr_scan
 from stage.formats.exr_scan import SCANLINES_PER_CHUNK, SEVERAL_PARTS
 
 BLOCK_ROWS = 32
@@ -97,7 +97,7 @@ class RowFile:
 def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: bool = False) -> Iterator[RowFile]:
     """Yield a file that takes the rows of a picture; it exists when the block ends without an error, whole, and else not at all."""
     if checksum:
-        metadata = {**metadata, exr_checksum.ATTRIBUTE: exr_checksum.UNSET}
+        metadata = {**metadata, exr_scan.CHECKSUM_ATTRIBUTE: exr_scan.UNSET_CHECKSUM}
     with replacing(path) as temporary:
         file = RowFile(temporary, path=path, rows=rows, metadata=metadata)
         yield file

@@ -12,7 +12,7 @@ from stage.errors import ManifestError
 from stage.formats.camera_raw import path_is_raw
 from stage.importers.layout import image_names
 from stage.importers.light_rig import read_camera_matrix
-from stage.text import name_fault
+from stage.model import name_fault
 
 MASK_WORDS, AMBIENT_WORDS = frozenset({"mask"}), frozenset({"ambient"})
 """Words in the name of an image by which it is the mask, or an image of ambient light alone."""

@@ -10,7 +10,7 @@ import numpy as np
 from stage.errors import ManifestError
 from stage.formats.mat_file import read_mat_arrays
 from stage.importers.layout import first_of, read_json, read_lines
-from stage.text import name_fault
+from stage.model import name_fault
 from stage.tof.raw_frames import read_array
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".mat", ".npy", ".json", ".lp", ".dat")

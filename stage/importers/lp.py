@@ -16,7 +16,7 @@ from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import View
 from stage.importers.layout import assumed_encoding, color_space_of, image_resolution, read_lines, write_capture
-from stage.text import name_fault
+from stage.model import name_fault
 
 
 def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None) -> Path:

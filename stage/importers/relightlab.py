@@ -19,7 +19,7 @@ from stage.colour.colour_spaces import ColorSpaceName
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import Selection, select
 from stage.importers.layout import Imported, assumed_encoding, color_space_of, image_resolution, read_json, write_capture
-from stage.text import name_fault
+from stage.model import name_fault
 
 SUFFIXES = (".relight", ".dome")
 POSITIONS = {"spherical": "positionsSphere", "lights3d": "positions3d"}

@@ -90,7 +90,7 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
     Args:
         source: the folder of the arrays, or one file.
         destination: the folder of the capture. .npy files of (rows, cols, bins) are placed there; other histograms are written as .npy.
-        bin_s, start_s, count_scale, pulses, first_photon_only: as of `stage.capture.ranging.Pulsed`.
+        bin_s, start_s, count_scale, pulses, first_photon_only: as of `stage.capture.light.Pulsed`.
         bins: `first` or `last`: where the bins are counted.
         arrays: which files, and what they do not say themselves; its size arranges pixels that are in one row.
         source_m: the place of the light source; None: at the camera.

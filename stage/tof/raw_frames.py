@@ -8,8 +8,8 @@ import numpy as np
 
 from stage import inputs
 from stage.capture.capture import Capture
+from stage.capture.light import ContinuousWave, Pulsed
 from stage.capture.manifest import FILE_NAME, Frame
-from stage.capture.ranging import ContinuousWave, Pulsed
 from stage.errors import ImageError, ManifestError, storage
 from stage.formats import images
 from stage.formats.npy import array_shape

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from stage.capture.camera import Camera
+from stage.capture.light import ContinuousWave, Pulsed
 from stage.capture.manifest import FILE_NAME, SCHEMA, Frame, Manifest, write_manifest
-from stage.capture.ranging import ContinuousWave, Pulsed
 from stage.errors import CalibrationError
 from stage.files import replacing
 from stage.model import Vector

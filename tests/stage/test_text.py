@@ -16,8 +16,7 @@ from stage.capture.manifest import read_manifest
 from stage.errors import ManifestError
 from stage.importers import lp
 from stage.importers.opencv_file import read_matrices
-from stage.model import Line, Strict
-from stage.text import name_fault
+from stage.model import Line, Strict, name_fault
 from tests.service.server.api.captures import manifest
 
 BAD = {"NUL": "a\0b", "newline": "a\nb", "escape": "\x1b[2J", "delete": "a\x7f", "C1": "a\x9b", "half": "b\ud800",

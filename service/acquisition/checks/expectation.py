@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.acquisition.checks.motion import Bands
-from service.acquisition.checks.sample import Sample
+from service.acquisition.checks.sample import Bands, Sample
 from service.acquisition.plans.shots import Shot
 from service.requests.base.base import Choice
 

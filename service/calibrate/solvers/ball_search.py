@@ -14,8 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from service.light_estimation.ball import Ball, ball_from_outline, project
-from service.light_estimation.ball_outline import refine_outline
+from service.light_estimation.ball import Ball, ball_from_outline, project, refine_outline
 from stage.capture.camera import Camera
 from stage.errors import CalibrationError
 

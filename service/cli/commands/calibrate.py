@@ -67,7 +67,7 @@ def _grey_ball(request: GreyBallRequest) -> None:
 
 
 def _intensity(request: IntensityRequest) -> None:
-    from service.calibrate.intensity import intensity
+    from service.calibrate.lights import intensity
 
     _print_lights(with_bar(intensity, request))
 

@@ -19,8 +19,8 @@ from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
+from stage.capture.light import LaserPlane, LaserRay
 from stage.capture.manifest import FILE_NAME, Frame
-from stage.capture.ranging import LaserPlane, LaserRay
 from stage.errors import ManifestError
 from stage.patterns.base import UniformPattern
 from stage.stack.correction import Correction

@@ -18,7 +18,7 @@ import numpy as np
 from kernels.status import Status
 from service.depth.laser.stripe_curves import RIVAL, WHOLE
 from stage.capture.camera import Camera
-from stage.capture.ranging import LaserPlane
+from stage.capture.light import LaserPlane
 from stage.results.depth_breaks import same_surface
 
 SLOPE_PX = 32.0

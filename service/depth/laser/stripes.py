@@ -20,7 +20,7 @@ from kernels.structured.stripe import REACH, find_stripe, plane_depths
 from service.depth.laser.stripe_curves import PEAKS, Chosen, choose_curves
 from service.depth.laser.stripe_map import StripeSamples
 from stage.capture.camera import Camera
-from stage.capture.ranging import LaserPlane
+from stage.capture.light import LaserPlane
 from stage.spread import MAD_TO_SIGMA
 
 LEAST_FRAMES = 2.0

@@ -6,7 +6,7 @@ Results and captures are opened from Windows, macOS and Linux, so a name is refu
 import unicodedata
 
 from service.errors import RequestError
-from stage.text import name_fault
+from stage.model import name_fault
 
 MAX_PART_BYTES = 255
 """Bytes of the name of a file or folder at most, as in common file systems."""

@@ -144,13 +144,13 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
 
 def _calibrate(request: JobRequest, files: StepFiles) -> None:
     """Calibrate the lights or the images of one capture."""
-    from service.calibrate import images, intensity, lights, response, white_balance
+    from service.calibrate import images, lights, response, white_balance
 
     products: dict[type[JobRequest], tuple[Callable[..., object], type[Options]]] = {
         calibration_jobs.MirrorBallJob: (lights.mirror_ball, calibrate.MirrorBallRequest),
         calibration_jobs.LightPositionsJob: (lights.light_positions, calibrate.LightPositionsRequest),
         calibration_jobs.GreyBallJob: (lights.grey_ball, calibrate.GreyBallRequest),
-        calibration_jobs.IntensityJob: (intensity.intensity, calibrate.IntensityRequest),
+        calibration_jobs.IntensityJob: (lights.intensity, calibrate.IntensityRequest),
         calibration_jobs.DarkJob: (images.dark, calibrate.DarkRequest),
         calibration_jobs.FlatFieldJob: (images.flat_field, calibrate.FlatFieldRequest),
         calibration_jobs.SaturationJob: (images.saturation, calibrate.SaturationRequest),

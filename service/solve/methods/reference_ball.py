@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.light_estimation.ball import Ball
-from service.light_estimation.ball_outline import ball_from_mask
+from service.light_estimation.ball import Ball, ball_from_mask
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.lighting import check_surface

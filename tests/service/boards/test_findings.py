@@ -5,9 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from service.boards.findings import find_defects
-from service.boards.stitching.comparison import compare, fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
-from service.boards.stitching.significance import scan_windows
+from service.boards.stitching.significance import compare, fit_form, scan_windows
 from service.boards.tiles import without_spikes
 
 GRID = BoardGrid(8e-5, 0.0, 0.01, 130, 150)

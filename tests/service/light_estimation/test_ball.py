@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from service.light_estimation.ball import ball_from_circle, ball_from_outline, fit_circle, fit_cone, intersect, project, view_ball
-from service.light_estimation.ball_outline import ball_from_mask
+from service.light_estimation.ball import (
+    ball_from_circle,
+    ball_from_mask,
+    ball_from_outline,
+    fit_circle,
+    fit_cone,
+    intersect,
+    project,
+    view_ball,
+)
 from stage.capture.camera import Camera, Distortion
 from stage.errors import CalibrationError
 from tests.reference.balls import lambertian, render

@@ -9,7 +9,7 @@ import pytest
 
 from stage.errors import ImageError, StorageError
 from stage.formats import exr
-from stage.formats.exr_checksum import ATTRIBUTE, is_intact, write_checksum
+from stage.formats.exr_scan import ATTRIBUTE, is_intact, write_checksum
 from tests.scenes.captures import write_exr
 
 PIXELS = np.random.default_rng(3).random((37, 23, 3)).astype(np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stage.errors import StorageError
-from stage.formats import exr, exr_checksum, exr_rows
+from stage.formats import exr, exr_rows, exr_scan
 from tests.scenes.captures import files_in
 
 ROWS, COLS = 150, 37
@@ -40,10 +40,10 @@ def test_parts_with_chunks_of_different_heights(tmp_path):
     parts = [exr.Part("rgba", RGB, "lin_rec709_scene", exr.Compression.DWAA), exr.Part("depth", DATA, exr.DATA)]
     exr.write_parts(tmp_path / "whole.exr", parts, metadata=METADATA)
     write_in_blocks(tmp_path / "blocks.exr", parts, (0, 64, 128, 150), checksum=True)
-    assert exr_checksum.is_intact(tmp_path / "blocks.exr")
+    assert exr_scan.is_intact(tmp_path / "blocks.exr")
     whole, header = exr.read(tmp_path / "whole.exr")
     found, own = exr.read(tmp_path / "blocks.exr")
-    assert own.keys() - header.keys() == {exr_checksum.ATTRIBUTE}
+    assert own.keys() - header.keys() == {exr_scan.CHECKSUM_ATTRIBUTE}
     assert {name: own[name] for name in header if name != "channels"}["note"] == "dataWindow"
     assert whole.keys() == found.keys()
     assert all(np.array_equal(plane, found[name]) for name, plane in whole.items())

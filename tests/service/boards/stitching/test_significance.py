@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from service.boards.stitching.comparison import bow_and_twist, compare, fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict, check_regions
-from service.boards.stitching.significance import mean_of, scan_windows, threshold
+from service.boards.stitching.significance import bow_and_twist, compare, fit_form, mean_of, scan_windows, threshold
 from stage.sets.board import Region
 
 GRID = BoardGrid(1e-5, 0.0, 1e-3, 100, 120)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from service.calibrate.solvers.mirror_ball import find_spot
-from service.light_estimation.ball import Ball, project, view_ball
-from service.light_estimation.ball_outline import ball_from_mask
+from service.light_estimation.ball import Ball, ball_from_mask, project, view_ball
 from stage.errors import CalibrationError
 from tests.reference.balls import mirror_of_far, render
 from tests.scenes.captures import angles_degrees
