@@ -18,10 +18,8 @@ _TEMPORARY = re.compile(r"\..+\.[a-z0-9_]{8}(\.[^.]*)?")  # .STEM., eight charac
 @contextmanager
 def replacing(path: str | Path, *, flush: bool = True) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces `path` when the block ends without an error and is removed otherwise.
-
-    Args:
-        flush: whether to wait until the file is on the disk. False for a file that its reader checks and can make again: it may be damaged
-            after a power failure.
+    `flush`: whether to wait until the file is on the disk. False for a file that its reader checks and can make again: it may be damaged
+    after a power failure.
 
     Convention:
         The temporary file lies in the same folder and has the same suffix, because writers choose a format by the suffix.

@@ -73,15 +73,9 @@ class Source:
 @contextmanager
 def confined(folder: Path, root: Path, *, max_pixels: int | None = None) -> Iterator[None]:
     """Open the files below a folder, in all threads of this process, without following links out of it.
-
-    Args:
-        folder: below `root`, or `root`; no part of its path below `root` may be a link.
-        root: a folder that is trusted, links in its path included.
-        max_pixels: the most pixels of an image that is decoded; None for any.
-
-    Raises:
-        ManifestError: the folder is a link, or leads through one.
-    """
+    `folder`: below `root`, or `root`; no part of its path below `root` may be a link. `root`: a folder that is trusted, links in its path
+    included. `max_pixels`: the most pixels of an image that is decoded; None for any. Raises ManifestError if the folder is a link, or
+    leads through one."""
     with storage("read", folder):
         top = os.open(root, os.O_CLOEXEC | os.O_DIRECTORY | getattr(os, "O_PATH", os.O_RDONLY))
         try:
@@ -126,11 +120,7 @@ def is_file(path: Path) -> bool:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Source]:
-    """Open a file for reading.
-
-    Raises:
-        ManifestError: the path leads out of a confined folder.
-    """
+    """Open a file for reading. Raises ManifestError if the path leads out of a confined folder."""
     given = Path(path)
     folder = _folder_of(given)
     if folder is None and _enclosed:

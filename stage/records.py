@@ -23,11 +23,8 @@ MOST_SHOWN = 60
 def read_record(path: str | Path, model: type[Record], schema: str, further: Callable[[dict[str, Any]], Iterator[str]] | None = None
                 ) -> Record:
     """Read a JSON file and check it against a model.
-
-    Args:
-        further: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report
-            because it stops at the first fault of a long list.
-    """
+    `further`: finds faults of content that is wrong, as `field: what is wrong`, among them those that the model does not report because it
+    stops at the first fault of a long list."""
     text = inputs.read_bytes(path)
     try:
         data = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
@@ -65,11 +62,7 @@ def describe(error: ValidationError, name: FieldName | None = None) -> str:
 
 def faults_of(error: ValidationError, name: FieldName | None = None, within: tuple[int | str, ...] = ()) -> list[str]:
     """Return the faults of a pydantic error, each as `field: what is wrong`.
-
-    Args:
-        name: names the fields; None: as `field_name` does.
-        within: the place of what was validated, in the content of the file.
-    """
+    `name`: names the fields; None: as `field_name` does. `within`: the place of what was validated, in the content of the file."""
     places = {fault["loc"][:n] for fault in error.errors() for n in range(len(fault["loc"]))}
     named = [(fault, (name or field_name)((*within, *fault["loc"]))) for fault in error.errors()
              if fault["loc"] not in places]  # a fault of an entry replaces the fault of its list

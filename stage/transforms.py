@@ -19,11 +19,7 @@ OPENCV_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 
 def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the continuous image coordinates of every pixel centre.
-
-    Returns:
-        u [height, width] and v [height, width], float64, pixels.
-    """
+    """Return the continuous image coordinates of every pixel centre. Returns u [height, width] and v [height, width], float64, pixels."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return u, v
 
@@ -56,10 +52,7 @@ Transform = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
 
 def rotation_about_y(degrees: float) -> np.ndarray:
     """Return the rotation about +y by an angle, positive from +z towards +x.
-
-    Returns:
-        [3, 3] float64 for column vectors: rotated = rotation @ direction.
-    """
+    Returns [3, 3] float64 for column vectors: rotated = rotation @ direction."""
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
@@ -72,12 +65,7 @@ def cross_matrix(vector: Sequence[float] | np.ndarray) -> np.ndarray:
 
 def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     """Return the rotation about an axis through the origin by an angle, positive by the right-hand rule.
-
-    Args:
-        axis: a unit vector.
-
-    Returns:
-        [3, 3] float64 for column vectors: rotated = rotation @ direction.
+    `axis`: a unit vector. Returns [3, 3] float64 for column vectors: rotated = rotation @ direction.
 
     Source: Rodrigues' formula.
     """
@@ -86,10 +74,7 @@ def rotation_about(axis: tuple[float, float, float], degrees: float) -> np.ndarr
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Return directions that are spread evenly over the sphere, a Fibonacci grid.
-
-    Returns:
-        [count, 3] float64 unit vectors.
+    """Return directions that are spread evenly over the sphere, a Fibonacci grid. Returns [count, 3] float64 unit vectors.
 
     Source: Swinbank and Purser, "Fibonacci grids", Quarterly Journal of the Royal Meteorological Society 132, 2006.
     """

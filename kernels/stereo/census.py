@@ -43,11 +43,8 @@ BITS = (2 * REACH_X + 1) * (2 * REACH_Y + 1) - 1
 
 def census(images: np.ndarray, *, before: int = 0, after: int = 0, device: str) -> wp.array:
     """Return the census of each pixel of several images, [images, rows, before + cols + after or more] uint64.
-
-    Args:
-        images: [images, rows, cols] float32; pixels beyond the border are those at the border.
-        before, after: columns without a meaning that are put before the first column and after the last.
-    """
+    `images`: [images, rows, cols] float32; pixels beyond the border are those at the border. `before`, `after`: columns without a meaning
+    that are put before the first column and after the last."""
     count, rows, cols = images.shape
     padded = padded_columns(cols, device)
     right = padded + REACH_X - cols

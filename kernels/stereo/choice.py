@@ -33,18 +33,14 @@ class Choice(NamedTuple):
     lead: wp.array  # [rows, cols] float32, by how much the best rival fits worse, of the same unit
 
 
-def choose(volume: wp.array, sums: wp.array, labels: Labels, *, right_columns: int) -> Choice:
-    """Choose the disparity of each pixel.
-
-    Args:
-        volume: [rows, cols, packs] packs of uint8, of `matching_cost`.
-        sums: [rows, cols, packs] packs of int16, of `gather`.
-        labels: of both.
-        right_columns: columns of the right image.
-
-    Returns:
-        Arrays on the device, not synchronised on CUDA.
-    """
+def choose(
+    volume: wp.array,  # [rows, cols, packs] packs of uint8, of `matching_cost`
+    sums: wp.array,  # [rows, cols, packs] packs of int16, of `gather`
+    labels: Labels,  # of both
+    *,
+    right_columns: int,  # columns of the right image
+) -> Choice:
+    """Choose the disparity of each pixel. Returns arrays on the device, not synchronised on CUDA."""
     rows, cols, packs = volume.shape
     device = str(volume.device)
     pack = devices.pack_width(device)

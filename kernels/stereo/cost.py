@@ -67,17 +67,14 @@ def census_pair(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: L
     return CensusPair(left_bits, right_bits, wp.array(held, dtype=wp.uint8, device=device), margins.before - labels.highest)
 
 
-def matching_cost(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, device: str) -> wp.array:
+def matching_cost(
+    left: np.ndarray,  # [frames, rows, cols] float32, rectified
+    right: np.ndarray,  # [frames, rows, right cols] float32
+    seen: np.ndarray,  # [rows, right cols] bool, False where the right camera sees nothing
+    labels: Labels, *, device: str,
+) -> wp.array:
     """Return the cost of each label at each pixel: `SCALE` units for each differing bit, the mean over the frames.
-
-    Args:
-        left: [frames, rows, cols] float32, rectified.
-        right: [frames, rows, right cols] float32.
-        seen: [rows, right cols] bool, False where the right camera sees nothing.
-
-    Returns:
-        [rows, cols, packs] packs of uint8.
-    """
+    Returns [rows, cols, packs] packs of uint8."""
     frames, rows, cols = left.shape
     bits = census_pair(left, right, seen, labels, device=device)
     pack = devices.pack_width(device)

@@ -25,19 +25,16 @@ class Probe(NamedTuple):
     lead: wp.array  # [rows, cols] float32, by how much the best rival fits worse, relative to chance
 
 
-def probe(left: np.ndarray, right: np.ndarray, seen: np.ndarray, labels: Labels, *, step: int, device: str) -> Probe:
-    """Compare some places of the left image with whole rows of the right one.
-
-    Args:
-        left: [frames, rows, cols] float32, rectified.
-        right: [frames, rows, right cols] float32.
-        seen: [rows, right cols] bool, False where the right camera sees nothing.
-        labels: the disparities that are compared.
-        step: distance between sampled places, in rows and columns; the first lies half a step from the corner.
-
-    Returns:
-        Arrays on the device, not synchronised on CUDA.
-    """
+def probe(
+    left: np.ndarray,  # [frames, rows, cols] float32, rectified
+    right: np.ndarray,  # [frames, rows, right cols] float32
+    seen: np.ndarray,  # [rows, right cols] bool, False where the right camera sees nothing
+    labels: Labels,  # the disparities that are compared
+    *,
+    step: int,  # distance between sampled places, in rows and columns; the first lies half a step from the corner
+    device: str,
+) -> Probe:
+    """Compare some places of the left image with whole rows of the right one. Returns arrays on the device, not synchronised on CUDA."""
     frames, rows, cols = left.shape
     bits = census_pair(left, right, seen, labels, device=device)
     shape = max(1, rows // step), max(1, cols // step)

@@ -55,14 +55,13 @@ class Refined(NamedTuple):
     contrast: wp.array  # [rows, cols] float32, standard deviation of the left readings in the window
 
 
-def refine(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, *, device: str) -> Refined:
-    """Refine the disparities of a band of rows; not synchronised on CUDA.
-
-    Args:
-        left: [frames, rows, cols] float32, rectified.
-        right: [frames, rows, right cols] float32.
-        disparity: [rows, cols] float32, good to a pixel or so; NaN where there is none.
-    """
+def refine(
+    left: np.ndarray,  # [frames, rows, cols] float32, rectified
+    right: np.ndarray,  # [frames, rows, right cols] float32
+    disparity: np.ndarray,  # [rows, cols] float32, good to a pixel or so; NaN where there is none
+    *, device: str,
+) -> Refined:
+    """Refine the disparities of a band of rows; not synchronised on CUDA."""
     _frames, rows, cols = left.shape
     lanes = LANES_CPU if device == "cpu" else LANES_CUDA
     side = lanes + REACH + SHIFTS + 4

@@ -132,13 +132,8 @@ class Solver:
     """Conjugate gradients on one grid, with their scratch memory and multigrid hierarchy.
 
     Memory: four arrays of the grid beyond slopes and heights, two where the slopes may be overwritten, and four thirds for the coarse
-    levels.
-
-    Args:
-        slopes: of all edges, and their weights.
-        max_iterations: of `solve`.
-        overwrite: whether the slopes may be overwritten, though not their weights: only the first residual needs them.
-    """
+    levels. `slopes`: of all edges, and their weights. `max_iterations`: of `solve`. `overwrite`: whether the slopes may be overwritten,
+    though not their weights: only the first residual needs them."""
 
     def __init__(self, grid: Grid, slopes: Slopes, *, max_iterations: int, overwrite: bool = False):
         self.grid, self.slopes, self.max_iterations = grid, slopes, max_iterations
@@ -151,21 +146,13 @@ class Solver:
 
     def solve(
         self,
-        h: wp.array,  # [size] float32, first guess; the answer on return
+        h: wp.array,  # [size] float32, heights: first guess, changed in place to the answer
         *,
-        tolerance: float,
-        progress: Callable[[float], None] | None = None,
+        tolerance: float,  # relative; close to the relative error of the slopes of h in the weighted norm
+        progress: Callable[[float], None] | None = None,  # told the fraction done, by the logarithm of the residual
     ) -> Convergence:
         """Improve h until the preconditioned residual norm is below tolerance times its first value.
-
-        Args:
-            h: heights, changed in place.
-            tolerance: relative; close to the relative error of the slopes of h in the weighted norm.
-            progress: told the fraction done, by the logarithm of the residual.
-
-        Returns:
-            How the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA.
-        """
+        Returns how the solve ended; reading the residual waits for the device, every CHECK_EVERY iterations on CUDA."""
         grid, every = self.grid, CHECK_EVERY if self.grid.device != "cpu" or devices.has_graphs("cpu") else 1
         run(_descent, grid.cells, [*self.slopes, h], [self.residual])
         self._precondition(0)

@@ -222,14 +222,12 @@ def relabel(label: np.ndarray, number: np.ndarray) -> None:
         label[cells] = number[label[cells]]
 
 
-def label_cells(usable: np.ndarray, open_edges: np.ndarray, pitch: int) -> tuple[np.ndarray, int]:
-    """Return the connected parts of a surface, [size] int32 with -1 outside, and their number.
-
-    Args:
-        usable: [size] bool.
-        open_edges: [2, size] bool, whether the edges to the right and down connect.
-        pitch: cells a row.
-    """
+def label_cells(
+    usable: np.ndarray,  # [size] bool
+    open_edges: np.ndarray,  # [2, size] bool, whether the edges to the right and down connect
+    pitch: int,  # cells a row
+) -> tuple[np.ndarray, int]:
+    """Return the connected parts of a surface, [size] int32 with -1 outside, and their number."""
     begins = usable.copy()
     begins[1:] &= ~open_edges[0, :-1]
     run = np.cumsum(begins, dtype=np.int32)  # runs of cells that are open to the right

@@ -58,6 +58,7 @@ def integrate_normals(
     """Integrate a normal map to a height map by weighted least squares.
 
     Normals do not tell the distance between parts of the mask that do not touch, so the mean of each part is mean_z.
+    Raises ArrayError if shapes do not fit, the mask is empty, or mean_z cannot be.
 
     Args:
         normal: unit normals, n_z > 0 towards an orthographic viewer. A pixel whose normal is not finite, or shorter
@@ -70,9 +71,6 @@ def integrate_normals(
         cuts: edges between a pixel and its right neighbour, and between it and the one below, that the surface breaks along; what
             they cut off is a part.
         progress: told the fraction done, 0…1.
-
-    Raises:
-        ArrayError: shapes do not fit, the mask is empty, or mean_z cannot be.
 
     Convention:
         Waits for the device: the mask of usable pixels and one number per mask run are read back, and the residual

@@ -83,21 +83,20 @@ def group_patches(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, ce
     return PatchTree(centre, facing, area[:, 0], radius[:, 0], following, patch, sent)
 
 
-def gather_light(points: np.ndarray, normals: np.ndarray, areas: np.ndarray, cells: np.ndarray, radiance: np.ndarray, height: wp.array,
-                 mask: wp.array, projection: Projection, *, device: str, opening: float | None = None) -> np.ndarray:
+def gather_light(
+    points: np.ndarray,  # [n, 3] camera-frame centres
+    normals: np.ndarray,  # [n, 3] unit
+    areas: np.ndarray,  # [n] in the square of the points' unit
+    cells: np.ndarray,  # [n, 2] int, row and column of each patch in a grid of patches, each below 32768
+    radiance: np.ndarray,  # [n, values], for example of each channel under each light
+    height: wp.array,  # [rows, cols] float32 camera-frame z
+    mask: wp.array, projection: Projection, *, device: str,
+    opening: float | None = None,  # of groups, in place of OPENING; 0: every patch sends on its own
+) -> np.ndarray:
     """Return what each patch of albedo 1 sends on of the light of all others: Σⱼ K[i, j] radianceⱼ; waits for the device.
 
     K[i, j] = cosᵢ cosⱼ Aⱼ / (π r² + Aⱼ), or 0 where something stands between: the distance between neighbours is kept from vanishing by
     the size of the patch.
-
-    Args:
-        points: [n, 3] camera-frame centres.
-        normals: [n, 3] unit.
-        areas: [n] in the square of the points' unit.
-        cells: [n, 2] int, row and column of each patch in a grid of patches, each below 32768.
-        radiance: [n, values], for example of each channel under each light.
-        height: [rows, cols] float32 camera-frame z.
-        opening: of groups, in place of OPENING; 0: every patch sends on its own.
     """
     count = len(points)
     if points.shape != (count, 3) or normals.shape != (count, 3) or areas.shape != (count,) or count == 0:

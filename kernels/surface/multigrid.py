@@ -163,12 +163,8 @@ def _coarsen(first: int,
 
 class Multigrid:
     """The hierarchy over one grid's edge weights.
-
-    Args:
-        target: the finest right-hand side, read by `cycle`.
-        value: where `cycle` leaves its answer.
-        scratch: an array of the finest layout that `cycle` may overwrite, finite.
-    """
+    `target`: the finest right-hand side, read by `cycle`. `value`: where `cycle` leaves its answer. `scratch`: an array of the finest
+    layout that `cycle` may overwrite, finite."""
 
     def __init__(self, grid: Grid, weights: EdgeWeights, *, target: wp.array, value: wp.array, scratch: wp.array):
         self.levels = [Level(grid, weights, target, value, scratch)]

@@ -48,14 +48,8 @@ class NearestOnMesh:
 
     def __init__(self, points: np.ndarray, faces: np.ndarray, *, device: str) -> None:
         """Build the tree of its faces.
-
-        Args:
-            points: [V, 3] float64 of any unit.
-            faces: [F, 3] int, counter-clockwise seen from outside; each has an area.
-
-        Raises:
-            ArrayError: there is no face, or a face names a point that is not there.
-        """
+        `points`: [V, 3] float64 of any unit. `faces`: [F, 3] int, counter-clockwise seen from outside; each has an area. Raises ArrayError
+        if there is no face, or a face names a point that is not there."""
         if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
             raise ArrayError(f"{len(faces)} faces of {len(points)} points: each needs three of the points")
         self._device = device

@@ -133,19 +133,18 @@ def _march(first: int,
         hidden[n, light] = own
 
 
-def march_part(pixels: wp.array, toward: wp.array, height: wp.array, part: wp.array, thickness: wp.array, moving: int,
-               projection: Projection) -> PartShadows:
+def march_part(
+    pixels: wp.array,  # [n] vec2i, row and column of pixels of some part
+    toward: wp.array,  # [lights] vec3, unit directions to the lights
+    height: wp.array,  # [rows, cols] float32, camera-frame z
+    part: wp.array,  # [rows, cols] int32, the part of each pixel, below 0 outside
+    thickness: wp.array,  # [rows, cols] float32, guessed distance from front to back, in the unit of the gaps
+    moving: int,  # number of the part that moves against all others
+    projection: Projection,
+) -> PartShadows:
     """March from pixels to distant lights over a surface of which one part moves; not synchronised on CUDA.
 
     Gaps are in the unit of height, or for a perspective camera in log depth.
-
-    Args:
-        pixels: [n] vec2i, row and column of pixels of some part.
-        toward: [lights] vec3, unit directions to the lights.
-        height: [rows, cols] float32, camera-frame z.
-        part: [rows, cols] int32, the part of each pixel, below 0 outside.
-        thickness: [rows, cols] float32, guessed distance from front to back, in the unit of the gaps.
-        moving: number of the part that moves against all others.
     """
     if not height.shape == part.shape == thickness.shape:
         raise ArrayError(f"height is {height.shape}, part {part.shape}, thickness {thickness.shape}: give one of each for every pixel")
@@ -193,17 +192,16 @@ class Offset(NamedTuple):
     """The same bounds if the groups of lights did not contradict each other."""
 
 
-def weigh_offsets(shadows: PartShadows, odds: np.ndarray, on_part: np.ndarray, group: np.ndarray, *, reach: float,
-                  blur: float) -> Evidence:
-    """Return the likelihood of offsets between -reach and reach. Waits for the device.
-
-    Args:
-        odds: [n, lights] log odds of shadow.
-        on_part: [n] bool, whether the pixel lies on the part that moves.
-        group: [lights] int, the group of each light, below GROUPS.
-        reach: largest offset that is compared, in the unit of the gaps.
-        blur: standard deviation of the gaps, in the same unit.
-    """
+def weigh_offsets(
+    shadows: PartShadows,
+    odds: np.ndarray,  # [n, lights] log odds of shadow
+    on_part: np.ndarray,  # [n] bool, whether the pixel lies on the part that moves
+    group: np.ndarray,  # [lights] int, the group of each light, below GROUPS
+    *,
+    reach: float,  # largest offset that is compared, in the unit of the gaps
+    blur: float,  # standard deviation of the gaps, in the same unit
+) -> Evidence:
+    """Return the likelihood of offsets between -reach and reach. Waits for the device."""
     highest, hidden = shadows.highest.numpy(), shadows.hidden.numpy()
     told = (highest > NO_GAP) & (hidden == 0) & (odds != 0)
     gaps = [highest[told], shadows.lowest.numpy()[told], shadows.back.numpy()[told]]

@@ -48,11 +48,8 @@ class Parts(NamedTuple):
 
 def connect(found: Fragments, height: np.ndarray, *, noise: float) -> Parts:
     """Connect fragments that belong together; their labels become those of the parts.
-
-    Args:
-        height: [size] heights in units of the spacing, integrated without the cut edges: each fragment has a constant of its own.
-        noise: standard deviation of the sum of slopes around four pixels.
-    """
+    `height`: [size] heights in units of the spacing, integrated without the cut edges: each fragment has a constant of its own. `noise`:
+    standard deviation of the sum of slopes around four pixels."""
     seam = _Seam(found, height)
     for _ in range(ROUNDS):
         if not _absorb(seam, seam.size < LEAST_PART):

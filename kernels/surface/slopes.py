@@ -161,14 +161,9 @@ def pair_slopes(surface: NormalMap, *, grid: Grid, spacing: float) -> tuple[Slop
     """Return the slopes and weights of every pair of 4-neighbours that are both usable.
 
     The weight of a pair is the harmonic mean of the trust in its pixels, times the cosines.
-
-    Args:
-        spacing: mean distance of neighbouring pixels in the plane of x and y.
-
-    Returns:
-        Slopes in units of the spacing, growing towards the viewer: of z (orthographic) or of −log d (perspective); and which pixels are
-        usable, [rows, cols] bool on the host: in the mask, with a finite normal of some length.
-    """
+    `spacing`: mean distance of neighbouring pixels in the plane of x and y. Returns Slopes in units of the spacing, growing towards the
+    viewer: of z (orthographic) or of −log d (perspective); and which pixels are usable, [rows, cols] bool on the host: in the mask, with a
+    finite normal of some length."""
     slopes = Slopes(grid.zeros(), grid.zeros(), grid.no_edges())
     usable = np.empty((grid.rows, grid.cols), dtype=bool)
     for band in surface.bands():

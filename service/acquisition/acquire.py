@@ -77,15 +77,9 @@ class Acquisition:
 
     def __init__(self, request: AcquireRequest, ask: Ask, tell: Ask = print, progress: Progress | None = None) -> None:
         """Read the plan and the rig, and open the journal and the camera; no lamp is switched yet.
-
-        Args:
-            ask: asks a person to do something, and returns when it is done.
-            tell: tells a person something, and returns at once.
-
-        Raises:
-            RequestError: an option cannot be used, the folder holds another capture, or the camera cannot be opened.
-            StageError: the plan or the rig is wrong; names file and field.
-        """
+        `ask`: asks a person to do something, and returns when it is done. `tell`: tells a person something, and returns at once. Raises
+        RequestError if an option cannot be used, the folder holds another capture, or the camera cannot be opened. Raises StageError if the
+        plan or the rig is wrong; names file and field."""
         self._request, self._ask, self._tell, self._timings = request, ask, tell, Timings(progress)
         self._projector: Projector | None = None
         self.rig: Rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
@@ -107,13 +101,8 @@ class Acquisition:
 
     def run(self, stop: threading.Event | None = None, receivers: Sequence[Receiver] = ()) -> AcquireResult:
         """Take all pictures that are missing; ends early when `stop` is set or the program is interrupted, with the lamps dark.
-
-        Args:
-            receivers: get the name of each picture of the capture itself; opened before a lamp is switched.
-
-        Raises:
-            RequestError: the lamps or the camera do not answer any more; the pictures that were taken are kept.
-        """
+        `receivers`: get the name of each picture of the capture itself; opened before a lamp is switched. Raises RequestError if the lamps
+        or the camera do not answer any more; the pictures that were taken are kept."""
         with ended_by_signals(stop or threading.Event()) as stopping, ExitStack() as receiving:
             lights = None
             try:

@@ -71,15 +71,8 @@ class CaptureFiles:
     def write_manifest(self, folder: str, taken: Mapping[str, Mapping[str, Any]], *, mask: str | None = None,
                        assumed: tuple[str, ...] = ()) -> None:
         """Write the capture.json of a folder with the pictures that there are; without any frame there is none.
-
-        Args:
-            taken: the lines of the journal by the key of the shot.
-            mask: the image of the mask in the folder.
-            assumed: more sentences for the entry `assumed`.
-
-        Raises:
-            RequestError: the camera of the rig has another resolution than the pictures.
-        """
+        `taken`: the lines of the journal by the key of the shot. `mask`: the image of the mask in the folder. `assumed`: more sentences for
+        the entry `assumed`. Raises RequestError if the camera of the rig has another resolution than the pictures."""
         frames: list[dict[str, Any]] = []
         names: list[str] = []
         flat = None
@@ -118,12 +111,8 @@ class Journal:
 
     def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
         """Read the journal, if there is one; `begin` writes one with a head that says what is captured.
-
-        Raises:
-            RequestError: the folder holds another capture than the head says; names what differs.
-            ManifestError: the journal is damaged; names its line.
-            StorageError: it cannot be read or written.
-        """
+        Raises RequestError if the folder holds another capture than the head says; names what differs. Raises ManifestError if the journal
+        is damaged; names its line. Raises StorageError if it cannot be read or written."""
         self._path = folder / JOURNAL_FILE
         self.taken: dict[str, dict[str, Any]] = {}
         """The line of the picture that each shot has, by the key of the shot."""

@@ -44,10 +44,7 @@ class EarlyIngest:
 
     def finish(self) -> None:
         """Complete the stack, which the preview and a solve then find.
-
-        Raises:
-            StageError: an image cannot be read, or the stack not be written.
-        """
+        Raises StageError if an image cannot be read, or the stack not be written."""
         self._end()
         try:
             if self._lights:

@@ -49,11 +49,7 @@ class LiveView:
     """A live view that runs."""
 
     def __init__(self, rig: Path, camera: str, folder: Path) -> None:
-        """Start the process; `folder` takes its pictures.
-
-        Raises:
-            RequestError: the kind of camera has no live view.
-        """
+        """Start the process; `folder` takes its pictures. Raises RequestError if the kind of camera has no live view."""
         if camera.partition(":")[0] not in LIVE:
             raise RequestError(f"--camera {camera}: has no live view")
         folder.mkdir(parents=True, exist_ok=True)
@@ -90,10 +86,7 @@ class LiveView:
 
 def look(rig_path: Path, camera: str, folder: Path, stop: threading.Event) -> None:
     """Show what a camera sees under all lamps, until `stop` is set; the lamps are dark at the end.
-
-    Raises:
-        RequestError: the lamps or the camera do not answer, or the camera has no live view.
-    """
+    Raises RequestError if the lamps or the camera do not answer, or the camera has no live view."""
     rig = read_rig(rig_path)
     setup = Setup(folder, END_S, (), None, jpeg=True)  # the format of pictures is not the live view's
     with closing(open_camera(camera, setup)) as opened, closing(Lights(rig_path, rig, lambda what: None)) as lights:  # none is asked
@@ -146,11 +139,7 @@ class LivePage:
         self._given = rig, camera, folder
 
     def __enter__(self) -> Self:
-        """Start the live view, and serve the page at any free port.
-
-        Raises:
-            RequestError: the kind of camera has no live view.
-        """
+        """Start the live view, and serve the page at any free port. Raises RequestError if the kind of camera has no live view."""
         self._view = LiveView(*self._given)
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), _handler(self._view))
         self._server.daemon_threads = True

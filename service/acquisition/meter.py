@@ -92,11 +92,8 @@ def meter(request: AcquireRequest, ask: Ask, progress: Progress | None = None) -
     """Take pictures of some lamps, propose an exposure, and write meter.json and meter.png; the lamps are dark at the end.
 
     A camera whose exposure time can be set, and is known, is left at the proposed one, and a picture with it has been judged.
-
-    Raises:
-        RequestError: the plan has no picture under lamps, the capture has begun, or lamps or camera do not answer.
-        StageError: the plan or the rig is wrong; names file and field.
-    """
+    Raises RequestError if the plan has no picture under lamps, the capture has begun, or lamps or camera do not answer. Raises StageError
+    if the plan or the rig is wrong; names file and field."""
     if (request.out / JOURNAL_FILE).exists():
         raise RequestError(f"--preview: {request.out} has pictures of a capture already: give another folder to --out")
     rig = None if request.rig is None else read_rig(request.rig)

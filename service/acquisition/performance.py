@@ -61,11 +61,8 @@ class _Frames(NamedTuple):
 
 def import_interleaved(request: InterleavedImport) -> Imported:
     """Write a sequence of captures, one for each period of a plan; the folder comes to be whole or not at all.
-
-    Raises:
-        RequestError: the plan cannot repeat, or the frames do not repeat it; names what does not fit.
-        StageError: plan, rig, an image or the video is wrong, or the folder cannot be written.
-    """
+    Raises RequestError if the plan cannot repeat, or the frames do not repeat it; names what does not fit. Raises StageError if plan, rig,
+    an image or the video is wrong, or the folder cannot be written."""
     target = request.destination
     if target is None:
         raise RequestError("DST is missing: give a folder for the sequence behind SRC")
@@ -169,14 +166,12 @@ def _blocks(frames: _Frames, space: ColorSpaceName) -> np.ndarray:
         return np.stack(list(pool.map(look, frames.names)))
 
 
-def repetition_fault(blocks: np.ndarray, period: Sequence[Shot], names: Sequence[str]) -> str | None:
-    """Return a sentence that says where frames do not repeat a plan, or None.
-
-    Args:
-        blocks: [frames, blocks] float, linear, the means of blocks of each frame.
-        period: the shots of one period, whose first is that of the first frame.
-        names: of the frames.
-    """
+def repetition_fault(
+    blocks: np.ndarray,  # [frames, blocks] float, linear, the means of blocks of each frame
+    period: Sequence[Shot],  # the shots of one period, whose first is that of the first frame
+    names: Sequence[str],  # of the frames
+) -> str | None:
+    """Return a sentence that says where frames do not repeat a plan, or None."""
     return (_misplaced(blocks, len(period), names) or _tracking_elsewhere(blocks, period, names)
             or _tracking_unlike(blocks, period, names))
 

@@ -26,11 +26,8 @@ def write_preview(capture: Path, device: str | None, progress: Progress | None =
     """Write preview.png into the folder of a capture, and return its path.
 
     Normals are those of least squares on the lights in neither shadow nor highlight, without the judgement of a solve, its height and its
-    material; the images are put into the stack that a solve reads after it.
-
-    Raises:
-        RequestError, StageError, KernelError: the capture has too few lights, or other frames than a solve needs.
-    """
+    material; the images are put into the stack that a solve reads after it. Raises RequestError, StageError or KernelError if the capture
+    has too few lights, or other frames than a solve needs."""
     request = SolveRequest(capture=capture, out=capture, method=Method.ROBUST, intensities=Intensities.DECLARED, device=device)
     opened = open_solve(request, None, Timings(progress), None)
     solution = opened.solver(opened.given, opened.lights)

@@ -25,16 +25,8 @@ class Projector:
 
     def __init__(self, resolution: tuple[int, int], port: int, timeout_s: float, spool: Path) -> None:
         """Serve the page; patterns are shown once it is open.
-
-        Args:
-            resolution: width and height of the projector in pixels.
-            port: of the page; 0: any free one.
-            timeout_s: the longest time until a pattern has been painted.
-            spool: a folder for the image that is shown.
-
-        Raises:
-            RequestError: the port is in use.
-        """
+        `resolution`: width and height of the projector in pixels. `port`: of the page; 0: any free one. Raises RequestError if the port is
+        in use."""
         self._resolution, self._timeout, self._image = resolution, timeout_s, spool / "pattern.png"
         self._changed = threading.Condition()
         self._number, self._shown, self._closing = 0, 0, False
@@ -48,11 +40,7 @@ class Projector:
         self._thread.start()
 
     def wait(self) -> None:
-        """Wait until a window of the projector's size is open.
-
-        Raises:
-            RequestError: there is none in time.
-        """
+        """Wait until a window of the projector's size is open. Raises RequestError if there is none in time."""
         with self._changed:
             if self._changed.wait_for(lambda: self._window == self._resolution, self._timeout):
                 return
@@ -66,10 +54,7 @@ class Projector:
 
     def show(self, levels: np.ndarray) -> None:
         """Show an image, [rows, cols] uint8 as the projector gets it, and return when the page has painted it.
-
-        Raises:
-            RequestError: it has not painted it in time.
-        """
+        Raises RequestError if it has not painted it in time."""
         with replacing(self._image, flush=False) as temporary:
             write_png(temporary, levels, srgb=False)
         with self._changed:

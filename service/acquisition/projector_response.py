@@ -24,11 +24,7 @@ class PatternImages:
     """The images of the projector of one capture."""
 
     def __init__(self, request: AcquireRequest, shots: Sequence[Shot]) -> None:
-        """Take note of the options.
-
-        Raises:
-            RequestError: both the options and the plan say how the projector responds.
-        """
+        """Take note of the options. Raises RequestError if both the options and the plan say how the projector responds."""
         self._request, self._measures = request, any(shot.grey is not None for shot in shots)
         self.response: Response | None = None
         """The response of the projector, once the first pattern has been shown through it."""
@@ -37,13 +33,8 @@ class PatternImages:
 
     def image(self, shot: Shot, greys: Callable[[], Mapping[float, Path]]) -> np.ndarray:
         """Return what the projector is given for a shot, [rows, cols] or [rows, cols, 3] uint8; black where it shows nothing.
-
-        Args:
-            greys: returns the pictures of even grey, by its level.
-
-        Raises:
-            RequestError: those pictures do not show a response; names their folder.
-        """
+        `greys`: returns the pictures of even grey, by its level. Raises RequestError if those pictures do not show a response; names their
+        folder."""
         assert self._request.projector is not None
         if shot.grey is not None:
             return stored(np.full(self._request.projector[::-1], shot.grey), 8, 1.0)

@@ -55,11 +55,7 @@ class RemoteControl:
     def __init__(self, rig: Path, camera: str, folder: Path, *, trigger: str | None = None, projector: str | None = None,
                  projector_port: int | None = None) -> None:
         """Read the rig; captures lie below a folder, and devices are named as `relit capture` takes them.
-
-        Raises:
-            RequestError: the size of the projector cannot be read.
-            StageError: the rig is wrong; names file and field.
-        """
+        Raises RequestError if the size of the projector cannot be read. Raises StageError if the rig is wrong; names file and field."""
         self._rig, self._path, self._camera, self._folder = read_rig(rig), rig.resolve(), camera, folder
         size = None if projector is None else re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", projector)
         if projector is not None and size is None:
@@ -91,10 +87,7 @@ class RemoteControl:
 
     def open(self, name: str) -> None:
         """Show a capture that was taken before.
-
-        Raises:
-            RequestError: a capture is running, there is no such capture, or it was not taken on this page with this rig.
-        """
+        Raises RequestError if a capture is running, there is no such capture, or it was not taken on this page with this rig."""
         with self._lock:
             self._refuse_beside_another()
             head = next(iter(lines_of(self._folder / name)), None) if re.fullmatch(NAME, name) else None
@@ -114,10 +107,7 @@ class RemoteControl:
 
     def start(self, name: str, plan: str, *, preview: bool = False, retake: Sequence[str] = ()) -> None:
         """Start a capture, go on with one, or meter the light.
-
-        Raises:
-            RequestError: a capture is running, or a name or the plan cannot be used.
-        """
+        Raises RequestError if a capture is running, or a name or the plan cannot be used."""
         if re.fullmatch(NAME, name) is None:
             raise RequestError(f"name: {name!r} is no name of a capture: give letters, digits, - and _")
         if unknown := [word for word in plan.split(",") if word not in self._plans]:
@@ -143,10 +133,7 @@ class RemoteControl:
 
     def calibrate(self, step: str) -> None:
         """Measure the lights by the ball, or the colours by the chart, that belongs to the capture that is shown, and write its manifest.
-
-        Raises:
-            RequestError: a capture is running, or there is no such calibration.
-        """
+        Raises RequestError if a capture is running, or there is no such calibration."""
         with self._lock:
             self._refuse_beside_another()
             kind, source = self._calibrations().get(step, ("", Path()))
@@ -169,11 +156,7 @@ class RemoteControl:
                 self._process.send_signal(signal.SIGINT)
 
     def look(self, on: bool) -> None:
-        """Begin or end the live view.
-
-        Raises:
-            RequestError: a capture is running, or the camera has no live view.
-        """
+        """Begin or end the live view. Raises RequestError if a capture is running, or the camera has no live view."""
         with self._lock:
             self._darken()
             if on:

@@ -25,14 +25,8 @@ SHADE_PART = 0.05
 
 def refuse_other_settings(folder: Path, earlier: Mapping[str, str], now: Mapping[str, str], shots: Sequence[Shot]) -> None:
     """Refuse to go on where a camera tells another value of a setting than it told when the capture began.
-
-    Args:
-        folder: of the capture, for messages.
-        shots: of the plan; where it sets exposure times, they may differ.
-
-    Raises:
-        RequestError: names the setting and both values.
-    """
+    `folder`: of the capture, for messages. `shots`: of the plan; where it sets exposure times, they may differ. Raises RequestError if
+    names the setting and both values."""
     timed = EXPOSURE_TIMES if any(shot.exposure_s is not None for shot in shots) else ()
     change = _other_setting({name: value for name, value in earlier.items() if name not in timed}, now)
     if change is not None:
@@ -61,15 +55,14 @@ def compared_shot(taken: Sequence[Shot], judge: Judge, rig: Rig) -> Shot:
     return taken[-1] if _by_hand(taken[-1], rig) else max(taken[since:], key=judge.light)
 
 
-def change_since(earlier: Path, picture: Picture, shot: Shot, judge: Judge, rig: Rig, space: str, full_scale: float) -> str | None:
-    """Return what has changed since a shot was taken, settings, place or light, and what to do; None: nothing.
-
-    Args:
-        earlier: the file of the picture that the shot has.
-        picture: the shot, taken again.
-        space: the colour space of both.
-        full_scale: the recorded value from which readings are clipped.
-    """
+def change_since(
+    earlier: Path,  # the file of the picture that the shot has
+    picture: Picture,  # the shot, taken again
+    shot: Shot, judge: Judge, rig: Rig,
+    space: str,  # the colour space of both
+    full_scale: float,  # the recorded value from which readings are clipped
+) -> str | None:
+    """Return what has changed since a shot was taken, settings, place or light, and what to do; None: nothing."""
     before = images.read_pixels(earlier)
     if (change := _other_setting(_told(earlier, before), _told(picture.path, picture.pixels))) is not None:
         return change

@@ -39,10 +39,7 @@ LIGHTS_PER_TERM = 2
 
 def make_basis(request: BasisRequest, progress: Progress | None = None) -> BasisResult:
     """Reduce a capture to a basis and write it, whole or not at all.
-
-    Raises:
-        RequestError: a suffix or a count that the kind does not have, or a result that would replace an input.
-    """
+    Raises RequestError if a suffix or a count that the kind does not have, or a result that would replace an input."""
     kind = resolve_kind(request.kind, request.out)
     device = devices.resolve(request.device)
     timings = Timings(progress)

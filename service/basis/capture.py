@@ -121,10 +121,7 @@ class StackBand(NamedTuple):
 
 def stack_bands(source: BasisCapture, device: str, bytes_per_pixel: int, timings: Timings, stage: str) -> Iterator[StackBand]:
     """Yield the bands of the stack on the device, without those that have no pixel inside the mask, as one stage of the work.
-
-    Args:
-        bytes_per_pixel: what the caller allocates beside the stack for each pixel.
-    """
+    `bytes_per_pixel`: what the caller allocates beside the stack for each pixel."""
     ranges = list(source.stack.bands(bytes_per_pixel))
     timings.stage(stage, len(ranges))
     for done, (start, stop) in enumerate(ranges, start=1):
@@ -162,13 +159,7 @@ def stored_sample(source: BasisCapture, front: np.ndarray) -> np.ndarray:
 
 def display_of(source: BasisCapture, front: np.ndarray, sample: np.ndarray, kind: str) -> Display:
     """Return the display values that files of a kind hold, for the lights in front of the object.
-
-    Args:
-        sample: stored_sample, which is exposed.
-
-    Raises:
-        ManifestError: a light has no irradiance in a channel, or the object is black.
-    """
+    `sample`: stored_sample, which is exposed. Raises ManifestError if a light has no irradiance in a channel, or the object is black."""
     irradiance = source.lights.irradiance
     dark = np.argwhere(irradiance[front] <= 0)
     if len(dark):

@@ -179,13 +179,7 @@ def _table(parts: list[_Part]) -> str:
 
 def gauge_study(values: np.ndarray) -> GaugeStudy:
     """Divide the variance of a crossed study into its parts.
-
-    Args:
-        values: [parts, operators, trials], two parts or more and two trials or more.
-
-    Raises:
-        ValueError: there are fewer parts or trials.
-    """
+    `values`: [parts, operators, trials], two parts or more and two trials or more. Raises ValueError if there are fewer parts or trials."""
     parts, operators, trials = values.shape
     if parts < 2 or trials < 2:
         raise ValueError(f"there are {parts} parts and {trials} trials: two or more of each are needed")

@@ -49,11 +49,8 @@ def write_board(path: Path, heights: HeightMap, provenance: dict[str, str]) -> N
 
 def read_golden(path: Path, regions: Path | None = None) -> Nominal:
     """Read the height map of a good board.
-
-    Args:
-        path: a result folder of relit inspect-board, or its board.exr.
-        regions: the JSON file of the regions that are judged on it; None: there are none.
-    """
+    `path`: a result folder of relit inspect-board, or its board.exr. `regions`: the JSON file of the regions that are judged on it; None:
+    there are none."""
     file = path / BOARD_FILE if path.is_dir() else path
     channels, metadata = exr.read(file)
     camera, _ = camera_and_provenance(metadata, file, file_name=BOARD_FILE)
@@ -121,13 +118,8 @@ class Match(NamedTuple):
 
 def match(measured: HeightMap, stitched: Stitched, nominal: Nominal, *, placement_m: float | None) -> Match:
     """Register a height map to the nominal one; both are on the nominal grid, the measured one at the stage's pose.
-
-    Args:
-        placement_m: standard deviation of the board's place, metres; None: SHIFT_SIGMA_PX pixels.
-
-    Raises:
-        BoardError: the board is not the nominal one, is mirrored, or its heights have another unit.
-    """
+    `placement_m`: standard deviation of the board's place, metres; None: SHIFT_SIGMA_PX pixels. Raises BoardError if the board is not the
+    nominal one, is mirrored, or its heights have another unit."""
     grid = nominal.heights.grid
     sigma = placement_m or SHIFT_SIGMA_PX * grid.pixel_m
     search = max(1, int(np.ceil(SEARCH_SIGMA * sigma / grid.pixel_m)))

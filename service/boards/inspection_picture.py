@@ -24,11 +24,8 @@ SPAN_SIGMA = 6.0
 def write_picture(path: Path, heights: HeightMap, deviation: HeightMap | None, inspected: np.ndarray | None, wanted: np.ndarray | None,
                   defects: Sequence[Defect], regions: Sequence[RegionResult]) -> None:
     """Write the panels as one PNG.
-
-    Args:
-        deviation, inspected, wanted: of the comparison, [rows, cols]: the pixels that were inspected, and those that have a nominal height.
-        defects, regions: drawn as frames.
-    """
+    `deviation`, `inspected`, `wanted`: of the comparison, [rows, cols]: the pixels that were inspected, and those that have a nominal
+    height. `defects`, `regions`: drawn as frames."""
     low, high = np.percentile(heights.height[heights.measured], [1, 99])
     grey = np.clip((heights.height - low) / max(high - low, 1e-12), 0, 1)
     shown = np.where(heights.measured[..., None], grey[..., None] * np.ones(3), OUTSIDE)

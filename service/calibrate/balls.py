@@ -46,12 +46,8 @@ DARK = 0.05
 def balls_of(request: BallRequest | RigCalibrationRequest, camera: Camera, *, exactly: int | None = None, at_least: int = 1,
            radii: Sequence[float] = (), heights: Sequence[float] = ()) -> list[Ball]:
     """Return the balls that a request names: those of its circles, then those of its masks.
-
-    Args:
-        exactly: how many balls there must be; None: `at_least` says it.
-        radii: metres, one for all balls or one for each; empty: not known.
-        heights: camera-frame z of the centres, one for all balls or one for each; empty: surface_z_m.
-    """
+    `exactly`: how many balls there must be; None: `at_least` says it. `radii`: metres, one for all balls or one for each; empty: not known.
+    `heights`: camera-frame z of the centres, one for all balls or one for each; empty: surface_z_m."""
     count = len(request.circles) + len(request.masks)
     if count < at_least or exactly not in (None, count):
         need = f"exactly {exactly}" if exactly is not None else f"{at_least} or more"
@@ -120,12 +116,8 @@ def find_mirror_ball(captures: LightCaptures, level: float) -> Ball:
 
 def find_mirror_balls(captures: LightCaptures, level: float, radius_m: float | None, z_m: float | None) -> list[Ball]:
     """Find the mirror balls of a capture: two round outlines or more in which the bright spot is small and moves from frame to frame.
-
-    Args:
-        captures: lit by one lamp a frame.
-        radius_m: of every ball; None: not known.
-        z_m: camera-frame z of every centre, for an orthographic camera; None: not known.
-    """
+    `captures`: lit by one lamp a frame. `radius_m`: of every ball; None: not known. `z_m`: camera-frame z of every centre, for an
+    orthographic camera; None: not known."""
     found = _mirrors(captures, level, radius_m, z_m)
     if len(found.balls) < 2:
         raise RequestError(f"{captures.source.folder}: {_counted(len(found.balls))} found in the images ({found.looked_at} round outlines "

@@ -68,11 +68,8 @@ class ChartCalibration(NamedTuple):
 
 def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> ChartCalibration:
     """Measure the colours of a camera from a chart in the frames of a capture, and write their matrices into a manifest.
-
-    Raises:
-        StageError: bad input, no chart, or one whose patches do not tell the colours; names what is wrong. Nothing is written.
-        RequestError: options that do not fit.
-    """
+    Raises StageError: bad input, no chart, or one whose patches do not tell the colours; names what is wrong. Nothing is written. Raises
+    RequestError: options that do not fit."""
     timings = Timings(progress)
     timings.stage("open", 1)
     source = Capture.open(request.capture)
@@ -135,10 +132,7 @@ class _Placed(NamedTuple):
 
 def _placed(corners: np.ndarray, chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipped: np.ndarray) -> _Placed:
     """Return the chart at a place, which the outlines of its patches refine.
-
-    Raises:
-        CalibrationError: the corners span no chart, or there are other colours.
-    """
+    Raises CalibrationError if the corners span no chart, or there are other colours."""
     place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])  # checks them
     corners = refine_corners(mean, corners, chart.grid)
     places = place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])
@@ -148,10 +142,7 @@ def _placed(corners: np.ndarray, chart: ChartReference, reference: np.ndarray, m
 
 def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipped: np.ndarray) -> _Placed:
     """Return the chart where most of its patches have its colours, of all places that are proposed.
-
-    Raises:
-        CalibrationError: there is none; says what is wrong with the first.
-    """
+    Raises CalibrationError if there is none; says what is wrong with the first."""
     faults: list[CalibrationError] = []
     best: _Placed | None = None
     for corners in find_charts(mean, len(chart.names)):
@@ -272,17 +263,15 @@ def _entry(each: KindColors, chart: ChartReference, manifest: Manifest) -> dict[
                         for index, name in enumerate(chart.names)]}
 
 
-def write_picture(path: Path, photograph: np.ndarray, corners: np.ndarray, chart: ChartReference, found: Sequence[tuple[str, ChartColors]],
-                  space: str, review: Review) -> Path:
-    """Write the picture, and return its path.
-
-    Args:
-        photograph: [rows, cols, 3] linear, in the colours of the camera.
-        corners: [4, 2] pixels of the centres of the corner patches.
-        found: the title and the colours of each kind of light.
-        space: the working space of the capture.
-        review: the view through which colours are shown.
-    """
+def write_picture(
+    path: Path,
+    photograph: np.ndarray,  # [rows, cols, 3] linear, in the colours of the camera
+    corners: np.ndarray,  # [4, 2] pixels of the centres of the corner patches
+    chart: ChartReference,
+    found: Sequence[tuple[str, ChartColors]],  # the title and the colours of each kind of light
+    space: str, review: Review,
+) -> Path:
+    """Write the picture, and return its path."""
     reach = AROUND * float(np.ptp(corners, axis=0).max())
     (left, top), (right, bottom) = np.maximum(corners.min(axis=0) - reach, 0).astype(int), (corners.max(axis=0) + reach).astype(int) + 1
     step = -(-(bottom - top) // MOST_ROWS)

@@ -143,10 +143,7 @@ class TopHistogram:
 
 def capture_saturation(channels: list[ChannelSaturation]) -> float:
     """Return the saturation of a capture, one number for all channels: the least level of a channel, to four digits.
-
-    Raises:
-        CalibrationError: no channel saturates.
-    """
+    Raises CalibrationError if no channel saturates."""
     levels = [channel.level for channel in channels if channel.level is not None]
     if not levels:
         raise CalibrationError("no channel piles up at its largest value: nothing shows where readings saturate")
@@ -192,11 +189,8 @@ class MeanImage(NamedTuple):
 def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: bool = False,
                progress: Callable[[int], None] | None = None) -> MeanImage:
     """Return the mean of images, which have the resolution and the encoding of the capture, in linear values.
-
-    Args:
-        refuse_saturated: True makes a saturated reading inside the mask an error.
-        progress: called after every image with the count of images that have been read.
-    """
+    `refuse_saturated`: True makes a saturated reading inside the mask an error. `progress`: called after every image with the count of
+    images that have been read."""
     if not paths:
         raise CalibrationError("no image is given")
     manifest = capture.manifest
@@ -224,13 +218,8 @@ def mean_image(paths: Sequence[Path], capture: Capture, *, refuse_saturated: boo
 
 def make_flat(white: MeanImage, white_dark: MeanImage | None, capture: Capture) -> np.ndarray:
     """Return the flat field for the correction: white card minus its own dark frame, plus the dark frame of the capture.
-
-    Args:
-        white_dark: the mean of dark images at the same exposure; None takes the dark frame of the capture for them.
-
-    Returns:
-        [rows, cols, 3] float32, linear.
-    """
+    `white_dark`: the mean of dark images at the same exposure; None takes the dark frame of the capture for them. Returns [rows, cols, 3]
+    float32, linear."""
     dark = np.zeros_like(white.pixels)
     if capture.manifest.dark is not None:
         path = capture.file(capture.manifest.dark)

@@ -67,10 +67,7 @@ class _OnTarget(NamedTuple):
 def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, *,
                  manifest_paths: Sequence[Path] | None = None) -> LaserPlanes:
     """Measure the plane of each laser frame, and write it to the manifests.
-
-    Args:
-        manifest_paths: the manifest to write for each capture, then for each of `apply_to`; None: their own.
-    """
+    `manifest_paths`: the manifest to write for each capture, then for each of `apply_to`; None: their own."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)

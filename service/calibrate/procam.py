@@ -44,10 +44,7 @@ class ProcamResult(NamedTuple):
 
 def procam(request: ProcamRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> ProcamResult:
     """Calibrate a projector-camera pair, and write camera, projector and their pose to the manifests.
-
-    Args:
-        manifest_paths: the manifest to write for each of `captures`, then for each of `apply_to`; None: their own.
-    """
+    `manifest_paths`: the manifest to write for each of `captures`, then for each of `apply_to`; None: their own."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)

@@ -92,17 +92,14 @@ class Response(NamedTuple):
     """The median absolute deviation of the pixels from the response, relative to full scale."""
 
 
-def fit_response(levels: Sequence[float], images: np.ndarray, *, usable: np.ndarray | None = None) -> Response:
+def fit_response(
+    levels: Sequence[float],  # the level of each image, from 0 to 1, all different, with 0 and 1 among them
+    images: np.ndarray,  # [levels, pixels] float32, linear readings
+    *,
+    usable: np.ndarray | None = None,  # [pixels] bool, True for pixels that saturate in no image; None for all
+) -> Response:
     """Fit the response of a projector to images of uniform levels.
-
-    Args:
-        levels: the level of each image, from 0 to 1, all different, with 0 and 1 among them.
-        images: [levels, pixels] float32, linear readings.
-        usable: [pixels] bool, True for pixels that saturate in no image; None for all.
-
-    Raises:
-        CalibrationError: the levels are invalid, or the images do not become brighter with the level.
-    """
+    Raises CalibrationError if the levels are invalid, or the images do not become brighter with the level."""
     order = np.argsort(levels)
     x = np.asarray(levels, dtype=np.float64)[order]
     if len(x) < 3 or len(np.unique(x)) < len(x) or x[0] != 0 or x[-1] != 1:

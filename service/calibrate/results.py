@@ -99,16 +99,14 @@ def leave_out_failures(captures: LightCaptures, results: Sequence[MeasuredLight 
             for result in results]
 
 
-def write_lights(kind: str, request: Options, captures: LightCaptures, results: Sequence[MeasuredLight], *,
-                 headings: tuple[str, ...], summary: dict[str, Any], relative: bool | None = None) -> LightCalibration:
-    """Write the report, then the manifest, each whole or not at all, and return what was written.
-
-    Args:
-        kind: the section of the report.
-        headings: of the table, between frame and flags.
-        summary: what the report says beside the lights.
-        relative: whether the common scale of the measured lights is unknown; None: their strength was not measured.
-    """
+def write_lights(
+    kind: str,  # the section of the report
+    request: Options, captures: LightCaptures, results: Sequence[MeasuredLight], *,
+    headings: tuple[str, ...],  # of the table, between frame and flags
+    summary: dict[str, Any],  # what the report says beside the lights
+    relative: bool | None = None,  # whether the common scale of the measured lights is unknown; None: their strength was not measured
+) -> LightCalibration:
+    """Write the report, then the manifest, each whole or not at all, and return what was written."""
     manifest = with_lights(captures.target, [result.light for result in results])
     if relative is not None:
         manifest = manifest.model_copy(update={"irradiance_scale": "relative" if relative else "absolute"})

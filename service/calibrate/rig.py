@@ -84,12 +84,8 @@ class Target(NamedTuple):
 
 def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = None) -> RigCalibration:
     """Measure the primaries of a rig, and write its file.
-
-    Raises:
-        RequestError: options that do not fit.
-        StageError: bad input, or an image from which a primary cannot be measured; names it. Nothing is written.
-        StorageError: a file cannot be written.
-    """
+    Raises RequestError: options that do not fit. Raises StageError: bad input, or an image from which a primary cannot be measured; names
+    it. Nothing is written. Raises StorageError if a file cannot be written."""
     timings = Timings(progress)
     timings.stage("open", 1)
     capture, rig = Capture.open(request.capture), read_rig(request.rig)
@@ -148,11 +144,7 @@ def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = No
 
 
 def _read_table(path: Path, capture: Capture, rig: Rig) -> Sweep:
-    """Return the frames of each primary by a table with the columns of cues.csv.
-
-    Raises:
-        ManifestError: a line is wrong; names it.
-    """
+    """Return the frames of each primary by a table with the columns of cues.csv. Raises ManifestError if a line is wrong; names it."""
     rows = read_table(path, COLUMNS)
     emitters = {(rig.lights[index].name, primary.name): column for column, (index, primary) in enumerate(rig.emitters)}
     frames = capture.manifest.frames

@@ -118,10 +118,7 @@ class BoardFrame(NamedTuple):
 
 def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest_paths: Sequence[Path] | None = None) -> StereoResult:
     """Calibrate several cameras, and write them to the manifests.
-
-    Args:
-        manifest_paths: the manifest to write for the capture, then for each of `apply_to`; None: their own.
-    """
+    `manifest_paths`: the manifest to write for the capture, then for each of `apply_to`; None: their own."""
     timings = Timings(progress)
     timings.stage("open", 1)
     capture = Capture.open(request.capture)

@@ -51,14 +51,9 @@ class TofCalibrationResult(NamedTuple):
 def calibrate_tof(request: TofCalibrationRequest, progress: Progress | None = None, *,
                   allowed: Sequence[Path] | None = None) -> TofCalibrationResult:
     """Calibrate a time-of-flight camera, and write the calibration.
-
-    Args:
-        allowed: folders of the captures that the sweep may name; None: any.
-
-    Raises:
-        StageError, KernelError: a capture or the sweep cannot be used, or does not determine the calibration; nothing is written.
-        RequestError: steps of both kinds, a step without a solved pixel, or a capture that is not allowed.
-    """
+    `allowed`: folders of the captures that the sweep may name; None: any. Raises StageError or KernelError if a capture or the sweep cannot
+    be used, or does not determine the calibration; nothing is written. Raises RequestError if steps of both kinds, a step without a solved
+    pixel, or a capture that is not allowed."""
     timings = Timings(progress)
     device, sweep = devices.resolve(request.device), request.sweep
     plan = read_sweep(sweep)

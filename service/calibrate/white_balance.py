@@ -34,12 +34,9 @@ def white_balance(request: WhiteBalanceRequest, progress: Progress | None = None
     """Measure the colour of the light on a card, and write `color_matrix` into the manifest.
 
     The matrix multiplies each channel by the gain that makes the card grey. Colours of camera raw files are then converted from the
-    primaries of the sensor to those of the capture's colour space, which keeps grey grey.
-
-    Raises:
-        StageError: an image is wrong, saturated in the region, or dark in a channel; nothing is written.
-        RequestError: the region leads out of the images, or images of other kinds are mixed.
-    """
+    primaries of the sensor to those of the capture's colour space, which keeps grey grey. Raises StageError if an image is wrong, saturated
+    in the region, or dark in a channel; nothing is written. Raises RequestError if the region leads out of the images, or images of other
+    kinds are mixed."""
     capture, manifest_path, timings = open_capture(request, progress)
     region = Crop(*request.region) if request.region is not None else Crop(0, 0, *capture.camera.resolution)
     if not region.is_within(capture.camera.resolution):

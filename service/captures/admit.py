@@ -30,17 +30,10 @@ MAX_CHANNELS = 4
 
 def admit_capture(folder: Path, *, max_pixels: int, progress: Progress | None = None) -> dict[str, Any]:
     """Check the manifest of a capture, or of a sequence of captures, and the header of every file that it names; or the shots of a scan,
-    or the tiles of a board.
-
-    Returns:
-        A description: number of captures and frames, resolution, colour space, name, and what frames are lit by, as `LIT_BY` names it; of a
-        scan its number of shots and name; of a board its number of tiles and name.
-
-    Raises:
-        ManifestError: the manifest is wrong, or a file lies outside the folder; names the field.
-        ImageError: a file is not an image, is cut short, or has more pixels than are allowed; names the file.
-        StorageError: a file cannot be read.
-    """
+    or the tiles of a board. Returns a description: number of captures and frames, resolution, colour space, name, and what frames are lit
+    by, as `LIT_BY` names it; of a scan its number of shots and name; of a board its number of tiles and name. Raises ManifestError if the
+    manifest is wrong, or a file lies outside the folder; names the field. Raises ImageError if a file is not an image, is cut short, or has
+    more pixels than are allowed; names the file. Raises StorageError if a file cannot be read."""
     if (folder / BOARD_FILE).is_file() and not (folder / FILE_NAME).exists():
         return _admit_board(folder, max_pixels)
     if (folder / SCAN_FILE).is_file() and not (folder / FILE_NAME).exists():
@@ -106,11 +99,8 @@ def recheck_capture(folder: Path, *, max_pixels: int, number: int | None = None)
 
 def admit_environment(folder: Path, *, max_pixels: int) -> dict[str, Any]:
     """Check the header of an environment map, the only image of a folder, and return its file and resolution.
-
-    Raises:
-        ImageError: there is not exactly one image, it is not a lat-long map, or it has too many pixels.
-        StorageError: it cannot be read.
-    """
+    Raises ImageError if there is not exactly one image, it is not a lat-long map, or it has too many pixels. Raises StorageError if it
+    cannot be read."""
     path = environment_file(folder)
     if path.suffix.lower() not in SUFFIXES:
         raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")

@@ -51,12 +51,8 @@ class _Views(NamedTuple):
 def write_picture(path: Path, capture: Capture, peak: float, suspects: Mapping[str, float], review: Review,
                   done: Callable[[int], None]) -> None:
     """Write the picture of a capture.
-
-    Args:
-        peak: the largest reading.
-        suspects: lights that disagree with the others, by their images; they are red.
-        done: called with the count of frames that have been read.
-    """
+    `suspects`: lights that disagree with the others, by their images; they are red. `done`: called with the count of frames that have been
+    read."""
     unit = 1.0 if peak <= 2.0 ** STOPS[1] else 2.0 ** (np.ceil(np.log2(peak)) - STOPS[1])
     views = _read(capture, unit, done)
     images, (mean,) = _shown(views.images, capture, review), _shown([views.mean], capture, review)

@@ -52,10 +52,8 @@ class Findings(NamedTuple):
 
 def findings(capture: Capture, positions: np.ndarray, recorded: Mapping[str, np.ndarray]) -> Findings:
     """Return what explains the images much better than the manifest, else the lights that disagree with the others.
-
-    Args:
-        recorded: [n, 3] float32 of each frame at these pixels, by the name of its image: fractions of full scale, or floating-point values.
-    """
+    `recorded`: [n, 3] float32 of each frame at these pixels, by the name of its image: fractions of full scale, or floating-point
+    values."""
     lit = capture.lit_by(DistantLight)
     correction = Correction.of(capture).at(positions)
     radiance = np.stack([correction.corrected(recorded[frame.image][:, None], frame)[:, 0] for frame, _ in lit]).astype(np.float64)

@@ -42,13 +42,8 @@ if TYPE_CHECKING:
 
 def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Imported:
     """Write the capture.json of a request, and return where it is and how the files were understood.
-
-    Args:
-        assumed: what was taken for granted by who chose the layout, which the manifest then records.
-
-    Raises:
-        ManifestError: the files do not hold what the layout has, or do not fit the options.
-    """
+    `assumed`: what was taken for granted by who chose the layout, which the manifest then records. Raises ManifestError if the files do not
+    hold what the layout has, or do not fit the options."""
     imported = _IMPORTS[type(request)](request)
     manifest = read_manifest(imported.path)
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
@@ -218,14 +213,9 @@ _IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
 
 def propose(folder: Path) -> dict[str, Any]:
     """Return how the files of a folder can be imported, as JSON.
-
-    Returns:
-        `summary` and `because`, sentences; `layout`, `file` and `options` as ImportChoices has them; `missing`, the names of options that a
-        person has to choose; `assumed`, sentences; `sure`, whether the files say all that the import needs.
-
-    Raises:
-        ManifestError: the files are of no layout that can be imported; the sentence says what was looked for.
-    """
+    Returns `summary` and `because`, sentences; `layout`, `file` and `options` as ImportChoices has them; `missing`, the names of options
+    that a person has to choose; `assumed`, sentences; `sure`, whether the files say all that the import needs. Raises ManifestError if the
+    files are of no layout that can be imported; the sentence says what was looked for."""
     found = guess(folder)
     if found.arguments[0] not in LAYOUTS:
         raise ManifestError(f"{folder}: looks like {found.layout}, which relit import {found.arguments[0]} takes, and the service does not")
@@ -244,11 +234,7 @@ def propose(folder: Path) -> dict[str, Any]:
 
 def import_chosen(folder: Path, choices: ImportChoices, assumed: tuple[str, ...], name: str) -> None:
     """Write the capture.json of a folder as it was chosen.
-
-    Args:
-        assumed: the sentences of the proposal that are still true.
-        name: that the capture is to have.
-    """
+    `assumed`: the sentences of the proposal that are still true. `name`: that the capture is to have."""
     _require_no_video(choices.layout, folder / (choices.file or ""))
     known = options_of_layout(choices.layout)
     options = {key: folder / value if key in known and known[key].role is Role.INPUT and isinstance(value, str) else value

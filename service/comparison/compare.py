@@ -78,13 +78,8 @@ class CompareResult(NamedTuple):
 
 def compare(request: CompareRequest, progress: Progress | None = None) -> CompareResult:
     """Lay a scan on its design, and say by how much it deviates, how sure that is, and which regions are within their tolerances.
-
-    Raises:
-        RequestError: small_gicp is not installed.
-        ScanError: the scan cannot be laid on the design.
-        StageError: a file is wrong, damaged or missing.
-        StorageError: the results cannot be written.
-    """
+    Raises RequestError if small_gicp is not installed. Raises ScanError if the scan cannot be laid on the design. Raises StageError if a
+    file is wrong, damaged or missing. Raises StorageError if the results cannot be written."""
     if not neighbours_are_installed():
         raise RequestError("a scan is laid on its design with small_gicp, which is not installed: pip install 'relit[scans]'")
     timings = Timings(progress)
@@ -234,11 +229,7 @@ def colours_of(found: Deviations, span_m: float) -> np.ndarray:
 
 def write_picture(path: Path, found: Deviations, colours: np.ndarray, span_m: float, spacing_m: float) -> None:
     """Write two views and the histogram as one PNG.
-
-    Args:
-        colours: [n, 3] of `colours_of`, whose full colour is at `span_m`.
-        spacing_m: the distance of neighbouring points.
-    """
+    `colours`: [n, 3] of `colours_of`, whose full colour is at `span_m`. `spacing_m`: the distance of neighbouring points."""
     views = [(f"from the {name}, {-1e3 * span_m:.3g} to {1e3 * span_m:.3g} mm", _view(found, colours, toward, spacing_m))
              for name, toward in VIEWS.items()]
     write_sheet(path, [[*views, ("deviations, share of the points", _histogram(found, span_m))]], height=SIDE_PX)

@@ -64,12 +64,8 @@ def decide(regions: Sequence[ToleranceRegion], patches: Patches, strange: tuple[
 
     A region fails if the mean of any patch is more than k σ outside of a limit, and passes if all are more than k σ inside of both, the
     scan shows enough of it, and nothing strange stands on it. k is that of as many one-sided tests as there are patches and limits
-    (Bonferroni's bound).
-
-    Args:
-        strange: places and normals of `deviations.standing_on`.
-        one_pose: no other pose fits about as well: else nobody knows what lies in a part of the surface, and only the whole is decided.
-    """
+    (Bonferroni's bound). `strange`: places and normals of `deviations.standing_on`. `one_pose`: no other pose fits about as well: else
+    nobody knows what lies in a part of the surface, and only the whole is decided."""
     of_region = [inside(region, patches.middle, patches.normal, unit_m) for region in regions]
     k = threshold(false_alarm, 2 * max(sum(int(each.sum()) for each in of_region), 1), sides=1)
     tree = cKDTree(_facing_points(patches.middle, patches.normal, patch_m)) if len(patches.middle) else None

@@ -121,11 +121,8 @@ def read_design(path: Path, unit_m: float, *, device: str) -> Design:
 
 def read_scanned(path: Path, unit_m: float, sigma_m: float | None) -> ScannedSurface:
     """Read a scan, whose coordinates are in a unit of so many metres.
-
-    Raises:
-        ResultError: it has too few points, or nothing tells which side of it is outside: faces, normals, or that it was all seen from
-            one place.
-    """
+    Raises ResultError if it has too few points, or nothing tells which side of it is outside: faces, normals, or that it was all seen from
+    one place."""
     file = path / MESH_FILE if path.is_dir() else path
     if file.suffix.lower() == PLY:
         ply = read_ply_points(file)

@@ -23,10 +23,7 @@ LIGHTS, SIDE, FRAMES = 64, 512, 24
 
 def bench(request: BenchRequest, progress: Progress | None = None) -> list[str]:
     """Measure the speed of the kernels on this machine.
-
-    Returns:
-        Lines of a Markdown table: what, milliseconds, pixels per second, against what, its milliseconds, ratio (above 1: faster).
-    """
+    Returns lines of a Markdown table: what, milliseconds, pixels per second, against what, its milliseconds, ratio (above 1: faster)."""
     timings = Timings(progress)
     name = devices.resolve(request.device)
     timings.stage("bench", 6)

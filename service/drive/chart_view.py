@@ -42,16 +42,13 @@ class ChartView(NamedTuple):
         return sheet
 
 
-def view_chart(chart: ChartReadings, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray) -> ChartView:
-    """Return how a chart looks in each frame.
-
-    Args:
-        chart: its readings under each primary at full level and normal incidence, and under white light.
-        rig: the lamps.
-        far: the light of each frame.
-        level: [frames, emitters] of `rig.emitters`, 0…1.
-        exposure: [frames] factor on the light.
-    """
+def view_chart(
+    chart: ChartReadings,  # its readings under each primary at full level and normal incidence, and under white light
+    rig: Rig, far: Sequence[FarLight],
+    level: np.ndarray,  # [frames, emitters] of `rig.emitters`, 0…1
+    exposure: np.ndarray,  # [frames] factor on the light
+) -> ChartView:
+    """Return how a chart looks in each frame."""
     readings = np.concatenate([chart.of(lamp) for lamp in rig.lights])  # [emitters, patches, 3]
     facing = np.maximum(rig.directions[[lamp for lamp, _ in rig.emitters]] @ FACING[0], 0)
     irradiance = np.concatenate([far_irradiance(light, FACING) for light in far]) * exposure[:, None]

@@ -73,16 +73,8 @@ class DriveResult(NamedTuple):
 
 def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResult:
     """Find the levels of the lamps and write them.
-
-    Args:
-        request: rig, light and where to put the cues.
-        progress: told of every stage.
-
-    Raises:
-        RequestError: options that do not fit, or an environment beyond all limits of the rig.
-        StageError, KernelError: bad input; names file and field.
-        StorageError: a file cannot be written; nothing half-written is left.
-    """
+    Raises RequestError: options that do not fit, or an environment beyond all limits of the rig. Raises StageError or KernelError: bad
+    input; names file and field. Raises StorageError if a file cannot be written; nothing half-written is left."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
@@ -137,11 +129,7 @@ def _title(number: int, beyond: float, radius: float) -> str:
 
 
 def _greatest(wanted: WantedLevels) -> float:
-    """Return the exposure at which the brightest primary of all frames is at full level.
-
-    Raises:
-        RequestError: no lamp gives light.
-    """
+    """Return the exposure at which the brightest primary of all frames is at full level. Raises RequestError if no lamp gives light."""
     most = float(wanted.level.max())
     if most == 0:
         raise RequestError("--auto-exposure: no frame has light")
@@ -150,10 +138,7 @@ def _greatest(wanted: WantedLevels) -> float:
 
 def _check_limits(wanted: WantedLevels, dilated: Dilated, rig: Rig, request: DriveRequest, exposure: float) -> None:
     """Check that the lamps hold the light of every frame.
-
-    Raises:
-        RequestError: more than MOST_LEFT of the energy of a frame finds no lamp.
-    """
+    Raises RequestError: more than MOST_LEFT of the energy of a frame finds no lamp."""
     irradiance = np.array([primary.irradiance for _, primary in rig.emitters])
 
     def left(level: np.ndarray, rest: np.ndarray) -> np.ndarray:
@@ -176,17 +161,7 @@ def _check_limits(wanted: WantedLevels, dilated: Dilated, rig: Rig, request: Dri
 def write_picture(folder: Path, rig: Rig, far: Sequence[FarLight], level: np.ndarray, exposure: np.ndarray, titles: Sequence[str],
                   chart: ChartView | None, review: Review) -> Path:
     """Write the picture into a folder and return its path.
-
-    Args:
-        folder: it is there.
-        rig: its lamps.
-        far: the light of each frame.
-        level: [frames, emitters] of `rig.emitters`, 0…1.
-        exposure: [frames] factor on the light.
-        titles: of the frames.
-        chart: what it shows in each frame; None: there is none.
-        review: the view through which colours are shown.
-    """
+    `level`: [frames, emitters] of `rig.emitters`, 0…1. `exposure`: [frames] factor on the light."""
     shown = np.linspace(0, len(far), min(MOST_ROWS, len(far)), endpoint=False).astype(int)
     rows = [_row(rig, far[index], level[index], exposure[index], titles[index], None if chart is None else chart.picture(index),
                  review)

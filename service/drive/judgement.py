@@ -31,15 +31,13 @@ class Judgement(NamedTuple):
     energy: np.ndarray  # [frames] irradiance of all lamps, over the energy of the environment
 
 
-def judge(run: Sequence[FarLight], level: np.ndarray, rig: Rig, exposure: np.ndarray) -> Judgement:
-    """Compare lamps with the environment, on normals that turn with it.
-
-    Args:
-        run: the light of each frame, all under one environment map or under none.
-        level: [frames, emitters] of `rig.emitters`, 0…1.
-        rig: its lamps.
-        exposure: [frames] factor on the environment and the discs.
-    """
+def judge(
+    run: Sequence[FarLight],  # the light of each frame, all under one environment map or under none
+    level: np.ndarray,  # [frames, emitters] of `rig.emitters`, 0…1
+    rig: Rig,
+    exposure: np.ndarray,  # [frames] factor on the environment and the discs
+) -> Judgement:
+    """Compare lamps with the environment, on normals that turn with it."""
     lamps, towards = lamp_irradiance(level, rig), rig.directions
     normals = fibonacci_sphere(NORMALS)
     environment = run[0].environment

@@ -52,12 +52,8 @@ class WantedLevels(NamedTuple):
 
 def levels_for_light(light: np.ndarray, rig: Rig, chart: ChartReadings | None) -> WantedLevels:
     """Return the levels of the primaries that give the light of each lamp, without an upper limit.
-
-    Args:
-        light: [frames, lights, 3] irradiance that each lamp is to give at the subject, in the colour space of the rig.
-        rig: its lamps.
-        chart: what the camera sees of the patches of a chart under each primary and under the environment; None: colours alone count.
-    """
+    `light`: [frames, lights, 3] irradiance that each lamp is to give at the subject, in the colour space of the rig. `rig`: its lamps.
+    `chart`: what the camera sees of the patches of a chart under each primary and under the environment; None: colours alone count."""
     frames = len(light)
     lamps = [np.array([primary.irradiance for primary in lamp.primaries]) for lamp in rig.lights]
     first = np.cumsum([0, *(len(matrix) for matrix in lamps)])
@@ -86,14 +82,7 @@ def levels_for_light(light: np.ndarray, rig: Rig, chart: ChartReadings | None) -
 
 def nonnegative_least_squares(gram: np.ndarray, towards: np.ndarray) -> np.ndarray:
     """Return the non-negative x of least xᵀ G x − 2 hᵀ x, for many h.
-
-    Args:
-        gram: [n, n] float64 G, positive definite.
-        towards: [count, n] float64, each h.
-
-    Returns:
-        [count, n] float64.
-    """
+    `gram`: [n, n] float64 G, positive definite. `towards`: [count, n] float64, each h. Returns [count, n] float64."""
     count = len(gram)
     found, left = np.zeros(towards.shape), np.arange(len(towards))
     sets = [lit for size in range(count, 0, -1) for lit in combinations(range(count), size)] if count <= MOST_PRIMARIES else []
@@ -207,14 +196,12 @@ def dilate(level: np.ndarray, rig: Rig) -> Dilated:
     return Dilated(result, radius, left)
 
 
-def fill(angle: np.ndarray, spare: np.ndarray, excess: float) -> tuple[np.ndarray, float]:
-    """Return what each lamp takes of an excess, and what is left.
-
-    Args:
-        angle: [lamps] from the middle of the excess, radians.
-        spare: [lamps] energy that each can still give.
-        excess: energy to be placed.
-    """
+def fill(
+    angle: np.ndarray,  # [lamps] from the middle of the excess, radians
+    spare: np.ndarray,  # [lamps] energy that each can still give
+    excess: float,  # energy to be placed
+) -> tuple[np.ndarray, float]:
+    """Return what each lamp takes of an excess, and what is left."""
     spare = np.where(angle <= WIDEST, spare, 0)
     if spare.sum() <= excess:
         return spare, excess - float(spare.sum())

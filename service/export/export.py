@@ -61,15 +61,10 @@ class Exported(NamedTuple):
 
 def export(request: ExportRequest, progress: Progress | None = None) -> Exported:
     """Write an asset from solved maps, or from a depth where there are no maps.
-
-    Raises:
-        ResultError: the maps are missing or incomplete.
-        RequestError: a geometry is asked for solved maps, or levels of detail, lights or frames of a depth or in a .glb.
-        ManifestError, ImageError: the capture of the rig, the environment or the frames of the card cannot be used.
-        AssetError: an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
-            contradicts its normals, or no face.
-        StorageError: the asset cannot be written; nothing is left half-written.
-    """
+    Raises ResultError if the maps are missing or incomplete. Raises RequestError if a geometry is asked for solved maps, or levels of
+    detail, lights or frames of a depth or in a .glb. Raises ManifestError or ImageError if the capture of the rig, the environment or the
+    frames of the card cannot be used. Raises AssetError if an unknown suffix, EXR textures in a .usdz or .glb, no height, a height that
+    contradicts its normals, or no face. Raises StorageError if the asset cannot be written; nothing is left half-written."""
     suffix = request.out.suffix.lower()
     if suffix.removeprefix(".") not in get_args(AssetFormat):
         raise AssetError(f"{request.out} cannot be written as an asset: its suffix must be .usda, .usdc or .usdz for USD, or .glb for glTF")

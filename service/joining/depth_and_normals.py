@@ -52,6 +52,8 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
                measured: np.ndarray, x: np.ndarray, y: np.ndarray, *, perspective: bool, device: str,
                progress: Callable[[float], None] | None = None) -> Joined:
     """Join the depth map and the normal map of one camera.
+    Raises ArrayError if shapes do not fit, fewer than LEAST_DEPTHS pixels have both, or values are not finite or not positive where they
+    must be.
 
     Args:
         normal: [3, rows, cols] unit, camera frame.
@@ -61,10 +63,6 @@ def join_depth(normal: np.ndarray, normal_sigma: np.ndarray, solved: np.ndarray,
         depth_sigma: [rows, cols] standard deviations of the depth, above 0 and independent between pixels.
         measured: [rows, cols] bool, where there is a depth.
         x, y: [rows, cols] plane coordinates of the pixels, as for `integrate_normals`.
-
-    Raises:
-        ArrayError: shapes do not fit, fewer than LEAST_DEPTHS pixels have both, or values are not finite or not positive where they must
-            be.
     """
     _check(normal, normal_sigma, solved, depth, depth_sigma, measured, perspective=perspective)
     plane = _Plane(x.astype(np.float64), y.astype(np.float64), perspective)
@@ -238,15 +236,13 @@ class Correction(NamedTuple):
     rejected: np.ndarray  # [rows, cols] bool, readings that disagree with their surroundings
 
 
-def correct(difference: np.ndarray, sigma: np.ndarray, known: np.ndarray, inside: np.ndarray) -> Correction:
-    """Estimate the error of a smooth map from its difference to a noisy one.
-
-    Args:
-        difference: [rows, cols] noisy minus smooth.
-        sigma: [rows, cols] standard deviation of the noise, independent between pixels.
-        known: [rows, cols] bool, where there is a difference; one pixel or more.
-        inside: [rows, cols] bool, where the correction is wanted.
-    """
+def correct(
+    difference: np.ndarray,  # [rows, cols] noisy minus smooth
+    sigma: np.ndarray,  # [rows, cols] standard deviation of the noise, independent between pixels
+    known: np.ndarray,  # [rows, cols] bool, where there is a difference; one pixel or more
+    inside: np.ndarray,  # [rows, cols] bool, where the correction is wanted
+) -> Correction:
+    """Estimate the error of a smooth map from its difference to a noisy one."""
     rejected = _outliers(difference, sigma, known)
     weight = np.where(known & ~rejected, 1 / sigma**2, 0)
     value = np.full(difference.shape, (weight * np.where(known, difference, 0)).sum() / weight.sum())

@@ -40,14 +40,13 @@ class Edges(NamedTuple):
     joined: np.ndarray  # [rows, cols] bool, whether there is an edge; False in the last column (row)
 
 
-def find_steps(value: np.ndarray, sigma: np.ndarray, known: np.ndarray, right: Edges, down: Edges) -> Cuts:
-    """Find the edges between pixels that cross a step.
-
-    Args:
-        value: [rows, cols] height in units of the pixels' distance.
-        sigma: [rows, cols] its standard deviation.
-        known: [rows, cols] bool, where there is a height.
-    """
+def find_steps(
+    value: np.ndarray,  # [rows, cols] height in units of the pixels' distance
+    sigma: np.ndarray,  # [rows, cols] its standard deviation
+    known: np.ndarray,  # [rows, cols] bool, where there is a height
+    right: Edges, down: Edges,
+) -> Cuts:
+    """Find the edges between pixels that cross a step."""
     edges = right, Edges(*(plane.T for plane in down))
     kept = known & ~_mixed(value, sigma, known, edges[0]) & ~_mixed(value.T, sigma.T, known.T, edges[1]).T
     filled, filled_sigma, reached = _carry_on(value, sigma, kept, edges)

@@ -43,10 +43,7 @@ class JoinResult(NamedTuple):
 
 def join(request: JoinRequest, progress: Progress | None = None) -> JoinResult:
     """Join solved maps with a depth.
-
-    Raises:
-        RequestError: the two are not of one camera, do not overlap, or contradict each other; or the output would replace an input.
-    """
+    Raises RequestError if the two are not of one camera, do not overlap, or contradict each other; or the output would replace an input."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)

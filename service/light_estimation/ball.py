@@ -59,11 +59,8 @@ class BallView(NamedTuple):
 
 def lines_of_sight(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the origin and the direction of the line of sight of each image point.
-
-    Returns:
-        origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
-        perspective camera, and lies on z = 0 for an orthographic camera.
-    """
+    Returns origin [..., 3] and unit direction [..., 3] away from the camera, camera frame, float64. The origin is the centre of a
+    perspective camera, and lies on z = 0 for an orthographic camera."""
     x, y = camera.plane_at(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     zero = np.zeros_like(x)
     if camera.projection == "orthographic":
@@ -85,22 +82,19 @@ def ball_from_circle(camera: Camera, u: float, v: float, radius_px: float, *, ra
     return ball_from_outline(camera, outline, error_px=CIRCLE_ERROR_PX, radius_m=radius_m, z_m=z_m)
 
 
-def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, radius_m: float | None = None,
-                      z_m: float | None = None) -> Ball:
+def ball_from_outline(
+    camera: Camera,
+    outline: np.ndarray,  # [points, 2] u, v
+    *,
+    error_px: float,  # the standard error of the centre of the outline, which the result holds
+    radius_m: float | None = None,  # the radius of the ball, which determines its distance from a perspective camera
+    z_m: float | None = None,  # the camera-frame z of the centre of the ball, for an orthographic camera
+) -> Ball:
     """Fit a ball to points of its outline by linear least squares.
 
     For an orthographic camera the outline is a circle in the image plane. For a perspective camera the unit rays r through the
     outline form a cone about the direction c of the centre, r·c = cos α, and a ball of radius R lies at distance R/sin α.
-
-    Args:
-        outline: [points, 2] u, v.
-        error_px: the standard error of the centre of the outline, which the result holds.
-        radius_m: the radius of the ball, which determines its distance from a perspective camera.
-        z_m: the camera-frame z of the centre of the ball, for an orthographic camera.
-
-    Raises:
-        CalibrationError: the points lie on no circle.
-    """
+    Raises CalibrationError if the points lie on no circle."""
     origin, direction = lines_of_sight(camera, outline[:, 0], outline[:, 1])
     span = np.linalg.norm(outline - outline.mean(axis=0), axis=1)
     radius_px = float(span.mean())
@@ -118,10 +112,7 @@ def ball_from_outline(camera: Camera, outline: np.ndarray, *, error_px: float, r
 
 def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit a circle x² + y² = 2ax + 2by + c to three points or more by linear least squares (Kåsa 1976), and return centre and radius.
-
-    Raises:
-        numpy.linalg.LinAlgError: the points lie on a line.
-    """
+    Raises numpy.linalg.LinAlgError if the points lie on a line."""
     middle = points.mean(axis=0)
     shifted = points - middle
     scale = np.abs(shifted).max() or 1.0
@@ -132,13 +123,7 @@ def fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def fit_cone(rays: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit a cone to three unit rays or more by linear least squares of r·g = 1, with g the axis over the cosine of the half angle.
-
-    Returns:
-        axis [3], a unit vector, and the half angle in radians.
-
-    Raises:
-        numpy.linalg.LinAlgError: the rays lie in one plane.
-    """
+    Returns axis [3], a unit vector, and the half angle in radians. Raises numpy.linalg.LinAlgError if the rays lie in one plane."""
     middle = rays.mean(axis=0)
     middle = middle / np.linalg.norm(middle)
     basis = np.linalg.svd(np.eye(3) - np.outer(middle, middle))[0]  # two directions across the mean ray, then the ray itself
@@ -166,11 +151,8 @@ def view_ball(ball: Ball, camera: Camera) -> BallView:
 
 def intersect(ball: Ball, camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Intersect the lines of sight of image points with a ball.
-
-    Returns:
-        inside [...] bool, True where the line meets the ball; point [..., 3], the intersection nearer to the camera, 0 where there is
-        none; direction [..., 3], the unit direction of the line.
-    """
+    Returns inside [...] bool, True where the line meets the ball; point [..., 3], the intersection nearer to the camera, 0 where there is
+    none; direction [..., 3], the unit direction of the line."""
     origin, direction = lines_of_sight(camera, u, v)
     to_centre = ball.centre - origin
     along = (to_centre * direction).sum(axis=-1)
@@ -216,14 +198,8 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
     """Fit a ball to the outline of a mask by RANSAC.
 
     Three random outline points propose a circle (a cone for a perspective camera). The circle with most points within a pixel is
-    fitted to these points, so that a stand or a hole does not influence it.
-
-    Args:
-        coverage: [rows, cols], from 0 outside to 1 inside, binary or anti-aliased.
-
-    Raises:
-        CalibrationError: the mask is empty, or its outline is no circle.
-    """
+    fitted to these points, so that a stand or a hole does not influence it. `coverage`: [rows, cols], from 0 outside to 1 inside, binary or
+    anti-aliased. Raises CalibrationError if the mask is empty, or its outline is no circle."""
     outline = outline_points(coverage)
     if len(outline) < 12:
         raise CalibrationError(f"the mask of the ball has an outline of {len(outline)} points: a ball needs a few pixels")
@@ -248,14 +224,8 @@ def ball_from_mask(camera: Camera, coverage: np.ndarray, *, radius_m: float | No
 
 def refine_outline(camera: Camera, outline: np.ndarray, inside: np.ndarray) -> tuple[Ball, np.ndarray, float]:
     """Fit a ball to the points near its outline, and choose these points anew, in turn.
-
-    Args:
-        outline: [points, 2] u, v.
-        inside: [points] bool, those that a proposal takes for points of the outline.
-
-    Returns:
-        The ball without a scale, which points lie within a pixel of its outline, and the standard error of its centre in pixels.
-    """
+    `outline`: [points, 2] u, v. `inside`: [points] bool, those that a proposal takes for points of the outline. Returns the ball without a
+    scale, which points lie within a pixel of its outline, and the standard error of its centre in pixels."""
     for _ in range(3):  # the points near the fitted circle are a few more than those near the proposal
         ball = ball_from_outline(camera, outline[inside], error_px=0.0)
         distance = _distance_px(ball, camera, outline)

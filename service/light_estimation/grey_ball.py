@@ -74,18 +74,14 @@ def received(light: DistantLight | PointLight, view: BallView) -> np.ndarray:
     return cosine / distance**2
 
 
-def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight,
-                   view: BallView) -> Brightness:
+def fit_brightness(
+    radiance: np.ndarray,  # [h, w, 3] scene-linear, the box of `view`
+    saturated: np.ndarray | None,  # [h, w] bool, or None
+    light: DistantLight | PointLight,  # gives direction or position
+    view: BallView,
+) -> Brightness:
     """Measure the brightness of a light of known position, in each channel by re-weighted least squares of reading = scale · shading.
-
-    Args:
-        radiance: [h, w, 3] scene-linear, the box of `view`.
-        saturated: [h, w] bool, or None.
-        light: gives direction or position.
-
-    Raises:
-        CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated; the message does not name the frame.
-    """
+    Raises CalibrationError if fewer than MIN_PIXELS readings are lit and unsaturated; the message does not name the frame."""
     shading = received(light, view)
     incidence = view.normal @ np.array(light.direction) if isinstance(light, DistantLight) else _cosine(light, view)
     usable = _usable(saturated, view) & (incidence > MIN_COSINE)
@@ -108,15 +104,8 @@ def fit_brightness(radiance: np.ndarray, saturated: np.ndarray | None, light: Di
 def better_encoding(radiance: np.ndarray, saturated: np.ndarray | None, light: DistantLight | PointLight, view: BallView, *,
                     exposure: float, declared: str, residual: float) -> tuple[str, float] | None:
     """Return another encoding under which the shading of the ball is much more Lambertian, or None.
-
-    Args:
-        radiance, saturated, light, view: as of fit_brightness.
-        exposure: recorded values over radiance.
-        residual: of `fit_brightness` as declared.
-
-    Returns:
-        The colour space that declares the encoding, and the residual under it.
-    """
+    `radiance`, `saturated`, `light`, `view`: as of fit_brightness. `exposure`: recorded values over radiance. `residual`: of
+    `fit_brightness` as declared. Returns the colour space that declares the encoding, and the residual under it."""
     if residual < LEAST_MISFIT:
         return None
     others = [(space, fit_brightness(values, saturated, light, view).residual)
@@ -129,11 +118,8 @@ def fit_direction(radiance: np.ndarray, saturated: np.ndarray | None, view: Ball
     """Measure the direction of a distant light by re-weighted least squares of b·n = reading, b = ρ/π E l, over the lit pixels.
 
     The fit starts from the brighter pixels and then decides from its own result which pixels are lit, so that noise does not decide.
-    Parameters are as of fit_brightness.
-
-    Raises:
-        CalibrationError: fewer than MIN_PIXELS readings are lit and unsaturated, or they do not determine a direction.
-    """
+    Parameters are as of fit_brightness. Raises CalibrationError if fewer than MIN_PIXELS readings are lit and unsaturated, or they do not
+    determine a direction."""
     usable = _usable(saturated, view)
     _check_count(int(usable.sum()))
     normal, reading = view.normal[usable], radiance[usable].astype(np.float64).mean(axis=-1)
@@ -180,11 +166,8 @@ def _cauchy(residual: np.ndarray, sample: np.ndarray | None = None) -> np.ndarra
 
 def other_readings(radiance: np.ndarray, exposure: np.ndarray | float, declared: str) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the radiance that the same recorded values stand for under other encodings, with the colour space that declares each.
-
-    Args:
-        radiance: [..., rows, cols, 3], scene-linear as declared; if it is declared linear, other encodings need values up to 1.
-        exposure: recorded values over radiance; has the dimensions of `radiance` or fewer.
-    """
+    `radiance`: [..., rows, cols, 3], scene-linear as declared; if it is declared linear, other encodings need values up to 1. `exposure`:
+    recorded values over radiance; has the dimensions of `radiance` or fewer."""
     recorded = (radiance * exposure).astype(np.float32)
     if not is_linear(declared):
         yield linear_space(declared), convert(recorded, linear_space(declared), declared).astype(np.float64) / exposure

@@ -51,14 +51,13 @@ class Fit(NamedTuple):
         return MAD_TO_SIGMA * float(np.median(np.abs(self.residual[chosen]))) if chosen.any() else np.nan
 
 
-def fit_lambertian(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, rounds: int = ROUNDS) -> Fit:
-    """Fit b·l to the readings of each pixel by re-weighted least squares with Cauchy weights.
-
-    Args:
-        readings: [lights, pixels] radiance over irradiance.
-        usable: [lights, pixels] bool, True for unsaturated readings.
-        directions: [lights, 3] unit.
-    """
+def fit_lambertian(
+    readings: np.ndarray,  # [lights, pixels] radiance over irradiance
+    usable: np.ndarray,  # [lights, pixels] bool, True for unsaturated readings
+    directions: np.ndarray,  # [lights, 3] unit
+    rounds: int = ROUNDS,
+) -> Fit:
+    """Fit b·l to the readings of each pixel by re-weighted least squares with Cauchy weights."""
     lit = usable & (readings > SHADOW * bright_readings(readings, usable)) & (readings > 0)
     weight = lit.astype(np.float64)
     for _ in range(rounds):

@@ -54,17 +54,13 @@ class _UnlitError(Exception):
         self.lights = lights
 
 
-def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray) -> Intensities:
+def fit_intensities(
+    readings: np.ndarray,  # [lights, pixels, 3] scene-linear radiance of pixels of the object
+    usable: np.ndarray,  # [lights, pixels] bool, True for unsaturated readings
+    directions: np.ndarray,  # [lights, 3] unit
+) -> Intensities:
     """Measure the irradiance of every light, up to one factor in each channel.
-
-    Args:
-        readings: [lights, pixels, 3] scene-linear radiance of pixels of the object.
-        usable: [lights, pixels] bool, True for unsaturated readings.
-        directions: [lights, 3] unit.
-
-    Raises:
-        CalibrationError: there are too few lights or pixels, or the directions do not determine the brightness.
-    """
+    Raises CalibrationError if there are too few lights or pixels, or the directions do not determine the brightness."""
     result = [np.full((len(directions), 3), np.nan) for _ in range(3)]
     told, fits = _fit_channels(readings, usable, directions, "RGB")
     for part, values in enumerate(result):
@@ -74,15 +70,9 @@ def fit_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.nda
 
 def fit_grey_intensities(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, *, rounds: int = ROUNDS) -> np.ndarray:
     """Measure one brightness of every light, up to one factor; quicker than three channels.
-
-    Args:
-        readings: [lights, pixels] scene-linear grey readings of pixels of the object.
-        usable, directions: as of fit_intensities, which raises the same errors.
-        rounds: the most rounds, more than LINEAR_ROUNDS.stop.
-
-    Returns:
-        [lights] float64, mean 1 over the measured lights; NaN for a light that too few pixels show.
-    """
+    `readings`: [lights, pixels] scene-linear grey readings of pixels of the object. `usable`, `directions`: as of fit_intensities, which
+    raises the same errors. `rounds`: the most rounds, more than LINEAR_ROUNDS.stop. Returns [lights] float64, mean 1 over the measured
+    lights; NaN for a light that too few pixels show."""
     told, (fit,) = _fit_channels(readings[..., None], usable, directions, ("grey",), rounds)
     result = np.full(len(directions), np.nan)
     result[told] = fit[0]
@@ -108,10 +98,7 @@ def check_directions(directions: np.ndarray) -> None:
 
     Another brightness explains the same images when there is a 3×3 matrix G, other than a multiple of the identity, with Gᵀ l
     parallel to l for every light. l × Gᵀ l = 0 is linear in G, so its null space must have one dimension.
-
-    Raises:
-        CalibrationError: there are fewer than four lights, or all lights but one lie in one plane.
-    """
+    Raises CalibrationError if there are fewer than four lights, or all lights but one lie in one plane."""
     if len(directions) < MIN_LIGHTS:
         raise CalibrationError(f"{len(directions)} distant lights: brightness needs {MIN_LIGHTS} or more")
     x, y, z = directions.T

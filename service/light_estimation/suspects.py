@@ -27,12 +27,7 @@ class Suspect(NamedTuple):
 
 def suspects(readings: np.ndarray, directions: np.ndarray, normal: np.ndarray) -> list[Suspect]:
     """Return the lights that disagree with the others, worst first.
-
-    Args:
-        readings: [lights, pixels] grey radiance over irradiance.
-        directions: [lights, 3] float64, unit.
-        normal: [3, pixels] unit normals that were found under these lights.
-    """
+    `readings`: [lights, pixels] grey radiance over irradiance. `normal`: [3, pixels] unit normals that were found under these lights."""
     cosine = directions @ normal
     seen = (cosine > LEAST_COSINE) & (directions[:, 2:] > LEAST_TOWARDS)
     ratio = np.where(seen, readings / np.maximum(cosine, LEAST_COSINE), np.nan)

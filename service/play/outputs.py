@@ -31,11 +31,7 @@ class Output(Protocol):
         """Prepare the next frame: 512 values by the number of the universe."""
 
     def send(self) -> None:
-        """Send the prepared frame at this moment.
-
-        Raises:
-            RequestError: the network refuses it.
-        """
+        """Send the prepared frame at this moment. Raises RequestError if the network refuses it."""
 
     def end(self) -> None:
         """Tell the fixtures that nothing more comes, where the protocol can, and close."""
@@ -43,13 +39,8 @@ class Output(Protocol):
 
 def open_output(protocol: str, hosts: Mapping[int, str | None], request: PlayRequest) -> Output:
     """Return the output of a protocol; nothing is sent yet.
-
-    Args:
-        hosts: of each universe by its number; None: all that listen.
-
-    Raises:
-        RequestError: the package of the protocol is missing, or a host or the interface is not known.
-    """
+    `hosts`: of each universe by its number; None: all that listen. Raises RequestError if the package of the protocol is missing, or a host
+    or the interface is not known."""
     try:
         adapter = import_module(f"service.play.{ADAPTERS[protocol]}")
     except ModuleNotFoundError as error:
@@ -66,10 +57,7 @@ class Datagrams:
 
     def __init__(self, interface: str | None) -> None:
         """Open the socket; `interface` is the address of the network interface that sends, None: the system chooses.
-
-        Raises:
-            RequestError: this machine has no such interface.
-        """
+        Raises RequestError if this machine has no such interface."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, HOPS)
@@ -84,11 +72,7 @@ class Datagrams:
                                ) from error
 
     def sendto(self, data: bytes | bytearray, address: tuple[str, int]) -> None:
-        """Send a packet at once.
-
-        Raises:
-            RequestError: the network refuses it.
-        """
+        """Send a packet at once. Raises RequestError if the network refuses it."""
         try:
             self._socket.sendto(data, address)
         except OSError as error:
@@ -106,13 +90,7 @@ class Datagrams:
 
 def address_of(host: str, where: str) -> str:
     """Return the IPv4 address of a host.
-
-    Args:
-        where: the option or field that names it, for the message.
-
-    Raises:
-        RequestError: nobody knows the host.
-    """
+    `where`: the option or field that names it, for the message. Raises RequestError if nobody knows the host."""
     try:
         return str(socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0])
     except (OSError, UnicodeError) as error:  # of a name that no host can have

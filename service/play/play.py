@@ -41,15 +41,9 @@ def play(request: PlayRequest, stop: threading.Event | None = None) -> PlayResul
     """Play cues on a rig.
 
     The show ends with its last frame, or when `stop` is set or the program gets one of SIGNALS. In each case, and after an error, dark
-    frames are sent and the streams are terminated.
-
-    Args:
-        stop: ends the show from another thread.
-
-    Raises:
-        RequestError: an option cannot be used, a package is missing, or the network refuses.
-        StageError: the cues or the rig are wrong, or do not fit each other; names file and field.
-    """
+    frames are sent and the streams are terminated. `stop`: ends the show from another thread. Raises RequestError if an option cannot be
+    used, a package is missing, or the network refuses. Raises StageError if the cues or the rig are wrong, or do not fit each other; names
+    file and field."""
     return run(prepare(request), stop)
 
 

@@ -86,11 +86,7 @@ class _SenderSocket(SenderSocketBase):  # type: ignore[misc]
 
 
 def open_output(nodes: Sequence[Node], datagrams: Datagrams, request: PlayRequest) -> SacnOutput:
-    """Return the output of sACN.
-
-    Raises:
-        RequestError: the name of the source is too long.
-    """
+    """Return the output of sACN. Raises RequestError if the name of the source is too long."""
     if len(request.source_name.encode()) > 63:
         raise RequestError(f"--source-name {request.source_name}: takes {len(request.source_name.encode())} bytes of UTF-8: sACN has 63")
     return SacnOutput(nodes, datagrams, request)

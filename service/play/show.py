@@ -39,11 +39,8 @@ def dark_values(hosts: Mapping[str, Iterable[int]]) -> Values:
 
 def read_show(request: PlayRequest) -> Show:
     """Read the cues and the rig of a request.
-
-    Raises:
-        RequestError: the cues do not have the frame that is to be held, or the protocol a universe.
-        StageError: the cues or the rig are wrong, or do not fit each other; names file and field.
-    """
+    Raises RequestError if the cues do not have the frame that is to be held, or the protocol a universe. Raises StageError if the cues or
+    the rig are wrong, or do not fit each other; names file and field."""
     rig = read_rig(request.rig)
     cues = read_cues(request.cues, rig)
     universes = driven_universes(request.rig, with_protocol(rig, request.protocol))
@@ -77,10 +74,7 @@ def _order(cues: Cues, request: PlayRequest) -> Iterable[int]:
 
 def with_protocol(rig: Rig, protocol: Protocol | None) -> Rig:
     """Return a rig whose lamps that are driven by DMX have a protocol, or the rig itself where none is asked for.
-
-    Raises:
-        RequestError: the protocol does not have a universe.
-    """
+    Raises RequestError if the protocol does not have a universe."""
     if protocol is None:
         return rig
     first, last = UNIVERSES[protocol]
@@ -97,13 +91,8 @@ def with_protocol(rig: Rig, protocol: Protocol | None) -> Rig:
 
 def driven_universes(path: Path, rig: Rig) -> dict[tuple[str, int], Universe]:
     """Return the universes of a rig by protocol and number.
-
-    Args:
-        path: of the rig, for messages.
-
-    Raises:
-        ManifestError: a lamp cannot be driven, no lamp is driven by DMX, or a universe has several hosts.
-    """
+    `path`: of the rig, for messages. Raises ManifestError if a lamp cannot be driven, no lamp is driven by DMX, or a universe has several
+    hosts."""
     if faults := listed((f"{path}: {fault}" for fault in patch_faults(rig)), f"{path}: has further faults: mend these first"):
         raise ManifestError(*faults)
     found: dict[tuple[str, int], Universe] = {}

@@ -38,11 +38,8 @@ class RigCheck(NamedTuple):
 
 def check_rig(request: RigCheckRequest) -> RigCheck:
     """Check a rig and draw its dome where that is asked for.
-
-    Raises:
-        ManifestError: the file is wrong; names the field.
-        StorageError: the rig cannot be read or the picture not be written.
-    """
+    Raises ManifestError if the file is wrong; names the field. Raises StorageError if the rig cannot be read or the picture not be
+    written."""
     rig = read_rig(request.rig)
     used: set[tuple[Universe, int]] = {(universe, each.channel) for lamp in rig.lights for universe, each in fixed_channels(lamp)}
     for index, primary in rig.emitters:

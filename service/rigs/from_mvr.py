@@ -30,12 +30,8 @@ class MadeRig(NamedTuple):
 
 def rig_from_mvr(request: RigFromMvrRequest) -> MadeRig:
     """Write the rig of a scene and return it.
-
-    Raises:
-        RequestError: a package is missing.
-        ManifestError: the scene is wrong; names the fixture.
-        StorageError: the scene cannot be read, or the rig not be written.
-    """
+    Raises RequestError if a package is missing. Raises ManifestError if the scene is wrong; names the fixture. Raises StorageError if the
+    scene cannot be read, or the rig not be written."""
     try:
         from service.rigs.gdtf import read_mode
         from service.rigs.mvr import read_scene
@@ -103,13 +99,8 @@ def _turned(place: ArrayLike) -> tuple[float, ...]:
 
 def _address(request: RigFromMvrRequest, channels: dict[str, int], where: str) -> dict[str, Any] | None:
     """Return the address of a lamp, or None if it has none.
-
-    Args:
-        channels: of each primary, counted through all universes of the scene from 0.
-
-    Raises:
-        ManifestError: the channels lie in several universes.
-    """
+    `channels`: of each primary, counted through all universes of the scene from 0. Raises ManifestError if the channels lie in several
+    universes."""
     if not channels:
         return None
     universes = sorted({channel // CHANNELS for channel in channels.values()})

@@ -92,15 +92,8 @@ class Mode(NamedTuple):
 
 def read_mode(content: bytes, name: str | None, where: str) -> Mode:
     """Return the lamps of a DMX mode.
-
-    Args:
-        content: the GDTF file.
-        name: the mode; None: the only one.
-        where: the GDTF file in sentences.
-
-    Raises:
-        ManifestError: the file is damaged, or has no such mode.
-    """
+    `name`: the mode; None: the only one. `where`: the GDTF file in sentences. Raises ManifestError if the file is damaged, or has no such
+    mode."""
     try:
         fixture = FixtureType(BytesIO(content))
         names = [mode.name for mode in fixture.dmx_modes]

@@ -18,10 +18,7 @@ Part = TypeVar("Part", bound=Strict)
 
 def addresses(patch: PatchOptions, primaries: Sequence[str]) -> Iterator[Address]:
     """Yield the addresses of lamps of these primaries, one after another.
-
-    Raises:
-        RequestError: a universe is beyond those of the protocol, or a lamp has more channels than a universe.
-    """
+    Raises RequestError if a universe is beyond those of the protocol, or a lamp has more channels than a universe."""
     width = len(primaries) * patch.bits // 8
     if width > CHANNELS:
         raise RequestError(f"--primaries: a lamp would have {width} channels, a universe has {CHANNELS}")

@@ -43,10 +43,7 @@ class Scene(NamedTuple):
 
     def type_content(self, fixture: Fixture) -> bytes | None:
         """Return the content of the GDTF file of a fixture, or None if the scene does not hold it.
-
-        Raises:
-            ManifestError: the archive is damaged there.
-        """
+        Raises ManifestError if the archive is damaged there."""
         name = fixture.type_file or ""
         held = set(self.package.namelist())
         # names in an archive without the UTF-8 flag are read as code page 437
@@ -58,11 +55,7 @@ class Scene(NamedTuple):
 
 
 def read_scene(content: bytes, where: str) -> Scene:
-    """Return the fixtures of a scene.
-
-    Raises:
-        ManifestError: the content is no MVR scene; `where` names it.
-    """
+    """Return the fixtures of a scene. Raises ManifestError if the content is no MVR scene; `where` names it."""
     try:
         description = GeneralSceneDescription(BytesIO(content))
         fixtures = [fixture for layer in description.scene.layers

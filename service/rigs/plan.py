@@ -45,11 +45,7 @@ class PlanRow(NamedTuple):
 
 def plan_rig(request: RigPlanRequest, progress: Progress | None = None) -> list[PlanRow]:
     """Judge domes under environments, and write plan.csv and plan.png.
-
-    Raises:
-        StageError: a map or a rig cannot be used.
-        StorageError: a file cannot be read or written.
-    """
+    Raises StageError if a map or a rig cannot be used. Raises StorageError if a file cannot be read or written."""
     timings = Timings(progress)
     given_rigs = [read_rig(path) for path in request.rigs]
     domes = [("", fibonacci_sphere(count)) for count in request.lights] + [(rig.name, rig.directions) for rig in given_rigs]

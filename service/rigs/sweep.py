@@ -24,12 +24,8 @@ class SweepResult(NamedTuple):
 
 def sweep_rig(request: RigSweepRequest) -> SweepResult:
     """Write cues.json and cues.csv: a dark frame, then every primary alone at even drives up to full level.
-
-    Raises:
-        RequestError: the rig has no lamp of a name.
-        ManifestError: the rig is wrong; names the field.
-        StorageError: a file cannot be written.
-    """
+    Raises RequestError if the rig has no lamp of a name. Raises ManifestError if the rig is wrong; names the field. Raises StorageError if
+    a file cannot be written."""
     rig = read_rig(request.rig)
     unknown = sorted(set(request.lights) - {lamp.name for lamp in rig.lights})
     if unknown:

@@ -29,18 +29,14 @@ LEAST_SHARE, MOST_SHARE = 1e-4, 2.0
 """Bounds of the share: above the second, motion and not noise differs between neighbours."""
 
 
-def noise_share(difference: np.ndarray, variance: np.ndarray, both: np.ndarray, freedom: int) -> np.ndarray:
+def noise_share(
+    difference: np.ndarray,  # [rows, cols, k] of two steps
+    variance: np.ndarray,  # [rows, cols] of the difference as the steps declare it: the mean of its squared length
+    both: np.ndarray,  # [rows, cols] bool, where both steps have an estimate
+    freedom: int,  # in how many directions the difference can point
+) -> np.ndarray:
     """Return which part of a variance is noise that differs from step to step.
-
-    Args:
-        difference: [rows, cols, k] of two steps.
-        variance: [rows, cols] of the difference as the steps declare it: the mean of its squared length.
-        both: [rows, cols] bool, where both steps have an estimate.
-        freedom: in how many directions the difference can point.
-
-    Returns:
-        [rows, cols] float32, LEAST_SHARE to MOST_SHARE; 1 where too few pixels tell.
-    """
+    Returns [rows, cols] float32, LEAST_SHARE to MOST_SHARE; 1 where too few pixels tell."""
     share = np.ones(both.shape, np.float32)
     inner = np.zeros_like(both)
     inner[1:-1, 1:-1] = both[1:-1, 1:-1] & both[:-2, 1:-1] & both[2:, 1:-1] & both[1:-1, :-2] & both[1:-1, 2:]
@@ -103,14 +99,13 @@ class Track:
         return np.sqrt(self.noise + self.constant**2)
 
 
-def begin(values: np.ndarray, sigma: np.ndarray, share: np.ndarray, valid: np.ndarray) -> Track:
-    """Return the track of the estimates of one step.
-
-    Args:
-        values: [rows, cols, k].
-        sigma: [rows, cols], standard deviation: root of the mean squared length of the error.
-        share: [rows, cols] part of its square that is noise, which may be above 1.
-    """
+def begin(
+    values: np.ndarray,  # [rows, cols, k]
+    sigma: np.ndarray,  # [rows, cols], standard deviation: root of the mean squared length of the error
+    share: np.ndarray,  # [rows, cols] part of its square that is noise, which may be above 1
+    valid: np.ndarray,
+) -> Track:
+    """Return the track of the estimates of one step."""
     noise = np.where(valid, share * sigma**2, 0).astype(np.float32)
     constant = np.where(valid, np.sqrt(np.maximum(1 - share, 0)) * sigma, 0).astype(np.float32)
     return Track(np.where(valid[..., None], values, 0).astype(np.float32), noise, constant, valid.astype(np.int32))

@@ -54,14 +54,9 @@ class _Step(NamedTuple):
 
 def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> SequenceResult:
     """Solve every capture of a sequence, and join what agrees from step to step.
-
-    Args:
-        request: its `capture` is the sequence, its `out` the folder for a folder of each step.
-
-    Raises:
-        RequestError: lights are to be found from the images of each step, or results would lie in a capture.
-        StageError, KernelError: bad input; the steps before are whole.
-    """
+    `request`: its `capture` is the sequence, its `out` the folder for a folder of each step. Raises RequestError if lights are to be found
+    from the images of each step, or results would lie in a capture. Raises StageError or KernelError: bad input; the steps before are
+    whole."""
     lights = shared_lights(request)
     sequence, manifests = _open(request)
     near = any(isinstance(frame.light, PointLight) for manifest in manifests for frame in manifest.frames)
@@ -83,10 +78,7 @@ def solve_sequence(request: SolveRequest, progress: Progress | None = None) -> S
 
 def depth_sequence(request: DepthRequest, progress: Progress | None = None) -> SequenceResult:
     """Measure the depth of every capture of a sequence, and join what agrees from step to step; as solve_sequence.
-
-    Raises:
-        ResultError: a step is decoded and cannot be triangulated.
-    """
+    Raises ResultError if a step is decoded and cannot be triangulated."""
     sequence, _ = _open(request)
     joiner = DepthJoiner()
 

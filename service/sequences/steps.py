@@ -133,13 +133,8 @@ def request_of_step(request: AnyRequest, step: TimeStep) -> AnyRequest:
 def solve_alone(request: SolveRequest, step: TimeStep, progress: Progress, lights: LightsOverTime,
                 sharing: SharedSolve | None = None) -> tuple[SolveRequest, bool]:
     """Solve one step of a sequence unless it is done.
-
-    Args:
-        lights: what the steps before have found; takes what this one finds.
-
-    Returns:
-        The request of the step, and whether it was done before.
-    """
+    `lights`: what the steps before have found; takes what this one finds. Returns the request of the step, and whether it was done
+    before."""
     there = request_of_step(request, step)
 
     def work() -> dict[str, Any]:

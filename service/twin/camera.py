@@ -61,11 +61,7 @@ class TwinPicture:
     """Pictures of a capture under the lamps of a rig; each lamp lights as the captured light does that stands nearest to it."""
 
     def __init__(self, rig: Rig, request: TwinRequest, timings: Timings) -> None:
-        """Read the images of the capture.
-
-        Raises:
-            StageError: bad input; names file and field.
-        """
+        """Read the images of the capture. Raises StageError: bad input; names file and field."""
         timings.stage("open", 1)
         device = devices.resolve(request.device)
         capture = Capture.open(request.capture, request.pixels)
@@ -96,13 +92,7 @@ class TwinPicture:
 
     def write(self, path: Path, levels: np.ndarray, *, most_rows: int | None = None) -> None:
         """Write the picture at levels as .exr, scene-linear, or .png, as it is displayed.
-
-        Args:
-            most_rows: the height to which a higher PNG is reduced; None: it is not.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        `most_rows`: the height to which a higher PNG is reduced; None: it is not. Raises StorageError if it cannot be written."""
         radiance = self.radiance(levels)
         if path.suffix.lower() == ".exr":
             exr.write(path, {name: radiance[..., c] for c, name in enumerate("RGB")}, color_space=self.space, metadata={})
@@ -162,11 +152,7 @@ class TwinCamera:
         will come again has the same noise as long as it is there.
 
         The virtual camera looks at the size of its card's file when it is opened, and reads so many bytes at each release; what follows
-        the end of a JPEG is ignored.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        the end of a JPEG is ignored. Raises StorageError if it cannot be written."""
         path, lit, levels = self._folder / CARD_FILE, 0, np.zeros(0)
         while not stop.is_set():
             frame = self._listener.last
@@ -239,11 +225,7 @@ def card_kept(camera: TwinCamera | None) -> Iterator[None]:
 
 
 def fault_spans(given: tuple[str, ...]) -> list[FaultSpan]:
-    """Return the faults of texts such as dead@17, or ambient@17- from release 17 on.
-
-    Raises:
-        RequestError: a text is otherwise.
-    """
+    """Return the faults of texts such as dead@17, or ambient@17- from release 17 on. Raises RequestError if a text is otherwise."""
     found = []
     for text in given:
         match = re.fullmatch(r"(\w+)@(\d+)(-(\d*))?", text)

@@ -116,10 +116,7 @@ class Fixtures:
         """Take a packet; return True if a whole frame is shown by it.
 
         A frame is whole at a synchronisation, or, of universes that are not synchronised, when each has got new values.
-
-        Args:
-            now: the time, s, of any clock.
-        """
+        `now`: the time, s, of any clock."""
         if isinstance(packet, SyncPacket):
             return self._synchronise(packet, now)
         universe = packet.protocol, packet.universe

@@ -36,15 +36,9 @@ class Listener:
 
     def __init__(self, universes: Collection[UniverseId], interface: str, *, keep: bool, most: int | None = None) -> None:
         """Bind the ports.
-
-        Args:
-            interface: address to listen on.
-            keep: whether all frames are kept, and not the last one alone.
-            most: the number of frames after which nothing is received any more; None: there is no end.
-
-        Raises:
-            RequestError: a port is in use, the address is not one of this machine, or the network refuses multicast.
-        """
+        `keep`: whether all frames are kept, and not the last one alone. `most`: the number of frames after which nothing is received any
+        more; None: there is no end. Raises RequestError if a port is in use, the address is not one of this machine, or the network refuses
+        multicast."""
         self.fixtures = Fixtures(universes)
         self.kept: list[ReceivedFrame] = []
         self.last = ReceivedFrame(0, 0.0, dict(self.fixtures.shown))

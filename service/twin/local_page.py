@@ -10,15 +10,7 @@ HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
 
 
 def page_socket(port: int, option: str) -> socket.socket:
-    """Return a socket that listens on the loopback.
-
-    Args:
-        port: 0: any free one.
-        option: that gave the port, for the message.
-
-    Raises:
-        RequestError: the port cannot be used.
-    """
+    """Return a socket that listens on the loopback. `port`: 0: any free one. Raises RequestError if the port cannot be used."""
     try:
         return socket.create_server(("127.0.0.1", port))
     except OSError as error:

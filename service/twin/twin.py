@@ -63,11 +63,7 @@ class Twin(NamedTuple):
 
 def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
     """Read the rig and the images of the capture.
-
-    Raises:
-        RequestError: a suffix is unknown.
-        StageError, KernelError: bad input; names file and field.
-    """
+    Raises RequestError if a suffix is unknown. Raises StageError or KernelError: bad input; names file and field."""
     if request.snapshot is not None and request.snapshot.suffix.lower() not in PICTURES:
         raise RequestError(f"--snapshot {request.snapshot}: end the name in {' or '.join(PICTURES)}")
     if request.pictures is not None and (request.snapshot or request.frames or request.after):
@@ -86,14 +82,8 @@ def open_twin(request: TwinRequest, progress: Progress | None = None) -> Twin:
 
 def rehearse(twin: Twin, request: TwinRequest, listening: Callable[[str | None], None]) -> TwinResult:
     """Receive what is sent to a rig until the request's end or an interruption, and show or write it.
-
-    Args:
-        listening: called when the twin listens, with the address of its page, if there is one.
-
-    Raises:
-        RequestError: a port is in use, or no frame came.
-        StorageError: a file cannot be written.
-    """
+    `listening`: called when the twin listens, with the address of its page, if there is one. Raises RequestError if a port is in use, or no
+    frame came. Raises StorageError if a file cannot be written."""
     rig, universes, picture, player = twin
     if request.pictures is not None:
         with storage("write", request.pictures):

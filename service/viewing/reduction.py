@@ -111,11 +111,7 @@ def tiling_of(factor: np.ndarray, *, lights: int, terms: int) -> Tiling:
 
 def tile_rows(stack: Stack, factor: np.ndarray, tiling: Tiling, step: int, timings: Timings, stage: str) -> Iterator[TileRow]:
     """Yield the captured images row by row of tiles, without rows that hold nothing of the object.
-
-    Args:
-        factor: [rows, cols] of the whole image, which the images are multiplied with.
-        tiling: of the image that is reduced by the step.
-    """
+    `factor`: [rows, cols] of the whole image, which the images are multiplied with. `tiling`: of the image that is reduced by the step."""
     lights, side, cols = stack.light_count, tiling.side, factor.shape[1]
     across = tiling.index.shape[1]
     bands = list(row_bands(stack, factor.shape, side * step, 4 * 3 * 4 * lights))

@@ -54,11 +54,8 @@ class PixelGrid(NamedTuple):
 def write_samples(stack: Stack, shape: tuple[int, int], found: ResultLayers, lights: DistantLights | PlacedLights | None, file: BlockFile,
                   *, doubts: list[str], device: str, timings: Timings) -> dict[str, Any]:
     """Write the samples of a solve, and return what view.json says of them.
-
-    Args:
-        lights: that the maps were solved with; None: they are of a kind that the model does not have, and there is no model.
-        doubts: gets a sentence where nothing tells whether the maps were solved from these images.
-    """
+    `lights`: that the maps were solved with; None: they are of a kind that the model does not have, and there is no model. `doubts`: gets a
+    sentence where nothing tells whether the maps were solved from these images."""
     if (doubt := other_inputs(found.provenance, stack.key, found.path)) is not None:
         doubts.append(doubt)
     count, (rows, cols) = stack.light_count, shape

@@ -57,11 +57,7 @@ def transfer_of(lights: DistantLights) -> Transfer:
 
 def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -> np.ndarray:
     """Return the weights [kinds, 3, lights] float32 of the captured images for white light of several kinds.
-
-    Args:
-        samples: [kinds, n, 3] unit vectors to each.
-        energy: [kinds, n] irradiance of each sample.
-    """
+    `samples`: [kinds, n, 3] unit vectors to each. `energy`: [kinds, n] irradiance of each sample."""
     found = np.zeros((len(samples), 3, len(lights.direction)), dtype=np.float32)
     for begin in range(0, len(samples), COLS):
         part = slice(begin, begin + COLS)
@@ -74,10 +70,8 @@ def weights_of(samples: np.ndarray, energy: np.ndarray, lights: DistantLights) -
 
 def grid_directions(parts: int, *, unit: bool = True) -> np.ndarray:
     """Return the directions of the grid, row by row, [ROWS · COLS, parts², 3] float64.
-
-    Args:
-        parts: samples down and across a pixel; 1: its middle.
-        unit: make them unit vectors; else their length is sin πv, in proportion to the solid angle of a sample.
+    `parts`: samples down and across a pixel; 1: its middle. `unit`: make them unit vectors; else their length is sin πv, in proportion to
+    the solid angle of a sample.
 
     Convention:
         +y at the top, +z in the middle of the grid, +x a quarter from the left edge.
@@ -95,11 +89,7 @@ class HeldOutLights:
 
     def __init__(self, stack: Stack, lights: DistantLights, transfer: Transfer, covered: np.ndarray) -> None:
         """Choose the lights, and an exposure for each.
-
-        Args:
-            transfer: the table of directions of the lights.
-            covered: [pixels padded] bool, pixels of the object.
-        """
+        `transfer`: the table of directions of the lights. `covered`: [pixels padded] bool, pixels of the object."""
         sky = np.einsum("dcl,d->cl", transfer.weights, transfer.solid_angle / transfer.solid_angle.sum())
         keys = key_weights(lights)
         self.weights = np.concatenate([keys, sky[None]]).astype(np.float32)  # [pictures, 3, lights]

@@ -104,13 +104,9 @@ class ViewResult(NamedTuple):
 
 def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     """Write what a browser needs to show a capture and its maps.
-
-    Raises:
-        RequestError: a file of the view would replace one of the capture.
-        ResultError: the maps are missing, incomplete or of another camera than the capture.
-        StageError: the capture cannot be opened; a frame that cannot be used is among the findings instead.
-        StorageError: a file cannot be written; view.json is there only if everything is.
-    """
+    Raises RequestError if a file of the view would replace one of the capture. Raises ResultError if the maps are missing, incomplete or of
+    another camera than the capture. Raises StageError if the capture cannot be opened; a frame that cannot be used is among the findings
+    instead. Raises StorageError if a file cannot be written; view.json is there only if everything is."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)

@@ -104,12 +104,9 @@ class Camera(Strict):
 
     def plane_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the point at which the line of sight of each pixel crosses the reference plane of the camera.
-
-        Returns:
-            x to the right and y upwards, each [rows, cols] float64. For a perspective camera the plane is z = -1, so that
-            (x, y, -1) points along the line of sight. For an orthographic camera x and y are the camera-frame coordinates of the
-            line of sight, in metres, or in pixels when the capture has no scale.
-        """
+        Returns x to the right and y upwards, each [rows, cols] float64. For a perspective camera the plane is z = -1, so that (x, y, -1)
+        points along the line of sight. For an orthographic camera x and y are the camera-frame coordinates of the line of sight, in metres,
+        or in pixels when the capture has no scale."""
         return self.plane_at(*pixel_centres(self.width, self.height))
 
     def plane_views(self, first_row: int = 0, rows: int | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -143,13 +140,8 @@ class Camera(Strict):
 
     def image_coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the image coordinates at which the camera sees points: the inverse of `plane_at`.
-
-        Args:
-            points: [..., 3] camera frame, in front of a perspective camera; metres, or pixels when the capture has no scale.
-
-        Returns:
-            u and v, each [...] float64.
-        """
+        `points`: [..., 3] camera frame, in front of a perspective camera; metres, or pixels when the capture has no scale. Returns u and v,
+        each [...] float64."""
         x, y, z = np.moveaxis(points.astype(np.float64), -1, 0)
         cu, cv = self.principal_point
         if self.projection == "orthographic":
@@ -163,25 +155,13 @@ class Camera(Strict):
 
     def points(self, height: np.ndarray, first_row: int = 0) -> np.ndarray:
         """Return the camera-frame points of a height map.
-
-        Args:
-            height: [rows, cols] camera-frame z, negative in front of a perspective camera, of the whole image or of some of its rows.
-
-        Returns:
-            [rows, cols, 3] float32, in the unit of `height`.
-        """
+        `height`: [rows, cols] camera-frame z, negative in front of a perspective camera, of the whole image or of some of its rows. Returns
+        [rows, cols, 3] float32, in the unit of `height`."""
         return self._raised(*self.plane_views(first_row, len(height)), height)
 
     def points_at(self, pixels: np.ndarray, height: np.ndarray) -> np.ndarray:
         """Return the camera-frame points of single pixels, as `points` does.
-
-        Args:
-            pixels: [n] row-major positions in the image.
-            height: [n] camera-frame z.
-
-        Returns:
-            [n, 3] float32, in the unit of `height`.
-        """
+        `pixels`: [n] row-major positions in the image. `height`: [n] camera-frame z. Returns [n, 3] float32, in the unit of `height`."""
         row, col = np.divmod(pixels, self.width)
         return self._raised(*self.plane_at(col + 0.5, row + 0.5), height)
 

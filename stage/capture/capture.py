@@ -64,15 +64,9 @@ class Capture:
     @classmethod
     def open(cls, path: str | Path, pixels: PixelChoices = AS_RECORDED) -> "Capture":
         """Open a capture, and check its manifest and the header of every file.
-
-        Args:
-            path: the folder, or the capture.json in it.
-            pixels: how the pixels of the images are read; with a crop, the camera and all images are those of the part.
-
-        Raises:
-            ManifestError: the manifest is wrong, or the crop leads out of the images; the message names the field.
-            ImageError: a file has the wrong size or is no image; the message names the file.
-        """
+        `path`: the folder, or the capture.json in it. `pixels`: how the pixels of the images are read; with a crop, the camera and all
+        images are those of the part. Raises ManifestError if the manifest is wrong, or the crop leads out of the images; the message names
+        the field. Raises ImageError if a file has the wrong size or is no image; the message names the file."""
         given = Path(path)
         folder = given.parent if given.name == FILE_NAME else given
         with storage("read", folder):
@@ -102,10 +96,7 @@ class Capture:
 
     def file(self, name: str) -> Path:
         """Return the path of a file that the manifest names, which always lies inside the folder.
-
-        Raises:
-            ManifestError: the name leads out of the folder.
-        """
+        Raises ManifestError if the name leads out of the folder."""
         if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
             raise ManifestError(f"{self.folder / FILE_NAME}: {name} leads out of the capture's folder")
         return self.folder / name
@@ -158,16 +149,9 @@ class Capture:
 
     def recorded(self, name: str, *, keep_half: bool = False) -> np.ndarray:
         """Read the recorded values of an image that holds radiance, in the part of it that the capture is about.
-
-        Args:
-            keep_half: True to leave half values as the file has them, too.
-
-        Returns:
-            [rows, cols, 3] uint8 or uint16 as the file has them, or float32; values below 0 are noise.
-
-        Raises:
-            ImageError: a value is NaN, infinite, or negative beyond the noise of the image and not to be clipped.
-        """
+        `keep_half`: True to leave half values as the file has them, too. Returns [rows, cols, 3] uint8 or uint16 as the file has them, or
+        float32; values below 0 are noise. Raises ImageError if a value is NaN, infinite, or negative beyond the noise of the image and not
+        to be clipped."""
         return self.part_of(self.recorded_whole(name, keep_half=keep_half))
 
     def recorded_whole(self, name: str, *, keep_half: bool = False) -> np.ndarray:

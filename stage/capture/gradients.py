@@ -45,11 +45,8 @@ def gradient_frames(capture: Capture) -> GradientFrames:
 
     When there are cross-polarised frames they are the diffuse frames, and parallel-polarised frames add the specular light;
     otherwise the unpolarised frames are used. A `full` frame, which names no polariser, counts as an unpolarised gradient frame of
-    axis `full`.
-
-    Raises:
-        ManifestError: there are no gradient frames, or they do not determine a normal; the message names what is missing.
-    """
+    axis `full`. Raises ManifestError if there are no gradient frames, or they do not determine a normal; the message names what is
+    missing."""
     where = capture.folder / FILE_NAME
     if not has_gradients(capture):
         raise ManifestError(f"{where}: frames: none is lit by a gradient light, which --method gradient needs")

@@ -41,11 +41,8 @@ def lie_in_one_plane(direction: np.ndarray) -> bool:
 
 def extended_lights(capture: Capture) -> ExtendedLights:
     """Return the lights of the stack of a capture, all of which must be extended or distant.
-
-    Raises:
-        ManifestError: a light of another type, a source whose colour changes over its extent, fewer than three lights, light from
-            one plane only, or a channel without light; the message names the frame.
-    """
+    Raises ManifestError: a light of another type, a source whose colour changes over its extent, fewer than three lights, light from one
+    plane only, or a channel without light; the message names the frame."""
     where = capture.folder / FILE_NAME
     direction, solid_angle, share, irradiance = [], [], [], []
     for index, frame in enumerate(capture.manifest.frames):
@@ -88,10 +85,7 @@ def extended_lights(capture: Capture) -> ExtendedLights:
 
 def distant_lights(capture: Capture) -> DistantLights:
     """Return the lights of the stack of a capture, all of which must be distant.
-
-    Raises:
-        ManifestError: a light is not distant, or there is none; the message names the frame.
-    """
+    Raises ManifestError if a light is not distant, or there is none; the message names the frame."""
     where = capture.folder / FILE_NAME
     for index, frame in enumerate(capture.manifest.frames):
         if isinstance(frame.light, SOURCES) and not isinstance(frame.light, DistantLight):
@@ -114,14 +108,9 @@ def has_placeholders(capture: Capture) -> bool:
 
 def check_solvable(capture: Capture) -> DistantLights | PlacedLights | ExtendedLights:
     """Check that a normal can be solved from a capture, and return its lights.
-
-    Returns:
-        ExtendedLights when a light is extended, PlacedLights when a light is a point light, otherwise DistantLights.
-
-    Raises:
-        ManifestError: there are fewer than three lights, all lights lie in one plane through the centre of the object, a point
-            light stands at an impossible position, the image has one pixel, a channel has no light, or the lights are placeholders.
-    """
+    Returns ExtendedLights when a light is extended, PlacedLights when a light is a point light, otherwise DistantLights. Raises
+    ManifestError if there are fewer than three lights, all lights lie in one plane through the centre of the object, a point light stands
+    at an impossible position, the image has one pixel, a channel has no light, or the lights are placeholders."""
     where = capture.folder / FILE_NAME
     if has_placeholders(capture):
         raise ManifestError(f"{where}: frames[].light: all are the placeholder, direction [0, 0, 1] and irradiance [1, 1, 1]: "

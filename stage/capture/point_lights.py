@@ -77,11 +77,8 @@ def distance_is_missing(capture: Capture) -> bool:
 
 def place_lights(capture: Capture) -> PlacedLights:
     """Return the lights of the stack of a capture, all of which must be distant or point lights.
-
-    Raises:
-        ManifestError: a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
-            object.
-    """
+    Raises ManifestError if a light is of another type, there is none, the camera has no scale, or lights stand inside or behind the
+    object."""
     where = capture.folder / FILE_NAME
     frames, place, strength, lobe = light_places(capture)
     camera, mask = capture.camera, capture.mask()

@@ -42,23 +42,15 @@ class Projector(UncalibratedProjector):
 
     def projector_from_camera(self) -> np.ndarray:
         """Return the transform from the camera frame to the frame of the projector with OpenCV's axes, x right, y down, z forward.
-
-        Returns:
-            [3, 4] float64: point_device = matrix @ (x, y, z, 1).
-        """
+        Returns [3, 4] float64: point_device = matrix @ (x, y, z, 1)."""
         pose = np.array(self.camera_from_projector, dtype=np.float64)
         rotation = OPENCV_FROM_CAMERA @ pose[:3, :3].T
         return np.column_stack([rotation, -rotation @ pose[:3, 3]])
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project camera-frame points into the image of the projector.
-
-        Args:
-            points: [..., 3] metres, camera frame.
-
-        Returns:
-            [..., 2] continuous column and row, and [...] bool: True for points in front of the projector.
-        """
+        `points`: [..., 3] metres, camera frame. Returns [..., 2] continuous column and row, and [...] bool: True for points in front of the
+        projector."""
         matrix = self.projector_from_camera()
         point_device = points @ matrix[:, :3].T + matrix[:, 3]
         ahead = point_device[..., 2] > 0

@@ -109,11 +109,7 @@ def capture_folders(folder: Path) -> list[Path]:
 
 def read_sequence(path: Path, *, frames_per_second: float | None = None) -> Sequence:
     """Return the steps of a sequence of captures or results.
-
-    Args:
-        path: a sequence.json, its folder, or a folder of captures.
-        frames_per_second: of a folder of captures; a file says its own.
-    """
+    `path`: a sequence.json, its folder, or a folder of captures. `frames_per_second`: of a folder of captures; a file says its own."""
     file = path if path.is_file() else path / SEQUENCE_FILE
     if not file.is_file():
         rate = frames_per_second or FRAME_RATE

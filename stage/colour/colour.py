@@ -25,14 +25,8 @@ GREY_WEIGHTS = (0.299, 0.587, 0.114)
 
 def linearise(pixels: np.ndarray, space: str) -> np.ndarray:
     """Convert recorded values to scene-linear values, in the space that `linear_space` names.
-
-    Args:
-        pixels: [rows, cols, channels], encoded in `space`: float32, or uint8 or uint16 as `images.read_recorded` returns them.
-        space: a ColorSpaceName.
-
-    Returns:
-        [rows, cols, channels] float32; `pixels` without a copy when they are float32 and `space` is linear already.
-    """
+    `pixels`: [rows, cols, channels], encoded in `space`: float32, or uint8 or uint16 as `images.read_recorded` returns them. `space`: a
+    ColorSpaceName. Returns [rows, cols, channels] float32; `pixels` without a copy when they are float32 and `space` is linear already."""
     apart = channels_apart(space)
     if pixels.dtype.kind == "u":
         if not apart:
@@ -68,16 +62,9 @@ def _linear_of_integers(space: str, configuration: str) -> tuple[np.ndarray, np.
 
 def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
     """Convert pixels from one colour space to another.
-
-    Args:
-        pixels: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue.
-
-    Returns:
-        Float32 in the shape of `pixels`; of one channel, the red channel of the converted grey.
-
-    Raises:
-        ColourError: the configuration lacks a space, or cannot convert.
-    """
+    `pixels`: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue. Returns Float32 in the
+    shape of `pixels`; of one channel, the red channel of the converted grey. Raises ColourError if the configuration lacks a space, or
+    cannot convert."""
     if source == target:
         return pixels
     grey = pixels.shape[2] == 1
@@ -92,14 +79,7 @@ def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
 
 def through_view(pixels: np.ndarray, space: str, review: Review) -> np.ndarray:
     """Convert pixels to those of a display, through a view.
-
-    Args:
-        pixels: [rows, cols, 3] float32, encoded in `space`.
-        review: the view and the looks.
-
-    Returns:
-        [rows, cols, 3] float32, 0…1.
-    """
+    `pixels`: [rows, cols, 3] float32, encoded in `space`. `review`: the view and the looks. Returns [rows, cols, 3] float32, 0…1."""
     found = current()
     chosen, look = found.view(review.view), "" if review.look is None else found.checked_look(review.look)
     if chosen is None:
@@ -115,10 +95,7 @@ def through_view(pixels: np.ndarray, space: str, review: Review) -> np.ndarray:
 
 def rgb_matrix(source: str, target: str) -> np.ndarray:
     """Return the matrix that converts column vectors from one scene-linear space to another.
-
-    Returns:
-        [3, 3] float32: rgb in `target` = matrix @ rgb in `source`.
-    """
+    Returns [3, 3] float32: rgb in `target` = matrix @ rgb in `source`."""
     primaries = np.eye(3, dtype=np.float32)[None]  # one row of three pixels: red, green and blue
     return np.ascontiguousarray(convert(primaries, source, target)[0].T)
 

@@ -55,10 +55,7 @@ def is_linear(space: str) -> bool:
 
 def linear_space(space: str) -> str:
     """Return the scene-linear space that belongs to a space, the working space of a capture: that with its primaries where there is one.
-
-    Raises:
-        ColourError: the configuration does not have the space.
-    """
+    Raises ColourError if the configuration does not have the space."""
     return _linear_of(space)[0]
 
 

@@ -62,10 +62,7 @@ class Configuration(NamedTuple):
 
     def checked(self, name: str) -> str:
         """Return the space with a name, an alias or a role.
-
-        Raises:
-            ColourError: there is none, or it holds data; the message proposes names.
-        """
+        Raises ColourError if there is none, or it holds data; the message proposes names."""
         found = self.find(name)
         if found is None:
             raise ColourError(f"{name} is no colour space of the OpenColorIO configuration {self.name}: {self._proposal(name)}")
@@ -85,10 +82,7 @@ class Configuration(NamedTuple):
 
     def steps(self, source: str, target: str) -> list[tuple[str, str, str]]:
         """Return the conversions that lead from one space to another: a configuration's location and two names of it each.
-
-        Raises:
-            ColourError: a space is missing, or the configuration does not say how it is joined with others.
-        """
+        Raises ColourError if a space is missing, or the configuration does not say how it is joined with others."""
         missing = [name for name in (source, target) if self.find(name) is None]
         for name in missing:
             if name not in NAMES:
@@ -111,13 +105,8 @@ class Configuration(NamedTuple):
 
     def view(self, wanted: str | None) -> tuple[str, str] | None:
         """Return a display and a view of it; None: the configuration has no views.
-
-        Args:
-            wanted: DISPLAY/VIEW, or a view, of the first display that has it; None: STANDARD_VIEW, else the default one.
-
-        Raises:
-            ColourError: there is no such view; the message proposes others.
-        """
+        `wanted`: DISPLAY/VIEW, or a view, of the first display that has it; None: STANDARD_VIEW, else the default one. Raises ColourError
+        if there is no such view; the message proposes others."""
         pairs = [(display, view) for display, views in self.views.items() for view in views]
         if wanted is None:
             return STANDARD_VIEW if STANDARD_VIEW in pairs else next(iter(pairs), None)
@@ -130,10 +119,7 @@ class Configuration(NamedTuple):
 
     def checked_look(self, wanted: str) -> str:
         """Return looks in OpenColorIO's syntax: names with commas between, each with + or - before it, and | between alternatives.
-
-        Raises:
-            ColourError: there is no such look; the message proposes others.
-        """
+        Raises ColourError if there is no such look; the message proposes others."""
         names = {look.lower(): look for look in self.looks}
         for look in (part.strip().lstrip("+-").strip() for part in re.split(r"[,:|]", wanted)):
             if look.lower() not in names:
@@ -161,21 +147,13 @@ class Configuration(NamedTuple):
 
 
 def current() -> Configuration:
-    """Return the configuration of this process.
-
-    Raises:
-        ColourError: it cannot be read.
-    """
+    """Return the configuration of this process. Raises ColourError if it cannot be read."""
     return configuration(location())
 
 
 @contextmanager
 def used(place: str | None) -> Iterator[None]:
-    """Use a configuration within a context; None: that of $OCIO, which is checked too.
-
-    Raises:
-        ColourError: it cannot be read.
-    """
+    """Use a configuration within a context; None: that of $OCIO, which is checked too. Raises ColourError if it cannot be read."""
     before = os.environ.get(VARIABLE)
     if place is not None:
         os.environ[VARIABLE] = place
@@ -191,10 +169,7 @@ def used(place: str | None) -> Iterator[None]:
 
 def configuration(place: str) -> Configuration:
     """Read a configuration; one that was read before and whose file has not changed is not read again.
-
-    Raises:
-        ColourError: it cannot be read; the message names it.
-    """
+    Raises ColourError if it cannot be read; the message names it."""
     if place.startswith("ocio://"):
         return _read(place, 0)
     try:
@@ -206,13 +181,8 @@ def configuration(place: str) -> Configuration:
 @cache
 def linear_of(place: str, space: str) -> tuple[str, bool]:
     """Return the linear space that belongs to a space of a configuration: that with the same primaries, else the role scene_linear.
-
-    Returns:
-        A name that files may declare, and whether the conversion leaves the channels apart.
-
-    Raises:
-        ColourError: the configuration has no such space.
-    """
+    Returns a name that files may declare, and whether the conversion leaves the channels apart. Raises ColourError if the configuration has
+    no such space."""
     found = configuration(place)
     name = found.checked(space)
     if name in found.linear:

@@ -13,11 +13,7 @@ SUFFIXES = {".exr", ".hdr"}
 
 
 def check_environment(path: Path) -> None:
-    """Check the header of an environment map.
-
-    Raises:
-        ImageError: not EXR or HDR, or not twice as wide as high.
-    """
+    """Check the header of an environment map. Raises ImageError: not EXR or HDR, or not twice as wide as high."""
     if path.suffix.lower() not in SUFFIXES:
         raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
     header = images.read_header(path)
@@ -27,17 +23,10 @@ def check_environment(path: Path) -> None:
 
 def read_environment(path: Path, space: str, *, clipped: dict[str, int] | None = None) -> np.ndarray:
     """Read an environment map in a colour space; HDR files are Rec.709, and so are EXR files that declare no other space.
-
-    Args:
-        path: lat-long .exr or .hdr.
-        space: the scene-linear colour space of the result.
-        clipped: is given the number of pixels with values that are negative beyond the noise of the map and set to 0, by its file name;
-            None refuses such maps.
-
-    Returns:
-        [rows, cols, 3] float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has
-        a channel that is 0.
-    """
+    `path`: lat-long .exr or .hdr. `space`: the scene-linear colour space of the result. `clipped`: is given the number of pixels with
+    values that are negative beyond the noise of the map and set to 0, by its file name; None refuses such maps. Returns [rows, cols, 3]
+    float32, scene-linear, none of them negative: noise below zero is 0, and a colour outside the gamut of `space` has a channel that is
+    0."""
     pixels = images.read_pixels(path).astype(np.float32)
     if clipped is None:
         check_radiance(path, pixels, remedy=CLIP_NEGATIVE)

@@ -43,17 +43,15 @@ CLIP_NEGATIVE = "--clip-negative sets such values to 0"
 """The advice in error messages of commands that have this option."""
 
 
-def check_radiance(path: str | Path, pixels: np.ndarray, *, remedy: str = "mend the image", stray: float = 0.0) -> None:
+def check_radiance(
+    path: str | Path,
+    pixels: np.ndarray,  # [rows, cols, channels] floating point
+    *,
+    remedy: str = "mend the image",  # what the message about negative values says can be done
+    stray: float = 0.0,  # the part of the pixels that may be below the noise, such as RAW_STRAY
+) -> None:
     """Check that no value is NaN, infinite, or further below zero than the noise of the image.
-
-    Args:
-        pixels: [rows, cols, channels] floating point.
-        remedy: what the message about negative values says can be done.
-        stray: the part of the pixels that may be below the noise, such as RAW_STRAY.
-
-    Raises:
-        ImageError: some values are; the message counts the pixels and names the first.
-    """
+    Raises ImageError if some values are; the message counts the pixels and names the first."""
     if _is_plain_half(pixels):
         return
     check_finite(path, pixels)
@@ -77,13 +75,8 @@ def check_finite(path: str | Path, pixels: np.ndarray) -> None:
 
 def clip_negative(pixels: np.ndarray) -> tuple[np.ndarray, int]:
     """Set the values to zero that are further below it than the noise of the image.
-
-    Args:
-        pixels: [rows, cols, channels] floating point, finite.
-
-    Returns:
-        The image, a copy if a value changes, and the number of pixels with such a value.
-    """
+    `pixels`: [rows, cols, channels] floating point, finite. Returns the image, a copy if a value changes, and the number of pixels with
+    such a value."""
     negative = pixels < noise_floor(pixels)
     count = int(negative.any(axis=-1).sum())
     return (np.where(negative, pixels.dtype.type(0), pixels) if count else pixels), count
@@ -104,13 +97,7 @@ def noise_floor(pixels: np.ndarray) -> np.ndarray:
 
     The noise is measured on triples of neighbours that are as near to zero as the most negative value: their second differences leave
     out shading, as a systematic offset has none. Without such triples, as in rendered images, every negative value is too low.
-
-    Args:
-        pixels: [rows, cols, channels] floating point, finite.
-
-    Returns:
-        [channels] float32, at most 0.
-    """
+    `pixels`: [rows, cols, channels] floating point, finite. Returns [channels] float32, at most 0."""
     lowest = np.minimum(pixels.min(axis=(0, 1)), 0).astype(np.float64)
     floor = np.zeros(pixels.shape[-1], dtype=np.float32)
     for channel in np.flatnonzero(lowest < 0):

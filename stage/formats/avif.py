@@ -31,11 +31,8 @@ class AvifHeader(NamedTuple):
 
 def header_of(path: str | Path, stream: BinaryIO) -> AvifHeader:
     """Read the size and the depth of an AVIF image that is open.
-
-    Raises:
-        ImageError: the file is no AVIF image, truncated, damaged, an image sequence, or one that is turned, mirrored or cropped after
-            decoding.
-    """
+    Raises ImageError if the file is no AVIF image, truncated, damaged, an image sequence, or one that is turned, mirrored or cropped after
+    decoding."""
     with storage("read", path):
         meta, is_whole = _meta(stream)
     if meta is None:

@@ -51,14 +51,9 @@ def header_of(source: inputs.Source) -> RawHeader:
 
 def decode(source: inputs.Source) -> np.ndarray:
     """Read the linear values of a camera raw file that is open, upright.
-
-    Returns:
-        [rows, cols, 1 or 3] float32 in the colours of the sensor: 0 is black and 1 saturates. A pixel that takes part of a colour from a
-        saturated one has at least 1 there.
-
-    Raises:
-        ImageError: the file is damaged, of no known camera, has other colours than red, green and blue, or rawpy is not installed.
-    """
+    Returns [rows, cols, 1 or 3] float32 in the colours of the sensor: 0 is black and 1 saturates. A pixel that takes part of a colour from
+    a saturated one has at least 1 there. Raises ImageError if the file is damaged, of no known camera, has other colours than red, green
+    and blue, or rawpy is not installed."""
     header = header_of(source)
     source.check_pixels(header.width, header.height)
     with _parsed(source) as raw:  # once more: LibRaw does not unpack what it has told the size of
@@ -89,15 +84,8 @@ def decode(source: inputs.Source) -> np.ndarray:
 
 def demosaic(mosaic: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Return red, green and blue of every pixel of a mosaic.
-
-    Args:
-        mosaic: [rows, cols] float32, 1 where the sensor saturates.
-        colour: [rows, cols] 0 red, 1 green, 2 blue.
-
-    Returns:
-        [rows, cols, 3] float32: the own colour of a pixel as it is, the others as means of those around it, and at least 1 where
-        one of these is saturated.
-    """
+    `mosaic`: [rows, cols] float32, 1 where the sensor saturates. `colour`: [rows, cols] 0 red, 1 green, 2 blue. Returns [rows, cols, 3]
+    float32: the own colour of a pixel as it is, the others as means of those around it, and at least 1 where one of these is saturated."""
     import cv2  # a tenth of a second that captures of other images need not wait
 
     repeats_every_two = np.array_equal(colour[2:], colour[:-2]) and np.array_equal(colour[:, 2:], colour[:, :-2])
@@ -119,12 +107,8 @@ def demosaic(mosaic: np.ndarray, colour: np.ndarray) -> np.ndarray:
 
 def rec709_from_camera(path: str | Path) -> np.ndarray:
     """Return the matrix from the colours of a sensor, once white is balanced, to linear values with the primaries of Rec.709.
-
-    Returns:
-        [3, 3] float64, whose rows add up to 1: what is white stays white.
-
-    Raises:
-        ImageError: neither the file nor LibRaw knows the colours of this camera.
+    Returns [3, 3] float64, whose rows add up to 1: what is white stays white. Raises ImageError if neither the file nor LibRaw knows the
+    colours of this camera.
 
     Source:
         The matrices of cameras are those of Adobe's DNG Specification, ColorMatrix1 and 2, normalised as dcraw does.

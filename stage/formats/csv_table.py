@@ -10,11 +10,8 @@ from stage.errors import ManifestError
 
 def read_table(path: Path, columns: Sequence[str]) -> "csv.DictReader[str]":
     """Return the rows of a table; the names of its columns are in lower case.
-
-    Raises:
-        ManifestError: the file is not UTF-8 text, or lacks one of these columns; names it.
-        StorageError: it cannot be read.
-    """
+    Raises ManifestError if the file is not UTF-8 text, or lacks one of these columns; names it. Raises StorageError if it cannot be
+    read."""
     try:
         rows = csv.DictReader(inputs.read_bytes(path).decode("utf-8-sig").splitlines())
     except UnicodeDecodeError as error:

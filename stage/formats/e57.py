@@ -25,10 +25,7 @@ class E57Scan(NamedTuple):
 
 def read_e57(path: Path) -> Iterator[E57Scan]:
     """Yield the scans of an E57 file, without places at which the scanner saw nothing.
-
-    Raises:
-        ResultError: pye57 is not installed, or the file is none that it reads; damaged pages are found by their checksums.
-    """
+    Raises ResultError if pye57 is not installed, or the file is none that it reads; damaged pages are found by their checksums."""
     if find_spec("pye57") is None:
         raise ResultError(f"{path}: E57 files need pye57: pip install 'relit[e57]'")
     import pye57

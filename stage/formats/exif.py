@@ -33,10 +33,7 @@ def sound(value: float) -> float | None:
 
 def exposure_times(where: str, exposures: Mapping[str, Exposure]) -> dict[str, float]:
     """Return the exposure time of every image, in seconds.
-
-    Raises:
-        ManifestError: an image has no exposure time, or images differ in f-number or sensitivity; the message names them.
-    """
+    Raises ManifestError if an image has no exposure time, or images differ in f-number or sensitivity; the message names them."""
     times = {}
     for name, exposure in exposures.items():
         if exposure.time_s is None:

@@ -68,10 +68,8 @@ class Part(NamedTuple):
 
 def read_header(path: str | Path) -> Header:
     """Read the header of an EXR file, and check from its chunk tables that the file is whole.
-
-    Raises:
-        ImageError: the file is not an EXR, is truncated, or has deep data, parts of different sizes, or one channel in several parts.
-    """
+    Raises ImageError if the file is not an EXR, is truncated, or has deep data, parts of different sizes, or one channel in several
+    parts."""
     with inputs.opened(path) as source:
         return header_of(source)
 
@@ -109,10 +107,7 @@ def header_of(source: inputs.Source) -> Header:
 
 def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read every channel of every part of an EXR file.
-
-    Returns:
-        The channels by name, each [rows, cols] in its stored type, and the attributes of the first part's header by name.
-    """
+    Returns the channels by name, each [rows, cols] in its stored type, and the attributes of the first part's header by name."""
     with inputs.opened(path) as source:
         header = header_of(source)
         if header.width * header.height * len(header.channels) >= LARGE_VALUES:
@@ -142,12 +137,9 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], *, color_space: 
 
 def write_parts(path: str | Path, parts: Sequence[Part], *, metadata: Mapping[str, Any], checksum: bool = False) -> None:
     """Write an EXR file whole or not at all: of several parts, or, where there is one part, a file without parts.
-
-    Args:
-        parts: with names that differ, and channels that differ and have one size.
-        metadata: further attributes of the first part; `pixelAspectRatio` and `framesPerSecond` are written to every part.
-        checksum: True to write a checksum of the file too, by which `stage.formats.exr_scan` finds every change of it.
-    """
+    `parts`: with names that differ, and channels that differ and have one size. `metadata`: further attributes of the first part;
+    `pixelAspectRatio` and `framesPerSecond` are written to every part. `checksum`: True to write a checksum of the file too, by which
+    `stage.formats.exr_scan` finds every change of it."""
     if checksum:
         metadata = {**metadata, exr_scan.CHECKSUM_ATTRIBUTE: exr_scan.UNSET_CHECKSUM}
     with replacing(path) as temporary:
@@ -209,10 +201,7 @@ def chromaticities(space: str) -> Sequence[float] | None:
 
 def color_space_of(metadata: Mapping[str, Any], default: str = "lin_rec709_scene") -> str:
     """Return the scene-linear colour space that a header declares by `colorInteropID` or by `chromaticities`, else `default`.
-
-    Raises:
-        ValueError: the chromaticities are those of no known colour space.
-    """
+    Raises ValueError if the chromaticities are those of no known colour space."""
     if (name := metadata.get("colorInteropID")) is not None:
         return str(name)
     if (given := metadata.get("chromaticities")) is None:

@@ -46,11 +46,8 @@ class RowFile:
 
     def append(self, parts: Sequence[exr.Part]) -> None:
         """Write the next rows.
-
-        Args:
-            parts: those of the picture, with the same channels in every call, each [rows, cols]; rows must be a multiple of BLOCK_ROWS
-                unless they are the last.
-        """
+        `parts`: those of the picture, with the same channels in every call, each [rows, cols]; rows must be a multiple of BLOCK_ROWS unless
+        they are the last."""
         rows = len(next(iter(parts[0].channels.values())))
         if self._taken + rows > self._rows or (rows % BLOCK_ROWS and self._taken + rows < self._rows):
             raise ValueError(f"{rows} rows after {self._taken} of {self._rows}: give multiples of {BLOCK_ROWS} until the last")

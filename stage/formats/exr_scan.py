@@ -59,10 +59,7 @@ class Scan(NamedTuple):
 
 def scan_header(path: Path, stream: BinaryIO) -> Scan:
     """Check how much the header of an EXR file holds.
-
-    Raises:
-        ImageError: the header has too many attributes, parts or channels, is too long, or is cut short.
-    """
+    Raises ImageError if the header has too many attributes, parts or channels, is too long, or is cut short."""
     stream.seek(0)
     head = stream.read(min(os.fstat(stream.fileno()).st_size, MAX_HEADER_BYTES))
     several = len(head) > 8 and bool(head[5] & SEVERAL_PARTS)
@@ -124,10 +121,7 @@ def _broken(path: Path, head: bytes) -> ImageError:
 
 def missing_bytes(stream: BinaryIO, table: int, parts: Sequence[Mapping[str, Any]]) -> int:
     """Return a lower bound of the bytes that a file lacks, from the last chunk of each part; 0 for a whole file, or for several levels.
-
-    Args:
-        table: the position of the tables of chunk offsets.
-    """
+    `table`: the position of the tables of chunk offsets."""
     layouts = [_layout(attributes) for attributes in parts]
     if any(chunks == 0 for chunks, _ in layouts):
         return 0

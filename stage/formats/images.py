@@ -96,10 +96,7 @@ def header_of(source: inputs.Source) -> ImageHeader:
 
 def read_pixels(path: str | Path) -> np.ndarray:
     """Read the recorded values of an image, upright: integers as fractions of full scale, floating-point values unchanged.
-
-    Returns:
-        [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel.
-    """
+    Returns [rows, cols, 3] float32, or float16 when the file holds half values; grey images repeat their one channel."""
     recorded = read_recorded(path)
     return np.take(fractions(recorded.dtype), recorded) if recorded.dtype.kind == "u" else recorded
 
@@ -113,11 +110,8 @@ def fractions(kind: np.dtype) -> np.ndarray:
 
 def read_recorded(path: str | Path) -> np.ndarray:
     """Read the recorded values of an image, upright, as the file has them; `fractions` converts them to those of `read_pixels`.
-
-    Returns:
-        [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
-        returns them; grey images repeat their one channel.
-    """
+    Returns [rows, cols, 3] uint8 or uint16 when the file holds integers of up to so many bits, else float32 or float16 as `read_pixels`
+    returns them; grey images repeat their one channel."""
     if _elsewhere:
         return _elsewhere[-1].recorded(Path(path))
     with inputs.opened(path) as source:
@@ -164,13 +158,7 @@ def _decoded(source: inputs.Source, suffix: str) -> np.ndarray:
 
 def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None = None) -> np.ndarray:
     """Read a mask, which is True where the first channel of an image is above one half.
-
-    Returns:
-        [rows, cols] bool.
-
-    Raises:
-        ImageError: the mask has another size, is unreadable, or is True nowhere.
-    """
+    Returns [rows, cols] bool. Raises ImageError if the mask has another size, is unreadable, or is True nowhere."""
     values = read_mask_values(path, resolution)
     mask = (values if crop is None else crop.of(values)) > 0.5
     if not mask.any():
@@ -180,10 +168,7 @@ def read_mask(path: str | Path, resolution: tuple[int, int], crop: Crop | None =
 
 def read_mask_values(path: str | Path, resolution: tuple[int, int]) -> np.ndarray:
     """Read the values of a mask: the first channel of an image, where partial values stand for pixels that the object covers in part.
-
-    Returns:
-        [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0.
-    """
+    Returns [rows, cols] float32, 0…1; values outside are clipped, and what is no number is 0."""
     check_resolution(path, resolution)
     values = read_pixels(path)[..., 0].astype(np.float32)
     return np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
@@ -201,14 +186,8 @@ difference of noise is more noise; only images of 8 bits are filtered."""
 
 def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
-
-    Args:
-        codes: [rows, cols] or [rows, cols, 3] uint8 or uint16.
-        srgb: True for colours that are encoded in sRGB, False for data that no reader should convert.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    `codes`: [rows, cols] or [rows, cols, 3] uint8 or uint16. `srgb`: True for colours that are encoded in sRGB, False for data that no
+    reader should convert. Raises OSError if the file cannot be written."""
     pixels = np.ascontiguousarray(codes[..., None] if codes.ndim == 2 else codes)  # two dimensions would be transposed
     rows, cols, channels = pixels.shape
     spec = oiio.ImageSpec(cols, rows, channels, str(codes.dtype))
@@ -234,14 +213,7 @@ def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
 
 def write_jpeg(path: Path, codes: np.ndarray, quality: int, *, subsampled: bool) -> None:
     """Write [rows, cols, 3] uint8 as a JPEG file.
-
-    Args:
-        quality: 1 to 100.
-        subsampled: whether colour has half of the resolution of brightness.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    `subsampled`: whether colour has half of the resolution of brightness. Raises OSError if the file cannot be written."""
     rows, cols, _ = codes.shape
     spec = oiio.ImageSpec(cols, rows, 3, "uint8")
     spec.attribute("compression", f"jpeg:{quality}")

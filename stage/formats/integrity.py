@@ -31,9 +31,7 @@ RATIOS = {1: (1, 1), 2: (12, 10), 3: (4, 3), 4: (3, 2), 5: (16, 9), 6: (5, 4), 7
 
 def check_png(path: str | Path, stream: BinaryIO, *, contents: bool) -> None:
     """Check that the chunks of a PNG file follow each other up to the end chunk.
-
-    Args:
-        contents: True compares the checksum of every chunk; False reads the lengths and types of the chunks only.
+    `contents`: True compares the checksum of every chunk; False reads the lengths and types of the chunks only.
 
     Source: W3C, "Portable Network Graphics (PNG) Specification", third edition, section 5.
     """

@@ -43,6 +43,7 @@ def las_is_installed() -> bool:
 def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, shot: np.ndarray, range_m: np.ndarray, path: str | Path, *,
               provenance: dict[str, str] | None = None) -> LasScales:
     """Write the points of a scan as a LAS file, whole or not at all.
+    Returns the scale and the offset of the coordinates, and the scale of intensity.
 
     Args:
         points: [n, 3] float64 metres, world frame; the axes are written unchanged.
@@ -51,9 +52,6 @@ def write_las(points: np.ndarray, intensity: np.ndarray, time_s: np.ndarray, sho
         shot: [n] index of the shot of each point; the points of one shot are numbered by their range, the nearest first.
         range_m: [n] the range of each point.
         provenance: texts that are kept in a record beside the scale of intensity.
-
-    Returns:
-        The scale and the offset of the coordinates, and the scale of intensity.
 
     Source:
         ASPRS, "LAS Specification 1.4 - R15", 2019: point data record format 6.
@@ -100,14 +98,11 @@ def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Read the points of a LAS or LAZ file.
+    """Read the points of a LAS or LAZ file. Raises ResultError if laspy is not installed, or the file is no LAS file.
 
     Returns:
         points: [n, 3] float64, in the unit of the file.
         colours: [n, 3] uint8, or None.
-
-    Raises:
-        ResultError: laspy is not installed, or the file is no LAS file.
     """
     if not las_is_installed():
         raise ResultError(f"{path}: LAS files need laspy: pip install 'relit[las]'")

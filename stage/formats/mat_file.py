@@ -35,14 +35,9 @@ Value = np.ndarray | tuple[str, ...]
 
 def read_mat(path: Path) -> dict[str, Value]:
     """Read the variables of a .mat file.
-
-    Returns:
-        The variables by name; the fields of a structure as `name.field`. Variables of other kinds (complex and sparse numbers,
-        functions, cells that do not hold texts alone) are left out.
-
-    Raises:
-        ManifestError: the file is not a whole .mat file of version 5; the message says what it is.
-    """
+    Returns the variables by name; the fields of a structure as `name.field`. Variables of other kinds (complex and sparse numbers,
+    functions, cells that do not hold texts alone) are left out. Raises ManifestError if the file is not a whole .mat file of version 5; the
+    message says what it is."""
     data = inputs.read_bytes(path)
     if data.startswith(b"MATLAB 7.3") or data.startswith(b"\x89HDF"):
         raise ManifestError(f"{path}: is a .mat file of version 7.3: save it in MATLAB with save -v7")

@@ -15,13 +15,8 @@ from stage.errors import ImageError, storage
 
 def array_shape(path: str | Path, stream: BinaryIO, max_pixels: int | None = None) -> tuple[int, ...]:
     """Return the shape of a .npy file of real numbers, and leave the stream at its beginning.
-
-    Args:
-        max_pixels: the most rows × columns, its first two sides; None for any.
-
-    Raises:
-        ImageError: the file is no .npy file, not of real numbers, has too many pixels, or does not hold as many bytes as its header says.
-    """
+    `max_pixels`: the most rows × columns, its first two sides; None for any. Raises ImageError if the file is no .npy file, not of real
+    numbers, has too many pixels, or does not hold as many bytes as its header says."""
     with storage("read", path):
         try:
             version = np.lib.format.read_magic(stream)

@@ -45,11 +45,8 @@ def write_ply(cloud: PointCloud, path: str | Path, *, comments: tuple[str, ...] 
 
 def header(vertex: np.dtype, count: int, comments: tuple[str, ...], faces: int | None = None) -> bytes:
     """Return the header of a binary PLY file.
-
-    Args:
-        vertex: the type of a vertex, whose fields are float32, uint16 or uint8.
-        faces: the number of faces, lists of int32 vertex numbers behind the vertices; None: the file has none.
-    """
+    `vertex`: the type of a vertex, whose fields are float32, uint16 or uint8. `faces`: the number of faces, lists of int32 vertex numbers
+    behind the vertices; None: the file has none."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(text.split())}" for text in comments),
              f"element vertex {count}", *(f"property {TYPES[vertex[name]]} {name}" for name in vertex.names or ())]
     if faces is not None:

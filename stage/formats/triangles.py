@@ -22,11 +22,7 @@ class Triangles(NamedTuple):
 
 def read_triangles(path: Path) -> Triangles:
     """Read a mesh; polygons of an OBJ file become triangles around their first corner, and faces without an area are left out.
-
-    Raises:
-        ResultError: the file is no STL or OBJ file, is damaged, or holds no face.
-        StorageError: it cannot be read.
-    """
+    Raises ResultError if the file is no STL or OBJ file, is damaged, or holds no face. Raises StorageError if it cannot be read."""
     if path.suffix.lower() not in (STL, OBJ):
         raise ResultError(f"{path}: is not a mesh that is read: give an STL, OBJ or PLY file; programs for design export STEP as STL")
     with storage("read", path):

@@ -61,14 +61,7 @@ class Folder(NamedTuple):
 
 def made(layout: str, reason: str, words: list[object], source: Path, *, solve: bool, sure: bool = False,
          assumed: tuple[str, ...] = (), summary: str = "") -> Guess:
-    """Return a guess.
-
-    Args:
-        words: the layout and arguments of `relit import`.
-        source: the folder of the capture.
-        solve: whether `relit solve` makes the result; else `relit depth`.
-        summary: what the folder holds; without it the layout says so.
-    """
+    """Return a guess. `solve`: whether `relit solve` makes the result; else `relit depth`."""
     program = "solve" if solve else "depth"
     return Guess(source, layout, reason, assumed, tuple(map(str, words)), sure,
                  shlex.join(["relit", program, str(source), "--out", f"{source.resolve().name}-{'maps' if solve else 'depth'}"]),

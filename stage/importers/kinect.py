@@ -39,12 +39,8 @@ SATURATED = 32767
 def import_folder(source: Path, destination: Path, *, packet: Path | None = None, p0: Path | None = None,
                   view: View | None = None) -> Imported:
     """Write a capture.json for a depth packet of a Kinect v2, and its nine images as .npy.
-
-    Args:
-        packet: the packet; None: the only file of the size of a packet.
-        p0: the response with the P0 tables; None: the only file with p0 in its name.
-        view: the camera, as libfreenect2's IrCameraParams have it; None: orthographic.
-    """
+    `packet`: the packet; None: the only file of the size of a packet. `p0`: the response with the P0 tables; None: the only file with p0 in
+    its name. `view`: the camera, as libfreenect2's IrCameraParams have it; None: orthographic."""
     packet = packet or _only(source, "depth packet", "--packet", lambda path: path.stat().st_size in PACKET_BYTES)
     p0 = p0 or _only(source, "file of P0 tables", "--p0", lambda path: "p0" in path.name.lower() and path.stat().st_size >= P0_BYTES)
     readings = decode(packet)
@@ -109,14 +105,8 @@ def read_p0(path: Path) -> np.ndarray:
 
 def without_offset(readings: np.ndarray, offset_rad: np.ndarray) -> np.ndarray:
     """Return the readings of one frequency as they would be without the offset of each pixel.
-
-    Args:
-        readings: [3, rows, cols] of P + Q cos(φ + offset + 2πi/3).
-        offset_rad: [rows, cols]; the offset is its negative, as in libfreenect2.
-
-    Returns:
-        [3, rows, cols] float32 of P + Q cos(φ + 2πi/3), all SATURATED where one reading is.
-    """
+    `readings`: [3, rows, cols] of P + Q cos(φ + offset + 2πi/3). `offset_rad`: [rows, cols]; the offset is its negative, as in
+    libfreenect2. Returns [3, rows, cols] float32 of P + Q cos(φ + 2πi/3), all SATURATED where one reading is."""
     turns = np.exp(2j * np.pi * np.arange(PHASES) / PHASES)[:, None, None]
     phasor = (readings * turns.conj()).sum(axis=0) * 2 / PHASES * np.exp(1j * offset_rad)
     found = readings.mean(axis=0) + (phasor * turns).real

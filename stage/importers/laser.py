@@ -62,10 +62,7 @@ class PlaneTable(NamedTuple):
 
     def points_and_normals(self, form: str | None, path: Path) -> tuple[np.ndarray, np.ndarray]:
         """Return a point of each plane and its unit normal, [planes, 3] float64 each.
-
-        Args:
-            form: one of FORMS, for coefficients; None: not told.
-        """
+        `form`: one of FORMS, for coefficients; None: not told."""
         normals = self.values[:, :3] if self.values.shape[1] == 4 else self.values[:, 3:]
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         if (length == 0).any():
@@ -81,11 +78,8 @@ class PlaneTable(NamedTuple):
 
 def read_planes(path: Path) -> PlaneTable:
     """Read the planes of a file.
-
-    Args:
-        path: text or CSV with a row for each plane, an image name before it or none; .npy or .mat with such an array; or a calibration file
-            of OpenCV or JSON (.yml, .xml, .json) with one of NAMES, or with a normal and a distance or a point.
-    """
+    `path`: text or CSV with a row for each plane, an image name before it or none; .npy or .mat with such an array; or a calibration file
+    of OpenCV or JSON (.yml, .xml, .json) with one of NAMES, or with a normal and a distance or a point."""
     suffix = path.suffix.lower()
     if suffix in TEXT:
         return _from_text(path)
@@ -180,7 +174,6 @@ def import_folder(source: Path, destination: Path, *, view: View, camera: Path |
     """Write a capture.json for images under one laser plane each.
 
     Args:
-        view: the camera, as far as options say it.
         planes: the file of the planes; None: every frame gets a placeholder.
         form: what four coefficients of a plane mean, one of `FORMS`.
         axes: where x, y and z of the planes point, as seen by the camera, whose centre is their origin; needed with `planes`.

@@ -103,11 +103,7 @@ def color_space_of(path: Path) -> ColorSpaceName:
 
 def assumed_encoding(space: ColorSpaceName, told: ColorSpaceName | None = None) -> list[str]:
     """Return the entry `assumed` of a manifest: a sentence where 8-bit images are taken as sRGB though nobody has said it.
-
-    Args:
-        space: that the manifest has.
-        told: that was asked for; None: `color_space_of` has found it.
-    """
+    `space`: that the manifest has. `told`: that was asked for; None: `color_space_of` has found it."""
     if told is not None or space != "srgb_texture":
         return []
     return ["color_space: the images have 8 bits and were taken as sRGB, which the files do not say: many cameras for measurements are "
@@ -118,11 +114,8 @@ def place_images(source: Path, destination: Path, names: Sequence[str]) -> None:
     """Put files of `source` into `destination` as hard links when the file system allows it, otherwise as copies.
 
     Files of the same size and time that `destination` holds already stay; other files are never overwritten.
-
-    Raises:
-        ManifestError: a file is missing, lies outside `source`, or differs from a file of its name in `destination`; then no file
-            is placed.
-    """
+    Raises ManifestError if a file is missing, lies outside `source`, or differs from a file of its name in `destination`; then no file is
+    placed."""
     wanted = []
     for name in names:
         origin, target = source / name, destination / name
@@ -149,12 +142,8 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
     """Check a manifest, place its images, and write it last, so that a capture.json never names files that do not exist.
 
     A capture.json that was there and differs is kept as PREVIOUS_NAME.
-
-    Args:
-        table: the file that the manifest was made from; errors name it.
-        folder: the folder of the images; None: that of `table`.
-        arrays: what the .npy files of these names hold, which are written; the other files are placed.
-    """
+    `table`: the file that the manifest was made from; errors name it. `folder`: the folder of the images; None: that of `table`. `arrays`:
+    what the .npy files of these names hold, which are written; the other files are placed."""
     try:
         manifest = Manifest.model_validate(data)
     except ValidationError as error:

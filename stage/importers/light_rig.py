@@ -51,12 +51,8 @@ class CameraMatrix(NamedTuple):
 
 def read_rig(path: Path) -> LightRig:
     """Read the lights of a rig.
-
-    Args:
-        path: a .mat file with S (positions) and, if they are known, Dir, Phi and mu; or a .json file with these keys, with `positions`,
-            `directions`, `intensities` and `mu`, or with a list `lights` of objects of `position`, `direction`, `intensity`, `mu` and
-            `image`.
-    """
+    `path`: a .mat file with S (positions) and, if they are known, Dir, Phi and mu; or a .json file with these keys, with `positions`,
+    `directions`, `intensities` and `mu`, or with a list `lights` of objects of `position`, `direction`, `intensity`, `mu` and `image`."""
     fields = _from_mat(path) if path.suffix.lower() == ".mat" else _from_json(path)
     positions = _pick(path, fields, POSITIONS, 3)
     if positions is None:

@@ -41,14 +41,10 @@ class LightTable(NamedTuple):
 
 def read_light_table(path: Path, *, variable: str | None = None, run: Run | None = None) -> LightTable:
     """Read a table of lights.
-
-    Args:
-        path: a .csv, .txt, .tsv, .lp or .dat file with a light in each row: an image name or none, three numbers, and one or three
-            numbers of its strength or none, with a line of headings or none; a .mat or .npy file with an array of three numbers for
-            each light; or a .json file with a list of lights or an object of lights by image name.
-        variable: the variable of a .mat file, or the key of a JSON object; None: the only one that can be meant.
-        run: whether lights are rows or columns of a table of numbers; None: as its shape says.
-    """
+    `path`: a .csv, .txt, .tsv, .lp or .dat file with a light in each row: an image name or none, three numbers, and one or three numbers of
+    its strength or none, with a line of headings or none; a .mat or .npy file with an array of three numbers for each light; or a .json
+    file with a list of lights or an object of lights by image name. `variable`: the variable of a .mat file, or the key of a JSON object;
+    None: the only one that can be meant. `run`: whether lights are rows or columns of a table of numbers; None: as its shape says."""
     suffix = path.suffix.lower()
     if suffix == ".mat":
         name, values = _variable(path, read_mat_arrays(path), variable)
@@ -63,11 +59,7 @@ def read_light_table(path: Path, *, variable: str | None = None, run: Run | None
 
 
 def read_strengths(path: Path) -> np.ndarray:
-    """Read the strength of each light from a file of its own: rows of one or three numbers.
-
-    Returns:
-        [lights, 3] float64.
-    """
+    """Read the strength of each light from a file of its own: rows of one or three numbers. Returns [lights, 3] float64."""
     if path.suffix.lower() == ".mat":
         name, values = _variable(path, read_mat_arrays(path), None, sides=(1, 3))
         return _strengths(np.asarray(values, dtype=np.float64), f"{path}: {name}")

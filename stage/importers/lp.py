@@ -21,11 +21,7 @@ from stage.model import name_fault
 
 def import_folder(source: Path, destination: Path, *, view: View | None = None, color_space: ColorSpaceName | None = None) -> Path:
     """Write a capture.json for an RTI capture.
-
-    Args:
-        source: the .lp file, or a folder with exactly one .lp file.
-        color_space: that of the images; None: by their depth.
-    """
+    `source`: the .lp file, or a folder with exactly one .lp file. `color_space`: that of the images; None: by their depth."""
     path = _find(source)
     folder = path.parent
     lines = read_lines(path)

@@ -59,11 +59,8 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
                        camera: Path | None = None, selection: Selection | None = None, view: View | None = None,
                        color_space: ColorSpaceName | None = None) -> Imported:
     """Write a capture.json for images under one near light each.
-
-    Args:
-        axes: where x, y and z of the rig point, as seen by the camera, whose centre is their origin.
-        unit_m: the metres in one unit of the positions.
-    """
+    `axes`: where x, y and z of the rig point, as seen by the camera, whose centre is their origin. `unit_m`: the metres in one unit of the
+    positions."""
     path = lights or find_table(source)
     rig = read_rig(path)
     chosen = select(source, selection or Selection())

@@ -18,11 +18,7 @@ COEFFICIENTS = 5
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """Read every matrix and number of a file.
-
-    Returns:
-        The float64 arrays, of one or two dimensions, by their names.
-    """
+    """Read every matrix and number of a file. Returns the float64 arrays, of one or two dimensions, by their names."""
     if path.suffix.lower() not in SUFFIXES:
         raise ManifestError(f"{path}: is no OpenCV calibration: its suffix must be one of {', '.join(SUFFIXES)}")
     with storage("read", path):
@@ -79,12 +75,7 @@ def _matrix(value: Any) -> np.ndarray | None:
 def pick(matrices: Mapping[str, np.ndarray], names: tuple[str, ...], path: Path, what: str, *,
          shape: tuple[int, ...] | None = None) -> np.ndarray:
     """Return the matrix that a file holds under the first of several names.
-
-    Args:
-        names: the names in order of preference.
-        what: the name of the quantity, for the message.
-        shape: the shape that the matrix must have; None allows any.
-    """
+    `shape`: the shape that the matrix must have; None allows any."""
     name = next((name for name in names if name in matrices), None)
     if name is None:
         raise ManifestError(f"{path}: holds no {what}: give it as one of {', '.join(names)}")
@@ -110,14 +101,8 @@ def distortion_of(coefficients: np.ndarray) -> Distortion:
 
 def camera_from_projector(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """Return the pose of a projector in a manifest from the result of OpenCV's stereoCalibrate with the camera first.
-
-    Args:
-        rotation: [3, 3] R, from the camera to the projector on OpenCV's axes.
-        translation: [3] T, metres.
-
-    Returns:
-        [4, 4] float64 `camera_from_projector`, metres, camera frames.
-    """
+    `rotation`: [3, 3] R, from the camera to the projector on OpenCV's axes. `translation`: [3] T, metres. Returns [4, 4] float64
+    `camera_from_projector`, metres, camera frames."""
     pose = np.eye(4)
     pose[:3, :3] = OPENCV_FROM_CAMERA @ rotation.T @ OPENCV_FROM_CAMERA
     pose[:3, 3] = OPENCV_FROM_CAMERA @ (-rotation.T @ translation)

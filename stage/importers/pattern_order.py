@@ -53,10 +53,7 @@ class GrayStack:
 
 def gray_entries(axis: str, size: int, given: int | None, *, inverses: str, fine_first: bool) -> list[Entry]:
     """Return the patterns of one axis of a Gray code.
-
-    Args:
-        given: the count of bits, the finest left out; None: all. The others are as of `GrayStack`.
-    """
+    `given`: the count of bits, the finest left out; None: all. The others are as of `GrayStack`."""
     whole = digit_count(size, 2)
     bits = whole if given is None else given
     if not 1 <= bits <= whole:

@@ -133,12 +133,8 @@ def import_phase(source: Path, destination: Path, *, pictures: PatternImages, ph
 def import_scanner(source: Path, destination: Path, *, calibration: Path, codec: str, axes: tuple[str, ...], unit_m: float,
                    projector: tuple[int, int] | None = None, images: str | None = None) -> Imported:
     """Write a capture.json for the images of a scanning program, with the calibration that it wrote.
-
-    Args:
-        codec: one of CODECS.
-        unit_m: the metres in one unit of the translation.
-        projector: the width and height of the projector; None: as the calibration says.
-    """
+    `codec`: one of CODECS. `unit_m`: the metres in one unit of the translation. `projector`: the width and height of the projector; None:
+    as the calibration says."""
     size = projector or projector_size(calibration)
     if size is None:
         raise ManifestError(f"{calibration}: does not say how many pixels the projector has: give --projector")

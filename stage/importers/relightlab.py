@@ -29,12 +29,8 @@ MM, MOST_MM = 0.001, 1e9
 
 def import_folder(source: Path, destination: Path | None, *, color_space: ColorSpaceName | None = None) -> Imported:
     """Write a capture.json for a project or a dome of RelightLab.
-
-    Args:
-        source: a .relight or .dome file, or a folder with exactly one of them.
-        destination: the folder of the capture, which gets links to, or copies of, the images; None: the folder of the images.
-        color_space: that of the images; None: by their depth.
-    """
+    `source`: a .relight or .dome file, or a folder with exactly one of them. `destination`: the folder of the capture, which gets links to,
+    or copies of, the images; None: the folder of the images. `color_space`: that of the images; None: by their depth."""
     path = _find(source)
     data = _read(path)
     dome = data.get("dome", {}) if path.suffix.lower() == ".relight" else data

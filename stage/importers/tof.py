@@ -32,21 +32,20 @@ class Plane(NamedTuple):
     """Rows and columns."""
 
 
-def import_correlations(source: Path, destination: Path, *, frequencies_hz: Sequence[float], phases_deg: Sequence[float], minus: bool,
-                        order: str = ORDERS[0], arrays: ArrayFiles | None = None, planes: str | None = None, source_m: Vector | None = None,
-                        view: View | None = None) -> Imported:
-    """Write a capture.json for correlation images of a continuous-wave camera.
-
-    Args:
-        destination: the folder of the capture. Files of one image each are placed there; images of other files are written as .npy.
-        frequencies_hz: the modulation frequencies, in the order of the images.
-        phases_deg: the reference phases δ of the images of a frequency, in their order.
-        minus: whether an image is P + Q cos(φ − δ); False: P + Q cos(φ + δ).
-        order: what changes slowest first, one of ORDERS.
-        arrays: which files, and what they do not say themselves.
-        planes: `first` or `last`: where the images are counted in arrays of three dimensions; None: as their shape says.
-        source_m: the place of the light source; None: at the camera.
-    """
+def import_correlations(
+    source: Path,
+    destination: Path,  # the folder of the capture. Files of one image each are placed there; images of other files are written as .npy.
+    *,
+    frequencies_hz: Sequence[float],  # the modulation frequencies, in the order of the images
+    phases_deg: Sequence[float],  # the reference phases δ of the images of a frequency, in their order
+    minus: bool,  # whether an image is P + Q cos(φ − δ); False: P + Q cos(φ + δ)
+    order: str = ORDERS[0],  # what changes slowest first, one of ORDERS
+    arrays: ArrayFiles | None = None,
+    planes: str | None = None,  # `first` or `last`: where the images are counted in arrays of three dimensions; None: as their shape says
+    source_m: Vector | None = None,  # the place of the light source; None: at the camera
+    view: View | None = None,
+) -> Imported:
+    """Write a capture.json for correlation images of a continuous-wave camera."""
     if order not in ORDERS:
         raise ManifestError(f"--order {order}: give {' or '.join(ORDERS)}")
     arrays = arrays or ArrayFiles()
@@ -88,7 +87,6 @@ def import_histograms(source: Path, destination: Path, *, bin_s: float, start_s:
     """Write a capture.json for photon histograms; several files of one scene are frames that are added.
 
     Args:
-        source: the folder of the arrays, or one file.
         destination: the folder of the capture. .npy files of (rows, cols, bins) are placed there; other histograms are written as .npy.
         bin_s, start_s, count_scale, pulses, first_photon_only: as of `stage.capture.light.Pulsed`.
         bins: `first` or `last`: where the bins are counted.

@@ -59,13 +59,8 @@ def is_video(path: Path) -> bool:
 
 def unpack(video: Path, folder: Path, frames: FrameRange) -> VideoFrames:
     """Write frames of a video as PNG images of 8 bits, named by their numbers, after all of them were found readable.
-
-    Args:
-        folder: of the images; those that are there already are replaced.
-
-    Raises:
-        ManifestError: the file is no video that OpenCV decodes, or it ends before the last frame.
-    """
+    `folder`: of the images; those that are there already are replaced. Raises ManifestError if the file is no video that OpenCV decodes, or
+    it ends before the last frame."""
     with _opened(video) as capture:
         code = int(capture.get(cv2.CAP_PROP_FOURCC))
         rate = capture.get(cv2.CAP_PROP_FPS) or None

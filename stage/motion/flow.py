@@ -33,34 +33,26 @@ class Flow(NamedTuple):
 
 def white_level(radiance: np.ndarray, mask: np.ndarray) -> float:
     """Return the brightness of the subject without its highlights, the WHITE_PERCENTILE of its grey values.
-
-    Args:
-        radiance: [rows, cols, 3] float32, linear.
-        mask: [rows, cols] bool, True on the subject.
-    """
+    `radiance`: [rows, cols, 3] float32, linear. `mask`: [rows, cols] bool, True on the subject."""
     return float(np.percentile(radiance[mask] @ np.asarray(GREY_WEIGHTS, dtype=np.float32), WHITE_PERCENTILE))
 
 
 def display(radiance: np.ndarray, white: float) -> np.ndarray:
     """Return the image on which flow is found: grey, gamma-encoded, with `white` somewhat below 255.
-
-    Returns:
-        [rows, cols] float32, 0 to 255.
-    """
+    Returns [rows, cols] float32, 0 to 255."""
     grey = radiance @ np.asarray(GREY_WEIGHTS, dtype=np.float32)
     return 255 * np.clip(grey / np.float32(HEADROOM * white), 0, 1) ** np.float32(1 / DISPLAY_GAMMA)
 
 
-def find_flow(reference: np.ndarray, other: np.ndarray, guess: np.ndarray | None = None) -> Flow:
+def find_flow(
+    reference: np.ndarray,  # [rows, cols] float32, from `display`
+    other: np.ndarray,  # the same for the other frame
+    guess: np.ndarray | None = None,  # [rows, cols, 2] float32, an approximate displacement from `extrapolate`, or None
+) -> Flow:
     """Find the optical flow from the reference frame to another frame.
 
     The search shifts patches and does not rotate them. With a guess the other frame is warped by it first, and the remaining
     displacement is searched. A subject may therefore turn by any angle in small steps, and errors do not accumulate.
-
-    Args:
-        reference: [rows, cols] float32, from `display`.
-        other: the same for the other frame.
-        guess: [rows, cols, 2] float32, an approximate displacement from `extrapolate`, or None.
 
     Source:
         Kroeger et al., "Fast optical flow using dense inverse search", ECCV 2016 (OpenCV's, at full resolution), then the variational
@@ -82,14 +74,8 @@ def find_flow(reference: np.ndarray, other: np.ndarray, guess: np.ndarray | None
 
 def extrapolate(flow: Flow, mask: np.ndarray) -> np.ndarray:
     """Extrapolate the flow to one tracking frame from its known pixels to the whole image, as a guess for the next tracking frame.
-
-    Args:
-        flow: the flow to the tracking frame before the next one.
-        mask: [rows, cols] bool, True on the subject.
-
-    Returns:
-        [rows, cols, 2] float32.
-    """
+    `flow`: the flow to the tracking frame before the next one. `mask`: [rows, cols] bool, True on the subject. Returns [rows, cols, 2]
+    float32."""
     trusted = flow.known & mask
     if not trusted.any():
         return flow.displacement

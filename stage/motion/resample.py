@@ -9,13 +9,8 @@ import numpy as np
 
 def positions(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the position to which a displacement moves every pixel.
-
-    Args:
-        displacement: [rows, cols, 2] float32, pixels right and down.
-
-    Returns:
-        x and y, [rows, cols] float32, clamped to the image, and [rows, cols] bool, True where they lie inside the image.
-    """
+    `displacement`: [rows, cols, 2] float32, pixels right and down. Returns x and y, [rows, cols] float32, clamped to the image, and [rows,
+    cols] bool, True where they lie inside the image."""
     rows, cols = displacement.shape[:2]
     x = displacement[..., 0] + np.arange(cols, dtype=np.float32)
     y = displacement[..., 1] + np.arange(rows, dtype=np.float32)[:, None]
@@ -33,11 +28,8 @@ def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
     In one dimension the result is the linear interpolation of the image minus q times that of its second difference, with
     q = f(1 - f)/2 and f the fraction of the position. Two dimensions take four bilinear interpolations instead of sixteen gathered
-    values in NumPy. OpenCV's cubic kernel, a = -0.75, is wrong by up to 0.05 pixels even on a ramp.
-
-    Args:
-        image: [rows, cols] or [rows, cols, 3] float32.
-        x: [rows, cols] float32, within the image.
+    values in NumPy. OpenCV's cubic kernel, a = -0.75, is wrong by up to 0.05 pixels even on a ramp. `image`: [rows, cols] or [rows, cols,
+    3] float32. `x`: [rows, cols] float32, within the image.
 
     Source:
         Keys, "Cubic convolution interpolation for digital image processing", IEEE Trans. ASSP 29(6), 1981, eq. 15 (a = -1/2).
@@ -53,13 +45,6 @@ def bicubic(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def touched(flags: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return whether any of the sixteen pixels of a bicubic interpolation is flagged.
-
-    Args:
-        flags: [rows, cols] bool.
-        x: [rows, cols] float32, within the image.
-
-    Returns:
-        [rows, cols] bool.
-    """
+    `flags`: [rows, cols] bool. `x`: [rows, cols] float32, within the image. Returns [rows, cols] bool."""
     dilated = cv2.dilate(flags.astype(np.uint8), np.ones((4, 4), np.uint8), anchor=(1, 1))  # one pixel before to two after
     return np.asarray(dilated[y.astype(np.intp), x.astype(np.intp)] > 0)

@@ -40,13 +40,8 @@ class Interval(NamedTuple):
 
 def tracking_frames(capture: Capture, *, to: str | None = None) -> Tracking:
     """Return the tracking frames of a capture, which all lights lit.
-
-    Args:
-        to: the image of the tracking frame to align to; None stands for the middle one, and the later of two middle ones.
-
-    Raises:
-        ManifestError: there are fewer than two, `to` is none of them, or the images are too small or too large for optical flow.
-    """
+    `to`: the image of the tracking frame to align to; None stands for the middle one, and the later of two middle ones. Raises
+    ManifestError if there are fewer than two, `to` is none of them, or the images are too small or too large for optical flow."""
     where = capture.folder / FILE_NAME
     times = tuple(index for index, frame in enumerate(capture.manifest.frames) if isinstance(frame.light, FullLight))
     if len(times) < 2:

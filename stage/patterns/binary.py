@@ -140,12 +140,8 @@ def gray_of(code: np.ndarray) -> np.ndarray:
 def binary_patterns(extent: int, axis: Axis, *, code: Literal["binary", "gray"] = "gray", stripe_px: float = 1, inverses: bool = True,
                     references: bool = True) -> tuple[BinaryPattern | UniformPattern, ...]:
     """Return the frames of a binary or Gray code, coarsest bit first, each followed by its inverse, then white and black (OpenCV's order).
-
-    Args:
-        stripe_px: width of the finest stripe.
-        inverses: with each frame its inverse, which gives every pixel a threshold of its own.
-        references: with white and black.
-    """
+    `stripe_px`: width of the finest stripe. `inverses`: with each frame its inverse, which gives every pixel a threshold of its own.
+    `references`: with white and black."""
     bits = digit_count(stripe_count(extent, stripe_px), 2)
     frames = [BinaryPattern(code=code, axis=axis, bit=bit, bits=bits, stripe_px=stripe_px, inverse=inverse)
               for bit in reversed(range(bits)) for inverse in ((False, True) if inverses else (False,))]
@@ -155,10 +151,7 @@ def binary_patterns(extent: int, axis: Axis, *, code: Literal["binary", "gray"] 
 def xor_patterns(extent: int, axis: Axis, *, base_bit: int = 0, stripe_px: float = 1,
                  inverses: bool = True) -> tuple[XorPattern | UniformPattern, ...]:
     """Return the frames of a Gray code in stripes that are all narrow, for scenes whose surfaces light each other.
-
-    Args:
-        base_bit: 0 for XOR-02 (no stripe wider than two finest ones), 1 for XOR-04.
-    """
+    `base_bit`: 0 for XOR-02 (no stripe wider than two finest ones), 1 for XOR-04."""
     bits = digit_count(stripe_count(extent, stripe_px), 2)
     if not 0 <= base_bit < bits:
         raise ValueError(f"base bit {base_bit} does not exist in {bits} bits (0 to {bits - 1})")

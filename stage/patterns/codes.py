@@ -48,12 +48,10 @@ class Collected(NamedTuple):
 
 def draw(pattern: Pattern, resolution: tuple[int, int]) -> np.ndarray:
     """Return the image that the projector shows for a manifest entry: the entry is the definition, the image follows from it.
+    Returns [rows, cols] or, in colours, [rows, cols, 3] float32, 0…1, linear light.
 
     Convention: coordinates are continuous, 0 at the outer edge of the first pixel; pixel c has its centre at c + 0.5. A code's level is
     taken at u along its axis and v across it.
-
-    Returns:
-        [rows, cols] or, in colours, [rows, cols, 3] float32, 0…1, linear light.
     """
     width, height = resolution
     x, y = np.arange(width)[None, :] + 0.5, np.arange(height)[:, None] + 0.5

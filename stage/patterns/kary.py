@@ -116,16 +116,9 @@ class KaryCode(NamedTuple):
 
 def digits_of(code: np.ndarray, base: int, digits: int, *, reflected: bool) -> np.ndarray:
     """Return base-k digits, least significant first.
-
-    Args:
-        code: [...] whole numbers from 0.
-        digits: how many; more significant ones are cut off.
-        reflected: a digit t becomes k - 1 - t where the more significant digits, as shown, add up to an odd number: neighbours
-            then differ in one digit, by one (k-ary Gray code). With odd k the plain digits above add up to odd at the same time.
-
-    Returns:
-        [digits, ...].
-    """
+    `digits`: how many; more significant ones are cut off. `reflected`: a digit t becomes k - 1 - t where the more significant digits, as
+    shown, add up to an odd number: neighbours then differ in one digit, by one (k-ary Gray code). With odd k the plain digits above add up
+    to odd at the same time. Returns [digits, ...]."""
     plain = np.stack([code // base**d % base for d in range(digits)])
     if not reflected:
         return plain
@@ -137,15 +130,14 @@ def digits_of(code: np.ndarray, base: int, digits: int, *, reflected: bool) -> n
     return shown
 
 
-def kary_patterns(extent: int, axis: Axis, *, base: int, reflected: bool = True, stripe_px: float = 1,
-                  levels: Sequence[float] | None = None, colors: Sequence[Rgb] | None = None) -> tuple[KaryPattern | UniformPattern, ...]:
-    """Return the frames of base-k digits, most significant first, then white and black, without which levels cannot be told.
-
-    Args:
-        reflected: k-ary Gray code, in which neighbouring stripes differ in one digit by one.
-        levels: [k] grey level of each digit value, linear light; None (and no colors): even steps from 0 to 1.
-        colors: [k] colour of each digit value, in place of levels.
-    """
+def kary_patterns(
+    extent: int, axis: Axis, *, base: int,
+    reflected: bool = True,  # k-ary Gray code, in which neighbouring stripes differ in one digit by one
+    stripe_px: float = 1,
+    levels: Sequence[float] | None = None,  # [k] grey level of each digit value, linear light; None (and no colors): even steps from 0 to 1
+    colors: Sequence[Rgb] | None = None,  # [k] colour of each digit value, in place of levels
+) -> tuple[KaryPattern | UniformPattern, ...]:
+    """Return the frames of base-k digits, most significant first, then white and black, without which levels cannot be told."""
     if levels is None and colors is None:
         levels = [value / max(base - 1, 1) for value in range(base)]
     digits = digit_count(stripe_count(extent, stripe_px), base)

@@ -108,11 +108,7 @@ def joint_periods(extent: int) -> tuple[float, ...]:
 
 def phase_patterns(axis: Axis, periods_px: Sequence[float], steps: int = 4) -> tuple[PhasePattern, ...]:
     """Return every step of every period.
-
-    Args:
-        periods_px: any number of periods, in projector pixels.
-        steps: of each, 3 or more, evenly spaced.
-    """
+    `periods_px`: any number of periods, in projector pixels. `steps`: of each, 3 or more, evenly spaced."""
     if not periods_px or len(set(periods_px)) < len(periods_px):
         listed = ", ".join(f"{period:g}" for period in periods_px) or "(none)"
         raise ValueError(f"periods {listed} are not several different ones: give each once, and at least one")
@@ -124,13 +120,9 @@ def micro_patterns(extent: int, axis: Axis, *, periods: int = 5, mean_period_px:
     """Return the frames of micro phase shifting: three steps of the first period, one of each other; all periods short and close together.
 
     All frequencies are high, so light between surfaces adds the same constant to every frame; they lie close together, so
-    defocus dims all alike, and one offset and one amplitude serve all frames.
-
-    Args:
-        extent: projector pixels along the axis, over which no two places look alike.
-        periods: how many, 3 or more; there are two more frames than periods.
-        mean_period_px: about which the periods lie.
-    """
+    defocus dims all alike, and one offset and one amplitude serve all frames. `extent`: projector pixels along the axis, over which no two
+    places look alike. `periods`: how many, 3 or more; there are two more frames than periods. `mean_period_px`: about which the periods
+    lie."""
     chosen = micro_periods(extent, periods, mean_period_px)
     first = [PhasePattern(code="phase", axis=axis, period_px=chosen[0], step=step, steps=3) for step in range(3)]
     return (*first, *(PhasePattern(code="phase", axis=axis, period_px=period, step=0, steps=3) for period in chosen[1:]))

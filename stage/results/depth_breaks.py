@@ -38,14 +38,8 @@ _PREDICTED = float(np.sqrt(1 + np.sum(_NEXT**2)))
 
 def same_surface(first: np.ndarray, second: np.ndarray, distance_px: float | np.ndarray, camera: Camera) -> np.ndarray:
     """Return whether the slope between two depths is at most 80 degrees.
-
-    Args:
-        first, second: depths in metres, of one shape; their order does not matter.
-        distance_px: the distance between their two pixels, in pixels.
-
-    Returns:
-        bool in the shape of the depths.
-    """
+    `first`, `second`: depths in metres, of one shape; their order does not matter. `distance_px`: the distance between their two pixels, in
+    pixels. Returns bool in the shape of the depths."""
     if camera.focal_px is None:
         return np.asarray(np.abs(first - second) <= STEEPEST * (camera.pixel_size_m or 1.0) * distance_px)
     footprint = np.minimum(first, second) / min(camera.focal_px)
@@ -55,15 +49,13 @@ def same_surface(first: np.ndarray, second: np.ndarray, distance_px: float | np.
 def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple[int, int], *,
               sigma: np.ndarray | None = None) -> np.ndarray:
     """Return for each pixel whether its neighbour at an offset shows the same surface.
+    Returns [rows, cols] bool; False where either pixel lies outside the mask or the image.
 
     Args:
         depth: [rows, cols] metres, above zero in the mask.
         mask: [rows, cols] bool, True where there is a depth.
         offset: rows downwards, at least 0, and columns to the right, which may be negative.
         sigma: [rows, cols] metres, standard deviation of the depth; values that are not finite count as 0. None: 0 everywhere.
-
-    Returns:
-        [rows, cols] bool; False where either pixel lies outside the mask or the image.
     """
     (down, right), (rows, cols) = offset, depth.shape
     first_col, last_col = max(-right, 0), max(cols - max(right, 0), 0)
@@ -85,10 +77,7 @@ def connected(depth: np.ndarray, mask: np.ndarray, camera: Camera, offset: tuple
 def _along(depth: np.ndarray, sigma: np.ndarray | None, mask: np.ndarray, camera: Camera, pixels: np.ndarray, offset: tuple[int, int]
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what is linear on planes (inverse depth, or depth under an orthographic camera), its standard deviation and its presence.
-
-    Returns:
-        [2 SIDE, n] each: SIDE pixels up to each of `pixels` [n, 2], and SIDE from its neighbour on.
-    """
+    Returns [2 SIDE, n] each: SIDE pixels up to each of `pixels` [n, 2], and SIDE from its neighbour on."""
     places = np.arange(1 - SIDE, SIDE + 1)[:, None]
     row, col = (pixels[:, axis] + places * offset[axis] for axis in (0, 1))
     inside = (row >= 0) & (row < mask.shape[0]) & (col >= 0) & (col < mask.shape[1])

@@ -66,10 +66,7 @@ class DepthMaps:
     @classmethod
     def read(cls, path: str | Path, *, unsure: bool = False) -> "DepthMaps":
         """Read a depth.exr that Relit wrote.
-
-        Args:
-            unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
-        """
+        `unsure`: keep the values of pixels that are estimated and do not count as solved; else they are 0."""
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=DEPTH_FILE)
         found = {name: channels[channel].astype(np.float32) for name, (channel, _) in LAYERS.items() if channel in channels}

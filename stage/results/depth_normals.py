@@ -21,15 +21,13 @@ ROWS = 256
 def depth_normals(depth: np.ndarray, mask: np.ndarray, camera: Camera, *, sigma: np.ndarray | None = None,
                   radius: int = 1) -> np.ndarray:
     """Return the normal of the plane through each pixel and its neighbours on the same surface.
+    Returns [rows, cols, 3] float32, unit, camera frame, towards the camera; 0 where the neighbours determine no plane.
 
     Args:
         depth: [rows, cols] metres.
         mask: [rows, cols] bool, True where there is a depth.
         sigma: [rows, cols] metres, standard deviation of the depth, by which noise is told from a break; None: there is no noise.
         radius: the radius of the neighbourhood in pixels; 1 is 3×3 pixels.
-
-    Returns:
-        [rows, cols, 3] float32, unit, camera frame, towards the camera; 0 where the neighbours determine no plane.
     """
     halo = radius * SIDE
     x, y = camera.plane_coordinates()

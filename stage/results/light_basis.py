@@ -30,22 +30,14 @@ def layer_name(index: int) -> str:
 
 def layer_types(rms: np.ndarray, largest: float) -> list[type[np.floating[Any]]]:
     """Return the stored type of each layer: half, or float when half would overflow or lose bits.
-
-    Args:
-        rms: [K, 3] the root mean square of each basis image.
-        largest: an upper bound of the absolute values of all layers.
-    """
+    `rms`: [K, 3] the root mean square of each basis image. `largest`: an upper bound of the absolute values of all layers."""
     return [np.float16 if largest <= exr.HALF_MAX and row.max() >= HALF_RMS_MIN else np.float32 for row in rms]
 
 
 def write_layers(path: str | Path, layers: Sequence[np.ndarray], mask: np.ndarray, *, color_space: str,
                  metadata: Mapping[str, str]) -> None:
     """Write the basis images as layers `basis.NNN.{R,G,B}`, which are 0 outside the mask, and the mask as `mask.Y`.
-
-    Args:
-        layers: K images, each [3, rows, cols] float16 or float32.
-        mask: [rows, cols] bool.
-    """
+    `layers`: K images, each [3, rows, cols] float16 or float32. `mask`: [rows, cols] bool."""
     channels = {f"{layer_name(k)}.{name}": np.where(mask, plane, 0).astype(plane.dtype)
                 for k, layer in enumerate(layers) for name, plane in zip("RGB", layer, strict=True)}
     exr.write(path, {**channels, "mask.Y": mask.astype(np.float16)}, color_space=color_space, metadata=metadata)

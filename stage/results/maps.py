@@ -102,11 +102,8 @@ class SurfaceMaps:
     @classmethod
     def read(cls, path: str | Path, *, unsure: bool = False, layers: Collection[str] = tuple(LAYERS)) -> "SurfaceMaps":
         """Read a maps.exr that Relit wrote.
-
-        Args:
-            unsure: keep the values of pixels that are estimated and do not count as solved; else they are 0.
-            layers: the layers to read beside `mask`; the others are None.
-        """
+        `unsure`: keep the values of pixels that are estimated and do not count as solved; else they are 0. `layers`: the layers to read
+        beside `mask`; the others are None."""
         channels, metadata = exr.read(path)
         camera, provenance = camera_and_provenance(metadata, path, file_name=MAPS_FILE)
         found: dict[str, np.ndarray] = {}

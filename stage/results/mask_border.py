@@ -56,12 +56,8 @@ def border(mask: np.ndarray, whole: np.ndarray, reach: float) -> np.ndarray:
 
 def outline_coverage(mask: np.ndarray, *, shift_px: float, blur_px: float) -> np.ndarray:
     """Return the coverage [rows, cols] float32 that follows from the smoothed outline of a mask.
-
-    Args:
-        mask: the pixels that are covered by more than a half.
-        shift_px: how far the object reaches beyond the mask; negative where the mask is wider.
-        blur_px: the standard deviation of the images' filter.
-    """
+    `mask`: the pixels that are covered by more than a half. `shift_px`: how far the object reaches beyond the mask; negative where the mask
+    is wider. `blur_px`: the standard deviation of the images' filter."""
     smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), SMOOTH_PX, borderType=cv2.BORDER_REPLICATE)
     depth = SMOOTH_PX * np.interp(smooth, NORMAL_CDF, NORMAL_X)  # from the outline, which the filter of a straight edge gives
     return np.interp((depth + shift_px) / blur_px, NORMAL_X, NORMAL_CDF).astype(np.float32)
@@ -69,11 +65,7 @@ def outline_coverage(mask: np.ndarray, *, shift_px: float, blur_px: float) -> np
 
 def outline_offset(difference: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Return [rows, cols] how far one outline lies beyond another, in pixels, as a mean over a window.
-
-    Args:
-        difference: [rows, cols] of the coverage of the two.
-        along: [rows, cols] bool, the rim of one of them.
-    """
+    `difference`: [rows, cols] of the coverage of the two. `along`: [rows, cols] bool, the rim of one of them."""
     area, length = (cv2.GaussianBlur(values.astype(np.float32), (0, 0), WINDOW_PX) for values in (difference, along))
     return area / np.maximum(length, 1e-6)
 

@@ -127,18 +127,14 @@ class Readings:
         return total / np.maximum(share.sum(axis=1), 1e-9)[:, None].astype(np.float32)
 
 
-def cover(readings: Readings, mask: np.ndarray, whole: np.ndarray, border: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the coverage of border pixels.
-
-    Args:
-        mask: [rows, cols] bool, which stands where there is no estimate.
-        whole: [rows, cols] bool, the pixels that the object covers wholly.
-        border: [n, 2] rows and columns of the pixels to estimate.
-        far: how far a whole pixel may be from a border pixel, in pixels.
-
-    Returns:
-        [rows, cols] float32 coverage, 0…1, and [n] bool where there was an estimate.
-    """
+def cover(
+    readings: Readings,
+    mask: np.ndarray,  # [rows, cols] bool, which stands where there is no estimate
+    whole: np.ndarray,  # [rows, cols] bool, the pixels that the object covers wholly
+    border: np.ndarray,  # [n, 2] rows and columns of the pixels to estimate
+    far: float,  # how far a whole pixel may be from a border pixel, in pixels
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate the coverage of border pixels. Returns [rows, cols] float32 coverage, 0…1, and [n] bool where there was an estimate."""
     coverage = mask.astype(np.float32)
     estimated = np.zeros(len(border), dtype=bool)
     nearest_whole = nearest(whole)
@@ -164,11 +160,7 @@ def cover(readings: Readings, mask: np.ndarray, whole: np.ndarray, border: np.nd
 
 def before_dark(readings: Readings, border: np.ndarray, whole: np.ndarray, clear: np.ndarray, far: float) -> np.ndarray:
     """Return [n] bool: the background beside a border pixel is dark in comparison with the object there.
-
-    Args:
-        whole: [rows, cols] bool, pixels of the object alone.
-        clear: [rows, cols] bool, pixels of the background alone.
-    """
+    `whole`: [rows, cols] bool, pixels of the object alone. `clear`: [rows, cols] bool, pixels of the background alone."""
     if not (len(border) and clear.any() and whole.any()):
         return np.zeros(len(border), dtype=bool)
     beyond = nearest(clear)(border)

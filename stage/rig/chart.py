@@ -86,10 +86,7 @@ class ChartReadings(NamedTuple):
 
     def of(self, lamp: Lamp) -> np.ndarray:
         """Return [primaries, patches, 3] the readings under each primary of a lamp at full level.
-
-        Raises:
-            ManifestError: the file has no readings for a primary, or the rig no spectrum of it.
-        """
+        Raises ManifestError if the file has no readings for a primary, or the rig no spectrum of it."""
         spectra = self.chart.spectra
         if spectra is None:
             missing = [primary.name for primary in lamp.primaries if primary.name not in (self.chart.primaries or {})]

@@ -76,10 +76,7 @@ def rig_digest(rig: Rig) -> str:
 
 def read_cues(path: str | Path, rig: Rig) -> Cues:
     """Read the cues of a rig, from their file or from the folder that holds cues.json.
-
-    Raises:
-        ManifestError: the file is wrong, or was made for another rig; names the file and the field.
-    """
+    Raises ManifestError if the file is wrong, or was made for another rig; names the file and the field."""
     path = Path(path)
     path = path / CUES_FILE if path.is_dir() else path
     cues = read_record(path, Cues, CUES_SCHEMA)

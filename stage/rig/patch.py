@@ -96,13 +96,8 @@ def drive_steps(rig: Rig, levels: np.ndarray) -> np.ndarray:
 
 def universe_values(rig: Rig, steps: np.ndarray) -> dict[Universe, np.ndarray]:
     """Return the values of all channels of the universes of a rig.
-
-    Args:
-        steps: [frames, emitters] integers, the drive of each of `rig.emitters` in steps of its bits: 0…255 or 0…65535.
-
-    Returns:
-        [frames, 512] uint8 by universe, in the order of protocol and number.
-    """
+    `steps`: [frames, emitters] integers, the drive of each of `rig.emitters` in steps of its bits: 0…255 or 0…65535. Returns [frames, 512]
+    uint8 by universe, in the order of protocol and number."""
     found: dict[Universe, np.ndarray] = {}
     for column, (index, primary) in enumerate(rig.emitters):
         place = slot(rig.lights[index], primary)
@@ -124,10 +119,7 @@ def levels_of_universes(rig: Rig, values: dict[tuple[str, int], np.ndarray]) -> 
     """Return the light of each of `rig.emitters`, 0 to 1, when universes have these values.
 
     What is not received is dark, and so is a lamp whose fixed channels have other values than the rig says: its light is not known then.
-
-    Args:
-        values: [512] uint8 by protocol and number of the universe.
-    """
+    `values`: [512] uint8 by protocol and number of the universe."""
     levels = np.zeros(len(rig.emitters))
     nothing = np.zeros(CHANNELS, dtype=np.uint8)
     ready = [all(values.get(universe[:2], nothing)[each.channel - 1] == each.value for universe, each in fixed_channels(lamp))

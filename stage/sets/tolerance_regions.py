@@ -60,10 +60,5 @@ class Tolerances(Strict):
 
 
 def read_tolerances(path: Path) -> Tolerances:
-    """Read a file of regions.
-
-    Raises:
-        ManifestError: it is wrong; names file and field.
-        StorageError: it cannot be read.
-    """
+    """Read a file of regions. Raises ManifestError if it is wrong; names file and field. Raises StorageError if it cannot be read."""
     return read_record(path, Tolerances, TOLERANCES_SCHEMA, lambda data: faults_of_each(data, "regions", ToleranceRegion))

@@ -108,11 +108,7 @@ class BracketedStack(Stack):
 def merge_brackets(stack: Stack, frames: Sequence[Frame], lights: DistantLights | PlacedLights, *,
                    component: Component = Component.WHOLE, leak: float = 0.0) -> Stack:
     """Return a stack whose frames of one light are merged; where every light has one frame, the stack as it is.
-
-    Args:
-        component: what the images of a polarised pair become.
-        leak: of the polarisers, `Manifest.polarizer_leak`.
-    """
+    `component`: what the images of a polarised pair become. `leak`: of the polarisers, `Manifest.polarizer_leak`."""
     exposure = np.array([frame.exposure_s or 1.0 for frame in frames])
     kind = np.array([frame.light.polarization if isinstance(frame.light, DistantLight | PointLight) else "none" for frame in frames])
     of_cross, of_parallel = component.gains(leak)

@@ -49,13 +49,8 @@ class Correction:
     @classmethod
     def of(cls, capture: Capture, *, full_scale: bool = False) -> "Correction":
         """Read the dark, flat and ambient frames of a capture and return its correction.
-
-        Args:
-            full_scale: True to mark the largest value of integers as saturated where the capture gives no `saturation`.
-
-        Raises:
-            ImageError: a frame is unreadable or holds impossible values, or the flat field is dark inside the mask.
-        """
+        `full_scale`: True to mark the largest value of integers as saturated where the capture gives no `saturation`. Raises ImageError if
+        a frame is unreadable or holds impossible values, or the flat field is dark inside the mask."""
         manifest, whole = capture.manifest, capture.whole or capture
         space = manifest.color_space
         dark = flat = None
@@ -120,22 +115,13 @@ class Correction:
 
     def at(self, pixels: np.ndarray) -> "Correction":
         """Return the correction of single pixels.
-
-        Args:
-            pixels: [n] row-major positions in the image.
-
-        Returns:
-            A correction whose images are [n, 1, 3], for `corrected`.
-        """
+        `pixels`: [n] row-major positions in the image. Returns a correction whose images are [n, 1, 3], for `corrected`."""
         dark, flat, ambient = (None if image is None else image.reshape(-1, 1, 3)[pixels] for image in (self.dark, self.flat, self.ambient))
         return replace(self, dark=dark, flat=flat, ambient=ambient)
 
     def corrected(self, recorded: np.ndarray, frame: Frame) -> np.ndarray:
         """Return the scene-linear radiance of recorded values of a frame, [rows, cols, 3] float32 of the same size as the images here.
-
-        Args:
-            recorded: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16.
-        """
+        `recorded`: [rows, cols, 3] float32 fractions of full scale, or uint8 or uint16."""
         pixels = linearise(recorded, self.capture.manifest.color_space)
         if self.dark is not None:
             pixels = pixels - self.dark
@@ -154,14 +140,8 @@ class Correction:
 
 def _any_from(limit: float, recorded: np.ndarray) -> np.ndarray:
     """Return whether any channel of a pixel is at or above a limit.
-
-    Args:
-        limit: a fraction of full scale, or a floating-point value.
-        recorded: [rows, cols, 3] uint8, uint16, float16 or float32.
-
-    Returns:
-        [rows, cols] bool.
-    """
+    `limit`: a fraction of full scale, or a floating-point value. `recorded`: [rows, cols, 3] uint8, uint16, float16 or float32. Returns
+    [rows, cols] bool."""
     least: np.float32 | int = np.float32(limit)
     if recorded.dtype.kind == "u":  # the first integer that stands for as much; past the last where none does
         least = int(np.searchsorted(images.fractions(recorded.dtype), least))

@@ -22,11 +22,7 @@ class EarlyStack:
 
     def __init__(self, folder: Path, light_count: int) -> None:
         """Take note of what there will be; the first image makes the file.
-
-        Args:
-            folder: of the cache of the capture.
-            light_count: of all light frames.
-        """
+        `folder`: of the cache of the capture. `light_count`: of all light frames."""
         self._folder, self._lights, self._path = folder, light_count, folder / EARLY
         self._file: StackFile | None = None
         self._resolution = (0, 0)
@@ -36,13 +32,8 @@ class EarlyStack:
 
     def add(self, capture: Capture, frame: Frame, light: int) -> None:
         """Decode an image; where it, or a dark, flat or ambient frame, is another one later, it is decoded anew in the end.
-
-        Args:
-            light: the place of the frame among all light frames.
-
-        Raises:
-            StageError: the image cannot be read, or the file not be written, or there is no space beside that of the images to come.
-        """
+        `light`: the place of the frame among all light frames. Raises StageError if the image cannot be read, or the file not be written,
+        or there is no space beside that of the images to come."""
         self._keys.pop(light, None)
         fingerprints = self._fingerprints = self._fingerprints or Fingerprints(capture.folder, self._folder / FINGERPRINTS)
         file = self._file or self._begin(capture, frame)

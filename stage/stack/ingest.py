@@ -77,14 +77,9 @@ class Ingest:
     @classmethod
     def of(cls, capture: Capture, *, cache: Path | None = None, tracking: Tracking | None = None) -> "Ingest":
         """Hash the images of the light frames of a capture.
-
-        Args:
-            cache: the folder for the cache; None stands for `.relit` in the folder of the capture.
-            tracking: tracking frames, to the reference of which every frame is warped; None leaves the frames as recorded.
-
-        Raises:
-            ManifestError: no light lit any frame of the capture.
-        """
+        `cache`: the folder for the cache; None stands for `.relit` in the folder of the capture. `tracking`: tracking frames, to the
+        reference of which every frame is warped; None leaves the frames as recorded. Raises ManifestError if no light lit any frame of the
+        capture."""
         frames = capture.sources()
         if not frames:
             raise ManifestError(f"{capture.folder}: frames: none is lit by a distant, point, extended or gradient light")
@@ -95,14 +90,9 @@ class Ingest:
 
     def stack(self, progress: FrameProgress | None = None, early: "Begun | None" = None) -> Stack:
         """Return the stack from the cache, and build it first when the cache does not hold it.
-
-        Args:
-            progress: called after every decoded frame, or once with all frames when the cache holds the stack.
-            early: images that were decoded when they came; its file becomes that of the stack.
-
-        Raises:
-            ManifestError: a frame lies too far outside the tracking frames.
-        """
+        `progress`: called after every decoded frame, or once with all frames when the cache holds the stack. `early`: images that were
+        decoded when they came; its file becomes that of the stack. Raises ManifestError if a frame lies too far outside the tracking
+        frames."""
         found = stacks.find(self.folder, self.key)
         if found is not None:
             if progress is not None:

@@ -37,10 +37,7 @@ class ExposureSeries(NamedTuple):
 
 def exposure_series(capture: Capture, frames: Sequence[Frame]) -> ExposureSeries | None:
     """Return the frames of patterns by their exposures; None where no pattern was taken at more than one.
-
-    Raises:
-        ManifestError: some patterns were not taken at an exposure that others were, or the images do not say where they saturate.
-    """
+    Raises ManifestError if some patterns were not taken at an exposure that others were, or the images do not say where they saturate."""
     groups: dict[object, list[Frame]] = {}
     for frame in frames:
         groups.setdefault(frame.pattern, []).append(frame)
@@ -77,13 +74,8 @@ class JoinedExposures:
 
     def __init__(self, capture: Capture, series: ExposureSeries, progress: Callable[[int], None] | None = None) -> None:
         """Read all frames once, to learn at which exposures no frame of a pixel is clipped.
-
-        Args:
-            progress: called after every pattern with the count of patterns that have been read.
-
-        Raises:
-            ManifestError: a frame does not say where it saturates.
-        """
+        `progress`: called after every pattern with the count of patterns that have been read. Raises ManifestError if a frame does not say
+        where it saturates."""
         self._correction = Correction.of(capture, full_scale=True)
         self._taken = {frame.image: group for frame, group in zip(series.shown, series.taken, strict=True)}
         times = series.times_s
@@ -111,10 +103,7 @@ class JoinedExposures:
 
     def read(self, frame: Frame) -> Radiance:
         """Return the joined frame of a pattern: radiance, and where all its exposures are clipped.
-
-        Args:
-            frame: one of `ExposureSeries.shown`.
-        """
+        `frame`: one of `ExposureSeries.shown`."""
         total = np.zeros((*self._total.shape, 3), dtype=np.float32)
         saturated = np.zeros_like(self._lost)
         for number, taken in enumerate(self._taken[frame.image]):

@@ -43,10 +43,7 @@ class Planes:
 
     def bands(self, bytes_per_pixel: int = 0) -> Iterator[slice]:
         """Yield ranges of rows that cover the image, each small enough for BAND_BYTES.
-
-        Args:
-            bytes_per_pixel: the bytes that the caller needs for each pixel beside the planes.
-        """
+        `bytes_per_pixel`: the bytes that the caller needs for each pixel beside the planes."""
         frames, rows, channels, cols = self.values.shape
         step = max(1, BAND_BYTES // max(cols * (4 * frames * channels + bytes_per_pixel), 1))
         for top in range(0, rows, step):
@@ -54,13 +51,7 @@ class Planes:
 
     def band(self, rows: slice, frames: Sequence[int] | None = None) -> np.ndarray:
         """Return some frames of a range of rows, each pixel times its exposure.
-
-        Args:
-            frames: indices of the frames; None stands for all.
-
-        Returns:
-            [frames, channels, pixels] float32, a copy.
-        """
+        `frames`: indices of the frames; None stands for all. Returns [frames, channels, pixels] float32, a copy."""
         part = self.values[list(frames) if frames is not None else slice(None), rows]
         if self.exposure is not None:
             part = part * self.exposure[None, rows, None, :]

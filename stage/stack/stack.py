@@ -74,13 +74,8 @@ class Stack:
 
     def band(self, start: int, stop: int) -> np.ndarray:
         """Return the stored values of a pixel range.
-
-        Returns:
-            [3, lights padded, stop - start] float16, a view of a fresh read-only map; radiance = value · scale[light].
-
-        Raises:
-            StorageError: the cache was removed or is truncated.
-        """
+        Returns [3, lights padded, stop - start] float16, a view of a fresh read-only map; radiance = value · scale[light]. Raises
+        StorageError if the cache was removed or is truncated."""
         return self._map(values_path(self.folder, self.key), self.shape)[:, :, start:stop]
 
     def saturated(self, start: int, stop: int) -> np.ndarray:
@@ -94,13 +89,7 @@ class Stack:
 
     def pick(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stored values and saturation bits of single pixels.
-
-        Args:
-            pixels: [n] row-major indices.
-
-        Returns:
-            [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies.
-        """
+        `pixels`: [n] row-major indices. Returns [3, lights padded, n] float16 and [lights padded / 8, n] uint8, copies."""
         channels, lights, count = self.shape
         values = np.empty((channels, lights, len(pixels)), dtype=np.float16)
         touched = max(1, min(PAGE_BYTES * len(pixels), 2 * count))
@@ -112,21 +101,14 @@ class Stack:
 
     def pick_radiance(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of single pixels, and which readings are usable.
-
-        Returns:
-            [lights, n, 3] float64 scene-linear and [lights, n] bool, without padding.
-        """
+        Returns [lights, n, 3] float64 scene-linear and [lights, n] bool, without padding."""
         count = self.light_count
         values, bits = self.pick(pixels)
         radiance = np.moveaxis(values[:, :count].astype(np.float64), 0, -1) * self.scale[:count, None, None]
         return radiance, np.unpackbits(bits, axis=0, bitorder="little")[:count] == 0
 
     def pick_saturated(self, pixels: np.ndarray) -> np.ndarray:
-        """Return the saturation bits of single pixels.
-
-        Returns:
-            [lights padded / 8, n] uint8, a copy.
-        """
+        """Return the saturation bits of single pixels. Returns [lights padded / 8, n] uint8, a copy."""
         rows = self.shape[1] // 8
         if not saturated_path(self.folder, self.key).exists():
             return np.zeros((rows, len(pixels)), dtype=np.uint8)
@@ -183,11 +165,8 @@ def find(folder: Path, key: str) -> Stack | None:
 
 def write_index(stack: Stack, values: Sequence[int], saturated: int | None) -> None:
     """Write the index of a stack, which completes it.
-
-    Args:
-        values: the checksums of its planes, in the order of channels and padded lights.
-        saturated: the checksum of the saturation bits, or None where there are none.
-    """
+    `values`: the checksums of its planes, in the order of channels and padded lights. `saturated`: the checksum of the saturation bits, or
+    None where there are none."""
     index = {"frames": stack.frames, "scale": [float(scale) for scale in stack.scale], "pixel_count": stack.pixel_count,
              "motion": stack.motion, "clipped": stack.clipped, "checksums": {"values": list(values), "saturated": saturated}}
     write_text(index_path(stack.folder, stack.key), json.dumps(index | {"checksum": _checksum(index)}))
@@ -215,14 +194,13 @@ class ReplacedStack(Stack):
     radiance: np.ndarray = field(default_factory=lambda: np.zeros((3, 0), dtype=np.float32))  # [3, n] in place of each reading
 
     @classmethod
-    def of(cls, stack: Stack, pixel: np.ndarray, light: np.ndarray, radiance: np.ndarray) -> "ReplacedStack":
-        """Return a stack with these readings in place of its own.
-
-        Args:
-            pixel: [n] row-major positions in the image.
-            light: [n] positions in the stack.
-            radiance: [3, n].
-        """
+    def of(
+        cls, stack: Stack,
+        pixel: np.ndarray,  # [n] row-major positions in the image
+        light: np.ndarray,  # [n] positions in the stack
+        radiance: np.ndarray,  # [3, n]
+    ) -> "ReplacedStack":
+        """Return a stack with these readings in place of its own."""
         order = np.argsort(pixel, kind="stable")
         scale = stack.scale.copy()
         largest = np.zeros(len(scale))

@@ -32,11 +32,8 @@ def of_plane(plane: np.ndarray, padding: int) -> int:
 
 def is_sound(path: Path, shape: tuple[int, ...], kind: type[np.generic], checksums: Iterable[int]) -> bool:
     """Return whether a cache file holds an array of this shape and type whose planes have these checksums.
-
-    Args:
-        shape: of the array; the last axis and, for half values, the light axis are padded.
-        checksums: of the planes along the last axis in C order, or of the whole array where there is one.
-    """
+    `shape`: of the array; the last axis and, for half values, the light axis are padded. `checksums`: of the planes along the last axis in
+    C order, or of the whole array where there is one."""
     expected = list(checksums)
     try:
         state = _state(path)

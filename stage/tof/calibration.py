@@ -94,13 +94,8 @@ class TofCalibration(Strict):
 
     def correct(self, range_m: np.ndarray, temperature_c: float | None = None) -> np.ndarray:
         """Return measured ranges in metres, corrected for scale, offset and drift.
-
-        Args:
-            temperature_c: the temperature of the camera, for a calibration with drift.
-
-        Raises:
-            CalibrationError: a temperature is given without drift in the calibration, or missing with it.
-        """
+        `temperature_c`: the temperature of the camera, for a calibration with drift. Raises CalibrationError if a temperature is given
+        without drift in the calibration, or missing with it."""
         if (temperature_c is None) != (self.temperature is None):
             what = "no temperature drift, and a temperature was given" if self.temperature is None else "a temperature drift"
             raise CalibrationError(f"the time-of-flight calibration has {what}: give both or neither")
@@ -123,13 +118,8 @@ def write_calibration(calibration: TofCalibration, path: str | Path) -> None:
 
 def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: float) -> Harmonics:
     """Fit the wiggling at one frequency to phases that were measured at known ranges.
-
-    Args:
-        phase_rad: [n] measured phases, radians.
-        range_m: [n] true ranges along the ray, metres.
-
-    Raises:
-        CalibrationError: there are too few readings, or they cover too little of a period.
+    `phase_rad`: [n] measured phases, radians. `range_m`: [n] true ranges along the ray, metres. Raises CalibrationError if there are too
+    few readings, or they cover too little of a period.
 
     Source:
         Lindner, Kolb, "Lateral and depth calibration of PMD-distance sensors", ISVC 2006.
@@ -152,11 +142,7 @@ def fit_harmonics(phase_rad: np.ndarray, range_m: np.ndarray, modulation_hz: flo
 
 
 def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
-    """Fit scale and offset of a `TofCalibration` to known ranges, [n] each, by least squares.
-
-    Returns:
-        scale and offset_m.
-    """
+    """Fit scale and offset of a `TofCalibration` to known ranges, [n] each, by least squares. Returns scale and offset_m."""
     if measured_m.shape != true_m.shape or measured_m.ndim != 1 or np.unique(true_m).size < 2 or np.ptp(measured_m) == 0:
         raise CalibrationError(f"{measured_m.size} measured and {true_m.size} true ranges give no line: "
                                "give as many, at two different ranges or more")
@@ -166,10 +152,7 @@ def fit_line(measured_m: np.ndarray, true_m: np.ndarray) -> tuple[float, float]:
 
 def fit_temperature(error_m: np.ndarray, temperature_c: np.ndarray) -> tuple[Temperature, float]:
     """Fit the drift with temperature to range errors, [n] each, relative to the mean temperature.
-
-    Returns:
-        The drift, and the error at its reference temperature in metres.
-    """
+    Returns the drift, and the error at its reference temperature in metres."""
     if error_m.shape != temperature_c.shape or np.unique(temperature_c).size < 2:
         raise CalibrationError("drift needs errors at two different temperatures or more: give one error a temperature")
     reference = float(temperature_c.mean())

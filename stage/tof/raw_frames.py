@@ -51,10 +51,7 @@ class Histograms:
 
 def is_pulsed(capture: Capture) -> bool:
     """Return whether the time-of-flight frames of a capture are photon histograms.
-
-    Raises:
-        ManifestError: the capture has no time-of-flight frames, or both correlation images and histograms.
-    """
+    Raises ManifestError if the capture has no time-of-flight frames, or both correlation images and histograms."""
     kinds = {type(frame.tof) for frame in capture.manifest.frames if frame.tof is not None}
     if len(kinds) != 1:
         what = "holds cw and pulsed frames: give one kind" if kinds else "holds no tof frame"
@@ -76,10 +73,7 @@ def read_correlations(capture: Capture) -> CorrelationImages:
 
 def read_histograms(capture: Capture) -> Histograms:
     """Read the photon histograms of a capture, and sum frames with the same bins.
-
-    Raises:
-        ManifestError: there is none, frames have different bins, or first_photon_only is given without pulses.
-    """
+    Raises ManifestError if there is none, frames have different bins, or first_photon_only is given without pulses."""
     frames = _frames(capture, Pulsed)
     if not frames:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].tof: none is pulsed")
@@ -124,10 +118,7 @@ def _check_bins(capture: Capture, frames: list[tuple[Frame, Pulsed]]) -> None:
 
 def read_source(capture: Capture) -> Vector | None:
     """Return the place of the light source of the time-of-flight frames in the camera frame, metres; None: at the camera.
-
-    Raises:
-        ManifestError: frames have different sources.
-    """
+    Raises ManifestError if frames have different sources."""
     places = {frame.tof.source_m: frame.image for frame in capture.manifest.frames if frame.tof is not None}
     if len(places) > 1:
         one, other = list(places.values())[:2]

@@ -39,16 +39,9 @@ Track = Annotated[tuple[Pose, ...], Field(min_length=1), AfterValidator(_ascendi
 
 def poses_at(track: tuple[Pose, ...], times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Interpolate the poses of a track at given times: positions linearly, rotations by slerp.
-
-    Args:
-        times_s: [n] seconds, on the clock of the track.
-
-    Returns:
-        rotation [n, 3, 3] and translation [n, 3] of world_from_platform, and covered [n] bool, which is False before the first and after
-        the last pose. The nearest pose is returned there; a single pose covers all times.
-
-    Raises:
-        CalibrationError: a time is not finite.
+    `times_s`: [n] seconds, on the clock of the track. Returns rotation [n, 3, 3] and translation [n, 3] of world_from_platform, and covered
+    [n] bool, which is False before the first and after the last pose. The nearest pose is returned there; a single pose covers all times.
+    Raises CalibrationError if a time is not finite.
 
     Source:
         Shoemake, "Animating rotation with quaternion curves", SIGGRAPH 1985.
@@ -141,24 +134,15 @@ def read_scan(path: str | Path) -> Shots:
 
 def directions(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
     """Return the unit directions of shots in the scanner frame: -z straight ahead, +x to the right, +y upwards, as in a camera frame.
-
-    Returns:
-        [n, 3] float64.
-    """
+    Returns [n, 3] float64."""
     flat = np.cos(elevation_rad)
     return np.stack([np.sin(azimuth_rad) * flat, np.sin(elevation_rad), -np.cos(azimuth_rad) * flat], axis=-1)
 
 
 def world_points(shots: Shots, index: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the world points of ranges, from the pose of the platform at the time of each shot.
-
-    Args:
-        index: [m] the shot of each range; a shot may have several ranges.
-        range_m: [m] metres.
-
-    Returns:
-        [m, 3] float64 metres, world frame, and [m] bool: False where the track does not cover the time of the shot.
-    """
+    `index`: [m] the shot of each range; a shot may have several ranges. `range_m`: [m] metres. Returns [m, 3] float64 metres, world frame,
+    and [m] bool: False where the track does not cover the time of the shot."""
     rotation, translation, covered = poses_at(shots.scan.track, shots.time_s[index])
     platform_from_scanner = np.array(shots.scan.platform_from_scanner, dtype=np.float64)
     in_scanner = directions(shots.azimuth_rad[index], shots.elevation_rad[index]) * range_m[:, None]

@@ -183,14 +183,9 @@ def range_bound_m(scene: TofScene, camera: HistogramCamera) -> np.ndarray:
     With λ the mean of each bin, t the time of the return and s its photons, σ² ≥ 1/(F_tt - F_ts²/F_ss), F_xy = Σ λ_x·λ_y·w over the bins;
     w is 1/λ for Poisson counts. Without background and with fine bins that is σ ≥ (c/2)·pulse_sigma_s/√s. When each of N pulses
     counts one photon at most, a is the part of the pulses without an earlier photon, and w is a/(N·(e^(λ/N) - 1)).
-
-    Args:
-        scene: range, albedo and cosine; the bound is that of the first return, when the second return is known, and that of half the
-            path of light where the source is not at the camera.
-        camera: bins, pulse, photons, background (which is known) and pulses.
-
-    Returns:
-        [rows, cols] float64 metres; infinite where the histogram contains no light of the return.
+    `scene`: range, albedo and cosine; the bound is that of the first return, when the second return is known, and that of half the path of
+    light where the source is not at the camera. `camera`: bins, pulse, photons, background (which is known) and pulses. Returns [rows,
+    cols] float64 metres; infinite where the histogram contains no light of the return.
 
     Source:
         Bar-David, "Communication under the Poisson regime", IEEE Trans. Information Theory 15(1), 1969; Kay, "Fundamentals of

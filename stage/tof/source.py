@@ -24,11 +24,8 @@ class SourcePath:
     @classmethod
     def of(cls, camera: Camera, source_m: tuple[float, float, float] | None) -> "SourcePath | None":
         """Return the paths of a camera's pixels, or None for a source at the camera.
-
-        Args:
-            camera: of the capture; the lines of sight of an orthographic camera begin in the plane z = 0.
-            source_m: place of the source in the camera frame, metres.
-        """
+        `camera`: of the capture; the lines of sight of an orthographic camera begin in the plane z = 0. `source_m`: place of the source in
+        the camera frame, metres."""
         if source_m is None or not any(source_m):
             return None
         x, y = camera.plane_coordinates()
@@ -48,14 +45,8 @@ class SourcePath:
 
     def range_of(self, half_path_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the range of each pixel, and the metres of range that a metre of the half path is.
-
-        Args:
-            half_path_m: [rows, cols] metres. A half path of no more than |s|/2 has no point in front of the camera: its range is not
-                above zero.
-
-        Returns:
-            Two arrays [rows, cols] float64: r, and dr / d(half path).
-        """
+        `half_path_m`: [rows, cols] metres. A half path of no more than |s|/2 has no point in front of the camera: its range is not above
+        zero. Returns two arrays [rows, cols] float64: r, and dr / d(half path)."""
         path = 2 * np.asarray(half_path_m, dtype=np.float64)
         left = np.maximum(path - self.along_m, 1e-9 * self.distance_m)  # above zero for every path longer than |s|
         range_m = 0.5 * (path**2 - self.distance_m**2) / left

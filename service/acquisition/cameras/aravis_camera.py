@@ -193,11 +193,7 @@ def _library() -> ctypes.CDLL | None:
 
 
 def _call(name: str, result: Any, types: list[Any], *arguments: Any) -> Any:
-    """Call a function whose last argument takes an error.
-
-    Raises:
-        AravisError: with the text of the error.
-    """
+    """Call a function whose last argument takes an error. Raises AravisError with the text of the error."""
     function = getattr(_library(), name)
     function.restype, function.argtypes = result, [*types, POINTER(POINTER(_Error))]
     error = POINTER(_Error)()

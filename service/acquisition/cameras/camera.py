@@ -73,21 +73,12 @@ class Camera(Protocol):
 
     def take(self, exposure_s: float | None) -> Picture:
         """Take a picture and wait for it.
-
-        Args:
-            exposure_s: the exposure time; None: the one that the camera has.
-
-        Raises:
-            NoPictureError: no picture came in time.
-            RequestError: the camera does not answer, or cannot be set to the exposure.
-        """
+        `exposure_s`: the exposure time; None: the one that the camera has. Raises NoPictureError if no picture came in time. Raises
+        RequestError if the camera does not answer, or cannot be set to the exposure."""
 
     def look(self) -> np.ndarray:
         """Return what the camera sees now, [rows, cols, 3] float32, 0 to 1, encoded for a screen.
-
-        Raises:
-            RequestError: it has no live view, or does not answer.
-        """
+        Raises RequestError if it has no live view, or does not answer."""
 
     def unasked(self) -> list[Path]:
         """Return the pictures that came without being asked for since the last one, as late ones do; they are not told again."""
@@ -98,10 +89,7 @@ class Camera(Protocol):
 
 def open_camera(given: str, setup: Setup) -> Camera:
     """Return the camera that a text names, such as watch:/mnt/tether/*.jpg.
-
-    Raises:
-        RequestError: there is no such kind of camera, a package or the camera is missing, or it is in an automatic mode.
-    """
+    Raises RequestError if there is no such kind of camera, a package or the camera is missing, or it is in an automatic mode."""
     kind, _, detail = given.partition(":")
     if kind not in KINDS:
         raise RequestError(f"--camera {given}: there is no kind of camera {kind}: give one of {', '.join(KINDS)}")

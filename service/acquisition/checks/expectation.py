@@ -145,14 +145,8 @@ def same_kind(shot: Shot, other: Shot) -> bool:
 
 def prediction_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
     """Return the weight of the picture of each lamp in the prediction at a direction.
-
-    Args:
-        wanted: [3] unit vector.
-        directions: [lamps, 3] unit vectors of the lamps whose pictures there are.
-
-    Returns:
-        [lamps] float64, or None where there are too few, or all lie on one side of the direction.
-    """
+    `wanted`: [3] unit vector. `directions`: [lamps, 3] unit vectors of the lamps whose pictures there are. Returns [lamps] float64, or None
+    where there are too few, or all lie on one side of the direction."""
     if len(directions) < LEAST_LAMPS:
         return None
     angle = np.arccos(np.clip(directions @ wanted, -1, 1))

@@ -80,12 +80,8 @@ class Judge:
 
     def judge(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float) -> list[Fault]:
         """Return the faults of a picture that has just come.
-
-        Args:
-            pixels: [rows, cols, 3] recorded values, integers as fractions of full scale.
-            space: the colour space of the picture.
-            full_scale: the recorded value from which readings are clipped.
-        """
+        `pixels`: [rows, cols, 3] recorded values, integers as fractions of full scale. `full_scale`: the recorded value from which readings
+        are clipped."""
         seen = self._look(shot, pixels, space, full_scale)
         doubled = None if seen.sample.digest is None else self._digests.get(seen.sample.digest)
         if doubled is not None:

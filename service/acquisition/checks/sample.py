@@ -60,15 +60,13 @@ def place_of_tile(pixels: np.ndarray) -> tuple[int, int]:
     return min(int(row) * step, max(0, pixels.shape[0] - TILE_PX)), min(int(column) * step, max(0, pixels.shape[1] - TILE_PX))
 
 
-def sample_of(pixels: np.ndarray, place: tuple[int, int], space: str, full_scale: float) -> Sample:
-    """Return the sample of a picture.
-
-    Args:
-        pixels: [rows, cols, 3] recorded values, integers as fractions of full scale.
-        place: of the tile, by `place_of_tile`.
-        space: the colour space of the picture.
-        full_scale: the recorded value from which readings are clipped.
-    """
+def sample_of(
+    pixels: np.ndarray,  # [rows, cols, 3] recorded values, integers as fractions of full scale
+    place: tuple[int, int],  # of the tile, by `place_of_tile`
+    space: str,
+    full_scale: float,  # the recorded value from which readings are clipped
+) -> Sample:
+    """Return the sample of a picture."""
     step, (row, column) = _stride(pixels.shape), place
     sparse = np.ascontiguousarray(pixels[step // 2::step, step // 2::step], dtype=np.float32)
     tile = np.ascontiguousarray(pixels[row:row + TILE_PX, column:column + TILE_PX], dtype=np.float32)

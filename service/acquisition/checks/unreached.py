@@ -23,11 +23,8 @@ ADVICE = "are the lamps switched on, and does what is sent reach them?"
 
 def unreached_faults(pictures: Sequence[Seen], directions: np.ndarray, dark_of: Callable[[Shot], np.ndarray | float]) -> list[Fault]:
     """Return the faults of pictures under single lamps that show no sign of them, where most do; or of all, where all are alike.
-
-    Args:
-        directions: [lamps, 3] unit vectors of the lamps of the rig.
-        dark_of: the mean picture without any lamp at the exposure of a shot, [blocks]; 0 where there is none.
-    """
+    `directions`: [lamps, 3] unit vectors of the lamps of the rig. `dark_of`: the mean picture without any lamp at the exposure of a shot,
+    [blocks]; 0 where there is none."""
     alone = [each for each in pictures if each.shot.lamp is not None]
     dark: dict[tuple[str, float | None], np.ndarray | float] = {}
     for each in alone:

@@ -21,10 +21,7 @@ class HttpLine:
 
     def send(self, command: str) -> None:
         """Send a request, given as the text of `written`.
-
-        Raises:
-            RequestError: the controller cannot be reached, or its status is not 2xx.
-        """
+        Raises RequestError if the controller cannot be reached, or its status is not 2xx."""
         method, url, content_type, *body = command.split(SEPARATOR)
         request = urllib.request.Request(url, method=method, data=body[0].encode() if body else None,
                                          headers={"Content-Type": content_type} if body else {})

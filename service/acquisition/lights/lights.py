@@ -24,10 +24,7 @@ class Switch(Protocol):
 
     def set(self, levels: np.ndarray) -> None:
         """Let the lamps shine at levels [emitters] of the rig, and return when they have been told.
-
-        Raises:
-            RequestError: the lamps do not answer.
-        """
+        Raises RequestError if the lamps do not answer."""
 
     def close(self) -> None:
         """Turn the lamps dark, as far as they can be reached, and let go of the line."""
@@ -38,15 +35,8 @@ class Lights:
 
     def __init__(self, path: Path, rig: Rig, ask: Ask) -> None:
         """Open the ways to the lamps; nothing is switched yet.
-
-        Args:
-            path: of the rig, for messages.
-            ask: asks the person who holds a lamp.
-
-        Raises:
-            RequestError: a package or a device is missing.
-            ManifestError: a lamp has no address, or one that cannot be used.
-        """
+        `path`: of the rig, for messages. `ask`: asks the person who holds a lamp. Raises RequestError if a package or a device is missing.
+        Raises ManifestError if a lamp has no address, or one that cannot be used."""
         self._switches: list[Switch] = []
         protocols = {lamp.address.protocol for lamp in rig.lights if lamp.address is not None}
         try:

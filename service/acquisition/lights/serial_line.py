@@ -28,10 +28,7 @@ class SerialLine:
 
     def send(self, command: str) -> None:
         """Send a command, and wait for the answer if the controller answers.
-
-        Raises:
-            RequestError: it does not answer in time, or otherwise.
-        """
+        Raises RequestError if it does not answer in time, or otherwise."""
         try:
             self._port.reset_input_buffer()
             self._port.write(command.encode())

@@ -72,13 +72,8 @@ class Shot(NamedTuple):
 
 def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[Shot, ...]:
     """Return the shots of a plan.
-
-    Args:
-        projector: width and height of the projector in pixels; None: there is none.
-
-    Raises:
-        RequestError: the plan names a lamp that the rig lacks, shows patterns without a projector, or has no picture of the object.
-    """
+    `projector`: width and height of the projector in pixels; None: there is none. Raises RequestError if the plan names a lamp that the rig
+    lacks, shows patterns without a projector, or has no picture of the object."""
     if not rig.lights and not all(needs_projector([sequence]) for sequence in plan.sequences):
         raise RequestError("the plan has pictures under lamps: give the file of the lamps, --rig rig.json")
     found: list[Shot] = []

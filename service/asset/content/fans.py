@@ -10,14 +10,9 @@ APART_PX = 0.01
 
 def split_fans(quads: np.ndarray, triangles: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return faces of which those around each vertex form one fan.
-
-    Args:
-        quads: [Q, 4] int32. triangles: [T, 3] int32. They lie side by side in an image: no edge has more than two faces, and no other face
-            touches a vertex that a closed fan surrounds.
-
-    Returns:
-        The faces with new vertex numbers, and the old number of every vertex, [V'] int64; the old vertices come first.
-    """
+    `quads`: [Q, 4] int32. triangles: [T, 3] int32. They lie side by side in an image: no edge has more than two faces, and no other face
+    touches a vertex that a closed fan surrounds. Returns the faces with new vertex numbers, and the old number of every vertex, [V'] int64;
+    the old vertices come first."""
     corner_vertex = np.concatenate([quads.ravel(), triangles.ravel()])
     following = np.concatenate([np.roll(quads, -1, axis=1).ravel(), np.roll(triangles, -1, axis=1).ravel()])
     low, high = np.minimum(corner_vertex, following).astype(np.int64), np.maximum(corner_vertex, following)

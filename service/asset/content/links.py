@@ -73,10 +73,7 @@ def surface_links(maps: SurfaceMaps, valid: np.ndarray) -> Links:
 
 def slopes(normal: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return how relief grows from a pixel to the one on its right and to the one below, as its normal says, in pixels a pixel.
-
-    Args:
-        normal: [rows, cols, 3] unit, camera frame; slopes are 0 where it is 0 or not finite.
-    """
+    `normal`: [rows, cols, 3] unit, camera frame; slopes are 0 where it is 0 or not finite."""
     across, up, facing = (np.nan_to_num(normal[..., axis], posinf=0, neginf=0) for axis in range(3))
     if camera.focal_px is not None:
         x, y = (plane.astype(np.float32) for plane in camera.plane_coordinates())

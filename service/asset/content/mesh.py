@@ -70,12 +70,9 @@ class SurfaceMesh(NamedTuple):
 
 def height_mesh(maps: SurfaceMaps, *, vertex_budget: int = VERTEX_BUDGET, links: Links | None = None) -> SurfaceMesh:
     """Return a height map as a mesh.
-
-    Args:
-        maps: with `height`; pixels outside the mask, not finite, or not in front of a perspective camera get no vertex, nor do single
-            pixels, lines that are one pixel wide, and islands of a few pixels.
-        vertex_budget: above it only every k-th pixel in both directions is used, with the smallest k that fits.
-        links: which neighbours lie on one surface; None: those of surface_links.
+    `maps`: with `height`; pixels outside the mask, not finite, or not in front of a perspective camera get no vertex, nor do single pixels,
+    lines that are one pixel wide, and islands of a few pixels. `vertex_budget`: above it only every k-th pixel in both directions is used,
+    with the smallest k that fits. `links`: which neighbours lie on one surface; None: those of surface_links.
 
     Convention:
         st = ((c + 0.5) / W, 1 - (r + 0.5) / H) for the pixel (row r, column c), so that a vertex lies on the centre

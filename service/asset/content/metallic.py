@@ -75,12 +75,8 @@ def metallic_look(maps: SurfaceMaps) -> MetallicLook:
 
     A pixel has six numbers, the metallic workflow four: what does not fit is divided between albedo and F0 by least squares. A pixel that
     reflects less than the index of refraction says, or a dielectric with coloured F0, loses that; blends of a metal and a dielectric lose
-    nothing if their colours are alike.
-
-    Args:
-        maps: with `diffuse_albedo`. Without `specular` the surface is Lambertian: the albedo is the base colour, metallic is 0, and nothing
-            is reflected at n = 1.
-    """
+    nothing if their colours are alike. `maps`: with `diffuse_albedo`. Without `specular` the surface is Lambertian: the albedo is the base
+    colour, metallic is 0, and nothing is reflected at n = 1."""
     assert maps.diffuse_albedo is not None, "maps without reflectance have no look"
     base_color = np.zeros((*maps.mask.shape, 3), dtype=np.float32)
     metallic = np.zeros(maps.mask.shape, dtype=np.float32)

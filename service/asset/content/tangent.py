@@ -71,9 +71,8 @@ def dot(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
     """Return unit tangents ∂P/∂s of the planar texture coordinates, perpendicular to the vertex normals.
-
-    Returns:
-        [V, 3] float32. Each triangle adds its direction ∂P/∂s, laid into the plane of the normal and weighted by its angle at the vertex.
+    Returns [V, 3] float32. Each triangle adds its direction ∂P/∂s, laid into the plane of the normal and weighted by its angle at the
+    vertex.
 
     Source: Mikkelsen, "Simulation of Wrinkled Surfaces Revisited", 2008, as in mikktspace.c: quads are divided along their shorter diagonal
         in texture space, or in space where both are alike.

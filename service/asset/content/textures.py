@@ -211,14 +211,13 @@ def _tangent_bands(normal: np.ndarray, known: np.ndarray, mesh: SurfaceMesh) -> 
         yield rows, frame.express(unit) / 2 + 0.5, covered
 
 
-def bleed(values: np.ndarray, known: np.ndarray, *, reach: int, in_place: bool = False) -> np.ndarray:
-    """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border.
-
-    Args:
-        values: [rows, cols] or [rows, cols, channels], integers or floats; zero throughout when nothing is known.
-        reach: number of rings; texels beyond get the mean of the known ones, for the coarse mip levels.
-        in_place: whether `values` are changed.
-    """
+def bleed(
+    values: np.ndarray,  # [rows, cols] or [rows, cols, channels], integers or floats; zero throughout when nothing is known
+    known: np.ndarray, *,
+    reach: int,  # number of rings; texels beyond get the mean of the known ones, for the coarse mip levels
+    in_place: bool = False,  # whether `values` are changed
+) -> np.ndarray:
+    """Fill unknown texels from their known neighbours, ring by ring, so that filtering a texture does not darken its border."""
     filled = values[..., None] if values.ndim == 2 else values
     if not in_place:
         filled = filled.copy()

@@ -30,16 +30,9 @@ from stage.results.maps import SurfaceMaps
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
                 textures: TextureFormat = TextureFormat.PNG16) -> AssetReport:
     """Write solved maps as a .glb file, whole or not at all.
-
-    Args:
-        name: free text; the root node, the mesh and the material are named after it.
-        version: of the asset, kept with the file's name in the extras of `asset`.
-        textures: the bits of normals, roughness and metallic; colours have 8.
-
-    Raises:
-        AssetError: EXR textures; no height layer, or no face; a colour space that is not known; more than the 4 GiB that a .glb can hold.
-        StorageError: the disk refuses; what was there before is left as it was.
-    """
+    `name`: free text; the root node, the mesh and the material are named after it. `textures`: the bits of normals, roughness and metallic;
+    colours have 8. Raises AssetError: EXR textures; no height layer, or no face; a colour space that is not known; more than the 4 GiB that
+    a .glb can hold. Raises StorageError if the disk refuses; what was there before is left as it was."""
     target = Path(path)
     check_textures(target, textures)
     mesh, look, provenance, unit_m = surface_of(maps)
@@ -53,20 +46,18 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
                        (*camera_warnings(maps.camera), *(loss_warnings(look) if look is not None else ())))
 
 
-def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
-                version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
+def write_depth(
+    maps: DepthMaps,
+    cloud: PointCloud | None,  # what points.ply holds, or None
+    path: str | Path, *,
+    name: str,  # free text; the root node and the material are named after it
+    geometry: Geometry = Geometry.MESH,  # what the asset is made of; glTF has no variants for both
+    version: str = FIRST_VERSION,  # of the asset, kept with the file's name in the extras of `asset`
+    textures: TextureFormat = TextureFormat.PNG16,
+) -> tuple[str, ...]:
     """Write a depth as a .glb file, whole or not at all, and return sentences on what the asset lacks.
-
-    Args:
-        cloud: what points.ply holds, or None.
-        name: free text; the root node and the material are named after it.
-        geometry: what the asset is made of; glTF has no variants for both.
-        version: of the asset, kept with the file's name in the extras of `asset`.
-
-    Raises:
-        AssetError: EXR textures; no point, or no face for a mesh; a cloud that is not one of this depth; more than 4 GiB.
-        StorageError: the disk refuses; what was there before is left as it was.
-    """
+    Raises AssetError: EXR textures; no point, or no face for a mesh; a cloud that is not one of this depth; more than 4 GiB. Raises
+    StorageError if the disk refuses; what was there before is left as it was."""
     target = Path(path)
     check_textures(target, textures)
     points = measured_points(maps, cloud)

@@ -38,10 +38,8 @@ BASE_COLOR, METALLIC_ROUGHNESS, NORMAL = "base_color", "metallic_roughness", "no
 
 def add_surface(glb: Glb, mesh: SurfaceMesh, *, unit_m: float, material: int, textured: bool, with_tangents: bool) -> Primitive:
     """Add the arrays of a mesh and return the primitive that uses them.
-
-    Args:
-        unit_m: metres of a unit of the mesh; glTF has no other unit than the metre.
-        with_tangents: write tangents, which only a normal map needs.
+    `unit_m`: metres of a unit of the mesh; glTF has no other unit than the metre. `with_tangents`: write tangents, which only a normal map
+    needs.
 
     Convention:
         The texture origin of glTF is the upper left corner, so v = 1 - t. The bitangent that a renderer makes, cross(normal, tangent) · w,
@@ -164,12 +162,8 @@ def write_textures(maps: SurfaceMaps, mesh: SurfaceMesh, folder: Path, *, look: 
     """Write the images that a glTF material of solved maps uses, and return them by name.
 
     METALLIC_ROUGHNESS is there only where a highlight was fitted.
-
-    Args:
-        mesh: of these maps; the normal map is relative to its frame.
-        look: of these maps, where they have reflectance.
-        storage: PNG16 or PNG8, the bits of the images that are no colours.
-    """
+    `mesh`: of these maps; the normal map is relative to its frame. `look`: of these maps, where they have reflectance. `storage`: PNG16 or
+    PNG8, the bits of the images that are no colours."""
     reach = max(BLEED_TEXELS, mesh.step)
     data: type[np.unsignedinteger[Any]] = np.uint8 if storage is TextureFormat.PNG8 else np.uint16
 

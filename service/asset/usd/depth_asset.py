@@ -52,21 +52,15 @@ class _Parts(NamedTuple):
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
                 version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
     """Write a depth as a USD asset with a mesh, which is cut at breaks of the depth, and the measured points as variants of `geo`.
+    Returns sentences on what the asset lacks. Raises AssetError: another suffix; an EXR texture in a .usdz; no point, or no face for a mesh
+    that is asked for; a cloud that is not one of this depth. Raises StorageError if the disk refuses; what was there before is left as it
+    was.
 
     Args:
         cloud: what points.ply holds, or None.
         name: free text; the root prim is named after it.
         geometry: the variant that is selected. Beside a mesh with a vertex for every k-th row and column, the points are those of the same
             pixels; without any face there is no mesh beside points.
-        version: of the asset, for assetInfo.
-
-    Returns:
-        Sentences on what the asset lacks.
-
-    Raises:
-        AssetError: another suffix; an EXR texture in a .usdz; no point, or no face for a mesh that is asked for; a cloud that is not one of
-            this depth.
-        StorageError: the disk refuses; what was there before is left as it was.
     """
     target = Path(path)
     check_textures(target, textures)
@@ -135,11 +129,7 @@ def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: 
     """Write a point cloud in metres as a USD layer, .usda or .usdc, whole or not at all.
 
     The intensity of points, where they have one, becomes the primvar of that name.
-
-    Raises:
-        AssetError: another suffix, or no point.
-        StorageError: the disk refuses.
-    """
+    Raises AssetError: another suffix, or no point. Raises StorageError if the disk refuses."""
     target = Path(path)
     if target.suffix.lower() not in POINT_SUFFIXES:
         raise AssetError(f"{target} cannot be written as USD points: its suffix must be .usda or .usdc")

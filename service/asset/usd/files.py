@@ -60,6 +60,8 @@ def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
 
 def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container[str], apart: Sequence[Path] = ()) -> None:
     """Flush an asset to the disk and put it in place of an older one, whole or not at all; as a package where the target is a .usdz.
+    Raises AssetError: larger than a package can be. Raises StorageError: there is something else in place of a folder. Raises OSError if
+    the disk refuses; what was there before is put back.
 
     Args:
         layer: the asset's first layer, in the folder of temporary_folder_beside.
@@ -67,11 +69,6 @@ def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container
             target.
         ours: names of files that an older asset can have in such a folder; other files that lie there stay.
         apart: files in folders of their own that are never packed. Beside a package, which does not refer to them, older ones stay too.
-
-    Raises:
-        AssetError: larger than a package can be.
-        StorageError: there is something else in place of a folder.
-        OSError: the disk refuses; what was there before is put back.
     """
     folders = [folder for folder in sorted(layer.parent.iterdir()) if folder.is_dir()]
     if check_suffix(target) == ".usdz":

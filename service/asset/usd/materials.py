@@ -55,11 +55,9 @@ _MATERIALX_TYPES = {"float": _TYPES.Float, "string": _TYPES.String, "filename": 
 
 def define_looks(layers: AssetLayers, textures: Mapping[str, Texture], *, ior: float, openpbr: Any = None) -> None:
     """Define a material for each look, and make them the variants of `look`.
-
-    Args:
-        textures: by name, written into the folder that `layers` names. Without `roughness` the surface is the fitted Lambertian: `ior` is
-            1, so that nothing is reflected at normal incidence, and roughness is 1.
-        openpbr: MaterialX.Document of the metallic look, which its material has for the render context `mtlx`; None: it has none.
+    `textures`: by name, written into the folder that `layers` names. Without `roughness` the surface is the fitted Lambertian: `ior` is 1,
+    so that nothing is reflected at normal incidence, and roughness is 1. `openpbr`: MaterialX.Document of the metallic look, which its
+    material has for the render context `mtlx`; None: it has none.
 
     Convention:
         The normal map holds (n + 1)/2, so its texture has scale (2, 2, 2, 1) and bias (-1, -1, -1, 0) and is read raw.

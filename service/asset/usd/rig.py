@@ -121,10 +121,7 @@ def rig_lights(capture: Capture) -> list[RigLight]:
 
 def define_rig(layers: AssetLayers, capture: Capture, extent: np.ndarray) -> list[Path]:
     """Define the variant `rig` of `light` from the lights of a capture, and return the textures of dome lights, beside the layer.
-
-    Args:
-        extent: [2, 3] bounding box of the surface, camera frame, scene units.
-    """
+    `extent`: [2, 3] bounding box of the surface, camera frame, scene units."""
     lights = rig_lights(capture)
     textures: list[Path] = []
     with layers.lighting(RIG) as usd_stage:

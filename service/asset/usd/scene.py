@@ -92,10 +92,8 @@ def define_points(usd_stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, widt
 
 def define_cameras(usd_stage: Usd.Stage, root: Sdf.Path, camera: Camera, extent: np.ndarray) -> None:
     """Define, below the root, the camera whose picture is exactly the image, and for an orthographic one its far perspective twin.
-
-    Args:
-        extent: [2, 3] bounding box of the surface, camera frame, scene units; it sets the clipping ranges, and where the cameras of an
-            orthographic capture stand.
+    `extent`: [2, 3] bounding box of the surface, camera frame, scene units; it sets the clipping ranges, and where the cameras of an
+    orthographic capture stand.
 
     Convention:
         Lens distortion has no place in a UsdGeomCamera: the camera is the ideal one, as the mesh is.

@@ -73,11 +73,8 @@ def writing_asset(target: Path, description: Description) -> Iterator[AssetFiles
 
 def define_surroundings(files: AssetFiles, surroundings: Surroundings, camera: Camera, extent: np.ndarray) -> dict[str, int]:
     """Define the variants of `light` and `geo` that are asked for, write their textures, and return counts of clipped pixels by variant.
-
-    Args:
-        files: of the asset, to which those of the surroundings are added.
-        extent: [2, 3] bounding box of the surface, camera frame, scene units.
-    """
+    `files`: of the asset, to which those of the surroundings are added. `extent`: [2, 3] bounding box of the surface, camera frame, scene
+    units."""
     layers, clipped_pixels = files.layers, {}
     if surroundings.card is not None:
         written = card_images.write_card(surroundings.card, files.textures, as_png=layers.packed)

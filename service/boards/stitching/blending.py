@@ -18,14 +18,8 @@ def grid_points(x: np.ndarray, y: np.ndarray, z: np.ndarray, sigma: np.ndarray, 
     Each point counts in the four pixels around it by its bilinear weight, so that the weights of a point add up to one. The mean of a
     pixel is moved along the slope to the pixel's centre from where its points lie on average. The noise of a point is then spread over
     four pixels: `variance` is the weighted mean of σ², with which the sum of independent pixels has the variance that the sum over a
-    region has, but for the region's border, where it is larger than the truth.
-
-    Args:
-        x, y, z, sigma: [n] metres, board frame.
-
-    Returns:
-        The patch, empty where no point lies on the grid.
-    """
+    region has, but for the region's border, where it is larger than the truth. `x`, `y`, `z`, `sigma`: [n] metres, board frame. Returns the
+    patch, empty where no point lies on the grid."""
     row, col = grid.place(x, y)
     inside = (row > -1) & (row < grid.rows) & (col > -1) & (col < grid.cols)
     row, col, z, variance = row[inside], col[inside], z[inside].astype(np.float64), sigma[inside].astype(np.float64) ** 2
@@ -93,11 +87,8 @@ class Blender:
 
     def add(self, patch: HeightPatch, covariance: np.ndarray, shared_m: float) -> None:
         """Add the patch of one tile.
-
-        Args:
-            covariance: [6, 6] m² of the tile's motion, as in Motions.
-            shared_m: standard deviation of the error that the pixels of a block share.
-        """
+        `covariance`: [6, 6] m² of the tile's motion, as in Motions. `shared_m`: standard deviation of the error that the pixels of a block
+        share."""
         rows = slice(patch.row, patch.row + patch.height.shape[0])
         cols = slice(patch.col, patch.col + patch.height.shape[1])
         there = patch.measured

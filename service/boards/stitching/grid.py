@@ -29,10 +29,7 @@ class BoardGrid(NamedTuple):
     @classmethod
     def of(cls, camera: Camera) -> Self:
         """Return the grid of a height map's orthographic camera.
-
-        Raises:
-            ValueError: the camera is not orthographic, has no pixel_size_m, or its world_from_camera turns.
-        """
+        Raises ValueError if the camera is not orthographic, has no pixel_size_m, or its world_from_camera turns."""
         if camera.projection != "orthographic" or camera.pixel_size_m is None:
             raise ValueError("its camera must be orthographic with a pixel_size_m")
         x = y = 0.0
@@ -111,11 +108,8 @@ class HeightMap(NamedTuple):
 
 def gradients(height: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the slopes of a height map, NaN where not measured, by Sobel's differences over 3 × 3 pixels.
-
-    Returns:
-        Slope along columns and along rows, per pixel and 0 where a neighbour is missing, and the factor by which each multiplies the
-        standard deviation of independent noise (one number as an array of no dimension).
-    """
+    Returns slope along columns and along rows, per pixel and 0 where a neighbour is missing, and the factor by which each multiplies the
+    standard deviation of independent noise (one number as an array of no dimension)."""
     padded = np.pad(height, 1, constant_values=np.nan)
     smooth = padded[:-2] + 2 * padded[1:-1] + padded[2:]
     across = (smooth[:, 2:] - smooth[:, :-2]) / 8
@@ -136,16 +130,15 @@ def bends(height: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(larger), larger, np.inf)
 
 
-def shift_error(height: np.ndarray, sigma_px: tuple[float, float], noise: float) -> np.ndarray:
+def shift_error(
+    height: np.ndarray,  # [rows, cols], NaN where not measured
+    sigma_px: tuple[float, float],  # standard deviation of the shift along columns and rows, pixels
+    noise: float,  # standard deviation of the noise of a pixel
+) -> np.ndarray:
     """Return σ of the error of heights that an uncertain shift makes, [rows, cols] in the unit of the heights.
 
     Slope times σ, where a slope is clear; of a shift that is uncertain by more than WIDE_PX, half of what heights differ by within 2.5 σ
     of a pixel, less what noise alone differs by.
-
-    Args:
-        height: [rows, cols], NaN where not measured.
-        sigma_px: standard deviation of the shift along columns and rows, pixels.
-        noise: standard deviation of the noise of a pixel.
     """
     across, down, gain = gradients(height)
     clear = np.hypot(across, down) > CLEAR_SLOPE * float(gain) * noise

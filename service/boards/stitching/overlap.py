@@ -88,19 +88,14 @@ class _Common(NamedTuple):
     """Rows and columns of the grid that the arrays cover."""
 
 
-def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *, centre: tuple[float, float], length_m: float,
-                    shift_sigma_m: float, search_px: int) -> Overlap | None:
-    """Compare two patches on one grid.
-
-    Args:
-        centre: x and y about which motions turn and tilt, metres.
-        length_m: L, metres.
-        shift_sigma_m: standard deviation along x and y of what is known about the shift before.
-        search_px: the largest shift that is looked at; 0 refines only.
-
-    Returns:
-        None where fewer than LEAST_PIXELS are common.
-    """
+def measure_overlap(
+    first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
+    centre: tuple[float, float],  # x and y about which motions turn and tilt, metres
+    length_m: float,  # L, metres
+    shift_sigma_m: float,  # standard deviation along x and y of what is known about the shift before
+    search_px: int,  # the largest shift that is looked at; 0 refines only
+) -> Overlap | None:
+    """Compare two patches on one grid. Returns None where fewer than LEAST_PIXELS are common."""
     common = _common(first, second, (0, 0))
     if common is None:
         return None
@@ -134,10 +129,7 @@ def measure_overlap(first: HeightPatch, second: HeightPatch, grid: BoardGrid, *,
 
 def choose_candidate(overlap: Overlap, expected: np.ndarray, covariance: np.ndarray) -> Overlap | None:
     """Return an overlap that REPEATS with the one candidate that the other overlaps and the stage leave; None if they leave several.
-
-    Args:
-        expected: [2] the difference of the shifts that is expected without this overlap, metres, with its covariance [2, 2].
-    """
+    `expected`: [2] the difference of the shifts that is expected without this overlap, metres, with its covariance [2, 2]."""
     away = np.array([candidate.difference[:2] - expected for candidate in overlap.candidates])
     cost = np.einsum("ni,ni->n", away, np.linalg.solve(covariance, away.T).T) / 2
     order = np.argsort(cost)

@@ -72,11 +72,7 @@ class Scan(NamedTuple):
 
 def threshold(false_alarm: float, tests: int, *, sides: int = 2) -> float:
     """Return from how many σ on a deviation counts so that all tests together raise a false alarm with at most a given probability.
-
-    Args:
-        false_alarm: above 0 and below 1.
-        sides: 2 where a deviation of either sign is an alarm, else 1.
-    """
+    `false_alarm`: above 0 and below 1. `sides`: 2 where a deviation of either sign is an alarm, else 1."""
     return float(-NormalDist().inv_cdf(false_alarm / (max(tests, 1) * sides)))
 
 
@@ -95,12 +91,8 @@ def mean_of(deviation: HeightMap, pixels: np.ndarray, *, spread: float = 1.0) ->
 
 def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false_alarm: float, smallest_px: int) -> Scan:
     """Look for significant windows over a whole board; pixels of significant windows do not count in larger ones.
-
-    Args:
-        tolerance_m: deviations up to this are no defect; one number, or one for each pixel, [rows, cols].
-        false_alarm: the probability of any false alarm on a board without defects.
-        smallest_px: side of the smallest window.
-    """
+    `tolerance_m`: deviations up to this are no defect; one number, or one for each pixel, [rows, cols]. `false_alarm`: the probability of
+    any false alarm on a board without defects. `smallest_px`: side of the smallest window."""
     shape = deviation.measured.shape
     tolerance = np.broadcast_to(np.asarray(tolerance_m, dtype=np.float64), shape)
     known = deviation.measured
@@ -226,11 +218,8 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     """Return the deviation of two height maps on one grid.
 
     To the shared errors of both maps come those of edges, where a shift and interpolation change heights: slope times the uncertainty
-    of the shift between the maps, and a part of the second difference.
-
-    Args:
-        shift_sigma_m: standard deviation along x and y of the registration of the measured map.
-    """
+    of the shift between the maps, and a part of the second difference. `shift_sigma_m`: standard deviation along x and y of the
+    registration of the measured map."""
     deviation = measured.height - nominal.height
     known = np.isfinite(deviation)
     variance = measured.variance + nominal.variance

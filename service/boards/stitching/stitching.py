@@ -74,19 +74,15 @@ class Stitched(NamedTuple):
     warnings: list[str]
 
 
-def stitch(tiles: Sequence[TilePoints], *, shift_sigma_m: float | None = None, turn_sigma_degrees: float | None = None,
-           pixel_m: float | None = None, progress: Callable[[float], None] = lambda share: None) -> Stitched:
+def stitch(
+    tiles: Sequence[TilePoints], *,
+    shift_sigma_m: float | None = None,  # standard deviation of the stage's positions, metres; None: SHIFT_SIGMA_PX pixels
+    turn_sigma_degrees: float | None = None,  # standard deviation of the rotation of tiles; None: TURN_SIGMA_DEGREES
+    pixel_m: float | None = None,  # side of the grid's pixels; None: the largest distance of neighbouring points of a tile
+    progress: Callable[[float], None] = lambda share: None,  # called with the share of the overlaps that have been measured, 0 to 1
+) -> Stitched:
     """Find where every tile lies.
-
-    Args:
-        shift_sigma_m: standard deviation of the stage's positions, metres; None: SHIFT_SIGMA_PX pixels.
-        turn_sigma_degrees: standard deviation of the rotation of tiles; None: TURN_SIGMA_DEGREES.
-        pixel_m: side of the grid's pixels; None: the largest distance of neighbouring points of a tile.
-        progress: called with the share of the overlaps that have been measured, 0 to 1.
-
-    Raises:
-        BoardError: a tile overlaps no other, is mirrored, shows another surface, or several shifts of tiles fit alike.
-    """
+    Raises BoardError if a tile overlaps no other, is mirrored, shows another surface, or several shifts of tiles fit alike."""
     pixel = pixel_m or max(tile.pixel_m for tile in tiles)
     shift_sigma = shift_sigma_m or SHIFT_SIGMA_PX * pixel
     turn_sigma = np.radians(TURN_SIGMA_DEGREES if turn_sigma_degrees is None else turn_sigma_degrees)
@@ -128,12 +124,7 @@ def stitch(tiles: Sequence[TilePoints], *, shift_sigma_m: float | None = None, t
 
 def blend(tiles: Sequence[TilePoints], stitched: Stitched, grid: BoardGrid, *, motion: np.ndarray | None = None,
           progress: Callable[[int], None] = lambda done: None) -> HeightMap:
-    """Return the height map of all tiles.
-
-    Args:
-        motion: [6] a motion of the whole board; None: none.
-        progress: called with the count of tiles that are done.
-    """
+    """Return the height map of all tiles. `motion`: [6] a motion of the whole board; None: none."""
     blender = Blender(grid, centre=stitched.centre, length_m=stitched.length_m, noise_factor=stitched.noise_factor)
     whole = np.zeros(UNKNOWNS) if motion is None else motion
     for number, tile in enumerate(tiles):
@@ -214,10 +205,7 @@ def _check_agreement(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int]
 def _solve(tiles: Sequence[TilePoints], overlaps: dict[tuple[int, int], Overlap], middles: np.ndarray, length_m: float, pixel_m: float,
            shift_sigma_m: float, turn_sigma: float) -> Motions:
     """Solve for the motions, and settle overlaps that repeat by what the others say; `overlaps` takes what is settled.
-
-    Raises:
-        BoardError: several shifts fit alike, and nothing tells which is right.
-    """
+    Raises BoardError if several shifts fit alike, and nothing tells which is right."""
     def solved() -> Motions:
         return solve_motions(overlaps, middles, length_m=length_m, pixel_m=pixel_m, shift_sigma_m=shift_sigma_m, turn_sigma=turn_sigma)
 

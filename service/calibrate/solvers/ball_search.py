@@ -64,10 +64,7 @@ class RoundOutline(NamedTuple):
 
 def find_outlines(camera: Camera, pictures: list[np.ndarray]) -> list[RoundOutline]:
     """Find round outlines, the most complete and largest first.
-
-    Args:
-        pictures: [rows, cols] each, 0 to 1, in which outlines stand still: the mean and the brightest of all frames.
-    """
+    `pictures`: [rows, cols] each, 0 to 1, in which outlines stand still: the mean and the brightest of all frames."""
     found: list[RoundOutline] = []
     for picture in pictures:
         for u, v, radius in _proposals(picture):

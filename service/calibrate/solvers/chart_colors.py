@@ -131,11 +131,8 @@ def combine(frames: list[PatchReadings]) -> PatchReadings:
 
 def orient(readings: PatchReadings, reference: np.ndarray, grid: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the order of patches in which a chart shows its colours, and the order of its corners, for it may be turned or mirrored, and
-    how many patches have the colours of the chart.
-
-    Raises:
-        CalibrationError: the patches have the colours of the chart in no order, or differ in fewer than three colours.
-    """
+    how many patches have the colours of the chart. Raises CalibrationError if the patches have the colours of the chart in no order, or
+    differ in fewer than three colours."""
     columns, rows = grid
     index = np.arange(columns * rows).reshape(rows, columns)
     orders = [index.ravel(), index[::-1, ::-1].ravel(), index[:, ::-1].ravel(), index[::-1].ravel()]
@@ -153,14 +150,8 @@ def orient(readings: PatchReadings, reference: np.ndarray, grid: tuple[int, int]
 
 def solve_colors(readings: PatchReadings, chart: ChartReference, xyz_from_rgb: np.ndarray, earlier: np.ndarray) -> ChartColors:
     """Return the matrix from the readings of a chart in their order to a working space.
-
-    Args:
-        xyz_from_rgb: [3, 3] from the working space to XYZ under D50.
-        earlier: [3, 3] the matrix that the capture had.
-
-    Raises:
-        CalibrationError: the response is far from linear, the light is uneven, or too few patches are left; says which.
-    """
+    `xyz_from_rgb`: [3, 3] from the working space to XYZ under D50. `earlier`: [3, 3] the matrix that the capture had. Raises
+    CalibrationError if the response is far from linear, the light is uneven, or too few patches are left; says which."""
     reference = chart.xyz @ np.linalg.inv(xyz_from_rgb).T
     light, gamma, error, refused = _judge(readings, reference, chart)
     used = np.array([index not in refused for index in range(len(reference))])

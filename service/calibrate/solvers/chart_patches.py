@@ -35,10 +35,7 @@ class ChartPatches(NamedTuple):
 
     def means(self, radiance: np.ndarray, saturated: np.ndarray | None) -> np.ndarray:
         """Return the mean [patches, 3] of each patch in the image [h, w, 3] of the box.
-
-        Raises:
-            CalibrationError: a pixel of a patch is saturated.
-        """
+        Raises CalibrationError if a pixel of a patch is saturated."""
         inside = self.label >= 0
         label = self.label[inside]
         if saturated is not None and saturated[inside].any():
@@ -49,18 +46,10 @@ class ChartPatches(NamedTuple):
 
 def find_patches(path: Path, grid: tuple[int, int], corners: np.ndarray, resolution: tuple[int, int]) -> ChartPatches:
     """Return the patches of a chart.
-
-    Args:
-        path: a CSV file with the columns name, r, g, b: the linear reflectances of each patch in reading order.
-        grid: its columns and rows.
-        corners: [4, 2] the pixels (u, v), the first of the image being centred at (0.5, 0.5), of the centres of the first patch, the
-            last of the first row, the last of the chart, and the first of the last row.
-        resolution: the width and height of the images.
-
-    Raises:
-        ManifestError: the table is wrong; names the line.
-        CalibrationError: the corners span no chart in the image, or its patches are too small.
-    """
+    `path`: a CSV file with the columns name, r, g, b: the linear reflectances of each patch in reading order. `corners`: [4, 2] the pixels
+    (u, v), the first of the image being centred at (0.5, 0.5), of the centres of the first patch, the last of the first row, the last of
+    the chart, and the first of the last row. `resolution`: the width and height of the images. Raises ManifestError if the table is wrong;
+    names the line. Raises CalibrationError if the corners span no chart in the image, or its patches are too small."""
     names, reflectance = _read_reflectances(path, grid)
     places = place_patches(names, grid, corners, resolution)
     neutral = np.ptp(reflectance, axis=1) <= NEUTRAL * reflectance.max(axis=1)
@@ -80,10 +69,7 @@ class PatchPlaces(NamedTuple):
 
 def place_patches(names: Sequence[str], grid: tuple[int, int], corners: np.ndarray, resolution: tuple[int, int]) -> PatchPlaces:
     """Return the pixels that show each patch of a chart; the arguments as in `find_patches`, names as errors have them.
-
-    Raises:
-        CalibrationError: the corners span no chart in the image, or its patches are too small.
-    """
+    Raises CalibrationError if the corners span no chart in the image, or its patches are too small."""
     columns, rows = grid
     last = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=float)
     # [u, v, 1] → [x, y, 1] of the grid up to a factor, with a last element of 1

@@ -54,18 +54,14 @@ def built_in(patches: int) -> ChartReference:
     return read_reference(path, patches, "D50", "")._replace(source="X-Rite, November 2014, D50, 2 degrees")
 
 
-def read_reference(path: Path, patches: int, illuminant: str, space: str) -> ChartReference:
+def read_reference(
+    path: Path,  # CGATS with LAB_L LAB_A LAB_B or XYZ_X XYZ_Y XYZ_Z, or CSV with the columns name and l, a, b or x, y, z or r, g, b
+    patches: int,  # how many the chart has
+    illuminant: str,  # D50 or D65, the light of colours whose file does not name it
+    space: str,  # the scene-linear space of r, g, b
+) -> ChartReference:
     """Read the colours of a chart from a file.
-
-    Args:
-        path: CGATS with LAB_L LAB_A LAB_B or XYZ_X XYZ_Y XYZ_Z, or CSV with the columns name and l, a, b or x, y, z or r, g, b.
-        patches: how many the chart has.
-        illuminant: D50 or D65, the light of colours whose file does not name it.
-        space: the scene-linear space of r, g, b.
-
-    Raises:
-        ManifestError: the file is none of these or has another number of patches; names the line or the column.
-    """
+    Raises ManifestError if the file is none of these or has another number of patches; names the line or the column."""
     content = inputs.read_bytes(path)
     if b"BEGIN_DATA" in content:
         names, kind, values, named = _read_cgats(path, content.decode("utf-8", "replace"))

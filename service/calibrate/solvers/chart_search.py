@@ -40,18 +40,9 @@ def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
 
     The detector takes patches that lie beside a chart in the same spacing, as those of the other page of an open Passport, for some of
     its own. So what it finds is followed by what it finds where the picture is cut off across each of these.
-
-    Args:
-        picture: [rows, cols, 3] float32, scene-linear.
-        patches: 24 or 140, those of the chart.
-
-    Yields:
-        [4, 2] float64 pixels (u, v), the centre of the first being (0.5, 0.5): the first patch, the last of the first row, the last of the
-        chart, the first of the last row, as OpenCV takes the chart to stand.
-
-    Raises:
-        CalibrationError: nothing is found.
-    """
+    `picture`: [rows, cols, 3] float32, scene-linear. Yields [4, 2] float64 pixels (u, v), the centre of the first being (0.5, 0.5): the
+    first patch, the last of the first row, the last of the chart, the first of the last row, as OpenCV takes the chart to stand. Raises
+    CalibrationError if nothing is found."""
     step = max(picture.shape[:2]) / LONGEST
     small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
     brightest = small.max(axis=-1)

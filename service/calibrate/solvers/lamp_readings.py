@@ -61,11 +61,7 @@ class Template(Protocol):
     """What the brightest image leaves of the model, relative to it."""
 
     def read(self, radiance: np.ndarray, saturated: np.ndarray | None) -> Reading:
-        """Return the reading of an image, [h, w, 3] of the target's box.
-
-        Raises:
-            CalibrationError: it is saturated.
-        """
+        """Return the reading of an image, [h, w, 3] of the target's box. Raises CalibrationError if it is saturated."""
 
 
 class LambertTemplate(NamedTuple):
@@ -109,10 +105,7 @@ class MirrorTemplate(NamedTuple):
 
 def grey_ball_template(radiance: np.ndarray, saturated: np.ndarray | None, direction: np.ndarray, view: BallView) -> LambertTemplate:
     """Choose the pixels of a grey ball under a lamp in this direction.
-
-    Raises:
-        CalibrationError: too little of the ball is lit, or it is lit from elsewhere, or is no grey ball.
-    """
+    Raises CalibrationError if too little of the ball is lit, or it is lit from elsewhere, or is no grey ball."""
     cosine = view.normal @ direction
     usable = view.inside & ((view.normal * view.to_viewer).sum(axis=-1) > MIN_FACING) & (cosine > MIN_COSINE)
     _check_clipped(saturated, usable)
@@ -123,10 +116,7 @@ def grey_ball_template(radiance: np.ndarray, saturated: np.ndarray | None, direc
 
 def facing_cosine(direction: np.ndarray, normal: np.ndarray) -> float:
     """Return the cosine between a lamp's direction and the normal of a card.
-
-    Raises:
-        CalibrationError: the lamp stands behind the card, or nearly.
-    """
+    Raises CalibrationError if the lamp stands behind the card, or nearly."""
     cosine = float(normal @ direction)
     if cosine < MIN_COSINE:
         raise CalibrationError(f"the lamp stands {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.0f} degrees from the card's normal, and "
@@ -214,17 +204,12 @@ class MeasuredPrimary(NamedTuple):
     """The largest standard error of a point of the response; 0 without one."""
 
 
-def fit_primary(drive: np.ndarray, value: np.ndarray, sigma: np.ndarray) -> MeasuredPrimary:
-    """Fit a primary to its readings.
-
-    Args:
-        drive: [n] above 0 to 1, with 1 among them; several readings may have one drive.
-        value: [n, 3] readings, linear.
-        sigma: [n, 3] their standard errors.
-
-    Raises:
-        CalibrationError: there is no reading at full level, or light falls while the drive rises.
-    """
+def fit_primary(
+    drive: np.ndarray,  # [n] above 0 to 1, with 1 among them; several readings may have one drive
+    value: np.ndarray,  # [n, 3] readings, linear
+    sigma: np.ndarray,  # [n, 3] their standard errors
+) -> MeasuredPrimary:
+    """Fit a primary to its readings. Raises CalibrationError if there is no reading at full level, or light falls while the drive rises."""
     if not (drive == 1).any():
         raise CalibrationError("no image shows it at full level: its irradiance at full level is not known")
     drives, place = np.unique(drive, return_inverse=True)

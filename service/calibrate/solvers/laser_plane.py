@@ -52,13 +52,7 @@ class LightPlane(NamedTuple):
 
 
 def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
-    """Return the plane of a chessboard.
-
-    Args:
-        corners: [across × down, 2] image coordinates, row by row.
-        board: inner corners across and down.
-        camera: a calibrated perspective camera.
-    """
+    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row."""
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
     points = np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m
     x, y = camera.plane_at(corners[:, 0], corners[:, 1])
@@ -86,10 +80,7 @@ def inside_board(corners: np.ndarray, board: tuple[int, int], shape: tuple[int, 
 
 def fit_light_plane(poses: list[np.ndarray]) -> LightPlane:
     """Fit a plane to the points of a stripe on several boards, [n, 3] metres on each.
-
-    Raises:
-        CalibrationError: there are too few points, or they lie along one line.
-    """
+    Raises CalibrationError if there are too few points, or they lie along one line."""
     points = np.concatenate([np.zeros((0, 3)), *poses])
     if len(poses) < 2 or len(points) < LEAST_POINTS:
         raise CalibrationError(f"its stripe is seen on {len(poses)} boards, at {len(points)} places: two boards and {LEAST_POINTS} "

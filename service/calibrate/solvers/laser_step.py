@@ -55,14 +55,9 @@ class StepFit(NamedTuple):
 
 def fit_step(poses: Sequence[Sequence[StepStripe | None]], height_m: float, pixel: float) -> StepFit:
     """Fit the planes of lasers to their stripes on a step in one pose or several.
-
-    Args:
-        poses: for each pose the stripe of each laser plane; None where it does not cross the block.
-        pixel: width of a pixel in normalised coordinates.
-
-    Raises:
-        CalibrationError: a pose shows too little of the step, a plane is seen in none, or the stripes do not determine them.
-    """
+    `poses`: for each pose the stripe of each laser plane; None where it does not cross the block. `pixel`: width of a pixel in normalised
+    coordinates. Raises CalibrationError if a pose shows too little of the step, a plane is seen in none, or the stripes do not determine
+    them."""
     count = len(poses[0])
     for number in range(count):
         if not any(pose[number] is not None for pose in poses):

@@ -61,17 +61,10 @@ def find_spot(radiance: np.ndarray, saturated: np.ndarray | None, ball: Ball, vi
 
     Each pixel of the spot measures the light from its own reflected direction. The result is the mean of these directions, weighted
     by the radiance above the level of the spot. In an orthographic image of a mirror ball equal areas are equal solid angles, so
-    that the mean is the centroid of the light. Saturated pixels count as the brightest.
-
-    Args:
-        radiance: [h, w, 3] scene-linear, the box of `view`.
-        saturated: [h, w] bool, or None.
-        level: relative to the peak: pixels of the spot are brighter than it and than the noise of the ball, and connected to the peak. It
-            is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
-
-    Raises:
-        CalibrationError: there is no spot, it covers too much of the ball, or it is at the rim; the caller names the frame.
-    """
+    that the mean is the centroid of the light. Saturated pixels count as the brightest. `radiance`: [h, w, 3] scene-linear, the box of
+    `view`. `saturated`: [h, w] bool, or None. `level`: relative to the peak: pixels of the spot are brighter than it and than the noise of
+    the ball, and connected to the peak. It is low, because the faint border of a spot of few pixels determines its sub-pixel position best.
+    Raises CalibrationError if there is no spot, it covers too much of the ball, or it is at the rim; the caller names the frame."""
     facing = (view.normal * view.to_viewer).sum(axis=-1)
     looked_at = view.inside & (facing > RIM_COSINE)
     value = np.where(looked_at, radiance.astype(np.float64).mean(axis=-1), 0)
@@ -149,17 +142,13 @@ class Position(NamedTuple):
     flags: tuple[str, ...]
 
 
-def nearest_point(points: np.ndarray, directions: np.ndarray, uncertainty_degrees: np.ndarray) -> Position:
+def nearest_point(
+    points: np.ndarray,  # [balls, 3] the point at which each ray leaves its ball
+    directions: np.ndarray,  # [balls, 3] unit directions of the rays
+    uncertainty_degrees: np.ndarray,  # [balls] the standard error of each direction
+) -> Position:
     """Return the point with the least sum of squared distances from rays: Σ (I - d dᵀ)(x - p) = 0.
-
-    Args:
-        points: [balls, 3] the point at which each ray leaves its ball.
-        directions: [balls, 3] unit directions of the rays.
-        uncertainty_degrees: [balls] the standard error of each direction.
-
-    Raises:
-        CalibrationError: the rays are nearly parallel, or meet behind a ball.
-    """
+    Raises CalibrationError if the rays are nearly parallel, or meet behind a ball."""
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     normal = across.sum(axis=0)
     # for two rays at an angle γ the eigenvalues are 1 - cos γ, 1 + cos γ and 2

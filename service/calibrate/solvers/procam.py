@@ -77,13 +77,8 @@ def eight_bits(image: np.ndarray) -> np.ndarray:
 
 def find_corners(image: np.ndarray, board: tuple[int, int]) -> np.ndarray | None:
     """Find the inner corners of a chessboard in an image.
-
-    Args:
-        image: [rows, cols] float32, linear, evenly lit.
-
-    Returns:
-        [corners, 2] sub-pixel image coordinates, row by row of the board; None when a corner is not visible.
-    """
+    `image`: [rows, cols] float32, linear, evenly lit. Returns [corners, 2] sub-pixel image coordinates, row by row of the board; None when
+    a corner is not visible."""
     shown = eight_bits(image)
     found, corners = cv2.findChessboardCornersSB(shown, board, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
@@ -99,15 +94,9 @@ def find_corners(image: np.ndarray, board: tuple[int, int]) -> np.ndarray | None
 
 def projector_corners(corners: np.ndarray, u: np.ndarray, v: np.ndarray, decoded: np.ndarray, board: tuple[int, int]) -> np.ndarray:
     """Return the corners of the board in the image of the projector, by a homography around each corner.
-
-    Args:
-        corners: [corners, 2] image coordinates of the camera.
-        u, v: [rows, cols] decoded projector coordinates.
-        decoded: [rows, cols] bool, True where both coordinates are decoded.
-
-    Returns:
-        [corners, 2] projector coordinates; NaN where too few pixels around a corner are decoded, or they fit no homography.
-    """
+    `corners`: [corners, 2] image coordinates of the camera. `u`, `v`: [rows, cols] decoded projector coordinates. `decoded`: [rows, cols]
+    bool, True where both coordinates are decoded. Returns [corners, 2] projector coordinates; NaN where too few pixels around a corner are
+    decoded, or they fit no homography."""
     result = np.full(corners.shape, np.nan)
     grid = corners.reshape(board[1], board[0], 2)
     reach = int(np.clip(REACH_OF_SPACING * _spacing(grid), *REACH_PX))

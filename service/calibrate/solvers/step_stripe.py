@@ -48,15 +48,13 @@ class StepStripe(NamedTuple):
     """Order along the stripe: -1 if the riser comes before the top, 1 if behind it."""
 
 
-def split_stripe(x: np.ndarray, y: np.ndarray, order: np.ndarray, pixel: float) -> StepStripe | None:
-    """Return the parts of a stripe on the faces of a block that stands on its base; None if it does not cross base, top and base.
-
-    Args:
-        x: [n] normalised image coordinates of the points, right.
-        y: the same, upwards.
-        order: [n] number of the line of the image that each lies on, ascending.
-        pixel: width of a pixel in the same coordinates.
-    """
+def split_stripe(
+    x: np.ndarray,  # [n] normalised image coordinates of the points, right
+    y: np.ndarray,  # the same, upwards
+    order: np.ndarray,  # [n] number of the line of the image that each lies on, ascending
+    pixel: float,  # width of a pixel in the same coordinates
+) -> StepStripe | None:
+    """Return the parts of a stripe on the faces of a block that stands on its base; None if it does not cross base, top and base."""
     points = np.stack([x, y], axis=1)
     if len(points) < 2 * LEAST_END + LEAST_TOP:
         return None
