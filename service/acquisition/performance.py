@@ -137,7 +137,6 @@ def _frames(request: InterleavedImport, folder: Path) -> _Frames:
 
 
 def _count(names: Sequence[str], length: int, closed: bool, request: InterleavedImport) -> int:
-    """Return the number of periods."""
     steps, left = divmod(len(names) - closed, length)
     if steps > 0 and left == 0:
         return steps

@@ -211,7 +211,6 @@ def _check_unit(measured: HeightMap, nominal: Nominal) -> None:
 
 
 def _patch(heights: HeightMap) -> HeightPatch:
-    """Return the part of a map that is measured."""
     row, col = np.nonzero(heights.measured)
     rows, cols = slice(int(row.min()), int(row.max()) + 1), slice(int(col.min()), int(col.max()) + 1)
     floor = np.nanmax(heights.variance) * 1e-6 + 1e-30  # a nominal map may be exact

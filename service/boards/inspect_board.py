@@ -133,7 +133,6 @@ def _stitch(board: BoardTiles, request: InspectBoardRequest, timings: Timings) -
 
 
 def _levelled(heights: HeightMap) -> HeightMap:
-    """Return a height map less its plane."""
     plane = fit_form(heights.grid, heights.height, quadratic=False)
     return heights._replace(height=heights.height - plane.over(heights.grid))
 

@@ -95,7 +95,6 @@ def laser_planes(request: LaserPlanesRequest, progress: Progress | None = None, 
 
 
 def _on_boards(captures: list[Capture], request: LaserPlanesRequest, device: str, timings: Timings) -> _OnTarget:
-    """Measure the planes on a chessboard."""
     assert request.board is not None and request.square_m is not None
     if len(captures) < LEAST_BOARDS:
         raise CalibrationError(f"{captures[0].folder}: is one pose of the board, which shows a line of each plane: give {LEAST_BOARDS} "

@@ -97,7 +97,6 @@ def export(request: ExportRequest, progress: Progress | None = None) -> Exported
 
 
 def _export_maps(path: Path, request: ExportRequest, writer: Writer, timings: Timings) -> Exported:
-    """Write an asset of solved maps."""
     maps = SurfaceMaps.read(path, layers=EXPORTED_LAYERS)
     around = _open_surroundings(request, maps)
     contents = {path.stem: digest(path), **_content_hashes(around)}
@@ -130,7 +129,6 @@ def _plain(maps: SurfaceMaps) -> str | None:
 
 
 def _export_depth(path: Path, request: ExportRequest, write: Callable[..., tuple[str, ...]], timings: Timings) -> Exported:
-    """Write an asset of a depth."""
     maps = DepthMaps.read(path)
     beside = path.parent / POINTS_FILE
     cloud: PointCloud | None = read_ply(beside) if beside.exists() else None

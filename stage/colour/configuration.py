@@ -222,7 +222,6 @@ def _cache_id(place: str, label: str) -> str:
 
 @cache
 def _read(place: str, changed: int) -> Configuration:
-    """Read a configuration of a file that was changed at a time."""
     config = oiio.ColorConfig(place)
     if fault := config.geterror():
         reason = re.sub(r'^Error reading OCIO config "[^"]*": (Error: Loading the OCIO profile .* failed. )?', "", " ".join(fault.split()))

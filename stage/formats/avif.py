@@ -96,7 +96,6 @@ def _meta(stream: BinaryIO) -> tuple[bytes | None, bool]:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the kind and the content of each box."""
     at = 0
     while at + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, at)

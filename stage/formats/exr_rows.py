@@ -102,7 +102,6 @@ def growing(path: Path, *, rows: int, metadata: Mapping[str, Any], checksum: boo
 
 
 def _attributes(header: bytes, *, several: bool) -> Iterator[_Attribute]:
-    """Yield the attributes of the headers of all parts."""
     at, part = 8, 0
     while header[at]:
         while header[at]:

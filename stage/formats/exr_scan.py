@@ -95,7 +95,6 @@ def scan_header(path: Path, stream: BinaryIO) -> Scan:
 
 
 def _channels(path: Path, head: bytes, at: int, end: int, most: int) -> Iterator[int]:
-    """Yield the positions of the channels of a list."""
     count = 0
     while at < end and head[at]:
         count += 1

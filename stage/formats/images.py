@@ -234,7 +234,6 @@ def check_resolution(path: str | Path, resolution: tuple[int, int], *, declared:
 
 @contextmanager
 def _decoder(source: inputs.Source) -> Iterator[oiio.ImageInput]:
-    """Open the decoder of an image that is open."""
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # colours as recorded, not multiplied by alpha
     with source.reopened() as same:
@@ -254,7 +253,6 @@ def _orientation(path: Path, spec: oiio.ImageSpec) -> int:
 
 
 def _exposure(spec: oiio.ImageSpec) -> Exposure:
-    """Return the EXIF exposure of a file."""
     names = ("ExposureTime", "FNumber", "Exif:PhotographicSensitivity")
     return Exposure(*(sound(float(spec.get_float_attribute(name, 0.0))) for name in names))
 

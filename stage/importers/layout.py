@@ -167,7 +167,6 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
 
 
 def _npy(array: np.ndarray) -> bytes:
-    """Return the content of a .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array))
     return buffer.getvalue()

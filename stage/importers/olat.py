@@ -81,7 +81,6 @@ def import_near_lights(source: Path, destination: Path, *, axes: Axes, unit_m: f
 
 
 def _entries(rig: LightRig, positions: np.ndarray, matrix: np.ndarray) -> list[dict[str, Any]]:
-    """Return the entries `light` of the manifest."""
     entries: list[dict[str, Any]] = []
     for index, position in enumerate(positions.tolist()):
         entry: dict[str, Any] = {"type": "point", "position_m": position,

@@ -179,7 +179,6 @@ def remove(folder: Path, key: str) -> None:
 
 
 def _checksum(index: dict[str, Any]) -> int:
-    """Return the checksum of the content of an index."""
     return zlib.crc32(json.dumps(index, sort_keys=True).encode())
 
 

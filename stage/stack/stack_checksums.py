@@ -64,7 +64,6 @@ def _have(path: Path, start: int, size: int, checksums: Sequence[int]) -> bool:
 
 
 def _of_next(file: BinaryIO, size: int) -> int:
-    """Return the checksum of the next bytes of a file."""
     checksum = 0
     while size > 0 and (content := file.read(min(size, PIECE_BYTES))):
         checksum, size = zlib.crc32(content, checksum), size - len(content)

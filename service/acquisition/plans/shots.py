@@ -180,7 +180,6 @@ def even_levels(rig: Rig, level: float = 1.0) -> np.ndarray:
 
 
 def _lamps(rig: Rig, names: Sequence[str] | None, where: str) -> Sequence[int]:
-    """Return the indices of lamps by their names."""
     if names is None:
         return range(len(rig.lights))
     known = {lamp.name: index for index, lamp in enumerate(rig.lights)}

@@ -94,7 +94,6 @@ def define_openpbr_looks(layers: AssetLayers, folder: Path, textures: Mapping[st
 
 
 def _define_material(layers: AssetLayers, look: str, name: str, textures: Mapping[str, Texture]) -> UsdShade.Material:
-    """Define a material whose inputs read the textures that there are."""
     usd_stage, path = layers.materials, layers.looks.AppendChild(name)
     material = UsdShade.Material.Define(usd_stage, path)
     Usd.ColorSpaceAPI.Apply(material.GetPrim()).CreateColorSpaceNameAttr().Set(Gf.ColorSpaceNames.LinearRec709)

@@ -147,7 +147,6 @@ def _on_a_circle(points: np.ndarray) -> np.ndarray:
 
 
 def _near(camera: Camera, ball: Ball, u: float, v: float, radius: float) -> bool:
-    """Return whether a circle is nearly the outline of a ball."""
     ball_u, ball_v = project(camera, ball.centre)
     size = SAME * max(ball.radius_px, radius)
     return math.hypot(u - ball_u, v - ball_v) < size and abs(ball.radius_px - radius) < size
