@@ -20,8 +20,7 @@ from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.preview import PREVIEW_FILE
 from service.requests.acquire import AcquireRequest
-from tests.service.acquisition.owl_stage import ROOT, owl_on_stage
-from tests.service.acquisition.scenes import KINDS, Scene, named, owl, relief
+from tests.service.acquisition.scenes import KINDS, ROOT, Scene, named, owl, owl_on_stage, relief
 from tests.service.acquisition.test_acquire import faults_at_random
 
 SEEDS = range(20)

@@ -18,7 +18,7 @@ from stage.results.maps import MAPS_FILE, SurfaceMaps
 from tests.clients.scenes import GOLD, PAINT, ball_maps, seen_in_perspective, without_scale
 from tests.clients.validators import findings
 from tests.scenes.surroundings import capture_of, write_frames
-from tests.service.asset.gltf import khronos
+from tests.service.asset.gltf import reading
 
 SIDE = 40
 pytestmark = pytest.mark.long
@@ -75,7 +75,7 @@ def exported(maps: SurfaceMaps, folder: Path, **options) -> Path:
 
 def faults(asset: Path) -> list[str]:
     """Return what the validators of its format find in an asset."""
-    return khronos.findings(khronos.validate(asset)[0]) if asset.suffix == ".glb" else findings(asset)
+    return reading.findings(reading.validate(asset)[0]) if asset.suffix == ".glb" else findings(asset)
 
 
 @pytest.mark.parametrize("surface", SURFACES)

@@ -1,11 +1,18 @@
-"""Pictures under single lamps, in memory, with the noise and the faults of a camera."""
+"""Scenes and stages that are captured in tests."""
 
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
+import service
 from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
@@ -14,6 +21,9 @@ from service.twin.camera import AMBIENT, BLUR_PX, OVEREXPOSED, SHIFT_PX
 from stage.capture.capture import Capture
 from stage.formats import images
 from stage.rig.rig import Rig
+from tests.scenes.patched_rigs import loopback
+from tests.scenes.rigs import write_rig
+from tests.service.acquisition.test_acquire import posting
 from tests.service.owl import OWL, block_mean
 
 KINDS = (FaultKind.UNLIT, FaultKind.WRONG_LIGHT, FaultKind.DOUBLED, FaultKind.MOVED, FaultKind.CLIPPED, FaultKind.AMBIENT,
@@ -23,6 +33,7 @@ VISIBLE = 0.3
 
 BRIGHT = 1.5
 """Ambient light of 0.8 of the mean picture goes where a lamp gives less than this: the prediction errs by more beside the brightest."""
+ROOT = Path(service.__file__).parents[1]
 
 
 class Scene(NamedTuple):
@@ -136,3 +147,23 @@ def named(scene: Scene, seed: int, kinds: tuple[FaultKind, ...]) -> tuple[dict[s
         pixels = camera.take(shot, made.get(index))
         judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE))
     return {shots[index].key: kind for index, kind in made.items()}, {fault.shot: fault.kind for fault in judge.review()}
+
+
+@contextmanager
+def owl_on_stage(folder: Path, *options: object) -> Iterator[list[object]]:
+    """Run the twin, with options for it, as long as the block; yield the options of `relit capture` that name lamps, camera and --trigger.
+
+    Its lamps are a third as bright as those of the owl's capture.
+    """
+    rig, watched, host = folder / "rig.json", folder / "watched", loopback()
+    write_rig(rig, [frame.light.direction for frame in Capture.open(OWL).manifest.frames], {"white": (1.0, 1.0, 1.0)}, host=host)
+    command = [sys.executable, "-m", "service.cli.main", "twin", rig, OWL, "--interface", host, "--port", "0", "--pictures", watched,
+               "--noise", "0.001", "--exposure", "-2", "--cache", folder, *options]
+    twin = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    try:
+        assert twin.stdout.readline().startswith("twin ")
+        page = twin.stdout.readline().split()[1].removesuffix(":")
+        yield ["--rig", rig, "--camera", f"watch:{watched}", "--trigger", posting(f"{page}/release")]
+    finally:
+        twin.kill()
+        twin.wait()

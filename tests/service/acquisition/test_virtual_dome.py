@@ -1,5 +1,4 @@
-"""A dome of 96 lamps over sACN and a camera at a USB port, both the twin's: the lamps light, and libgphoto2's virtual camera takes what is
-on its card.
+"""Captures at virtual domes, one of them by a watched folder.
 
 The card is full after 26 pictures, so the capture goes on several times.
 """
@@ -14,13 +13,15 @@ import OpenEXR
 import pytest
 
 from service.acquisition.checks.expectation import FaultKind
+from stage.capture.capture import Capture
 from stage.formats import images
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render, write_capture
 from tests.scenes.patched_rigs import loopback
 from tests.scenes.rigs import write_rig
-from tests.service.acquisition.scenes import BRIGHT, VISIBLE, relief
+from tests.service.acquisition.scenes import BRIGHT, VISIBLE, owl_on_stage, relief
 from tests.service.acquisition.test_cameras import virtual_camera
+from tests.service.owl import OWL, block_mean
 
 LAMPS = 96
 FAULTS = {"dead": FaultKind.UNLIT, "wrong": FaultKind.WRONG_LIGHT, "doubled": FaultKind.DOUBLED, "moved": FaultKind.MOVED,
@@ -73,6 +74,8 @@ with Listener(twin.universes, host, keep=False) as listener:
                     raise  # the next camera has an empty one
 print(json.dumps([cards, {fault.shot: fault.kind for fault in result.faults}]))
 """
+CROP = "130,120,48,48"
+"""The part of the owl that is solved."""
 
 
 def photographed(folder: Path, host: str, *faults: str) -> list:
@@ -146,3 +149,30 @@ def test_a_card_cannot_lose_a_picture(tmp_path, relit):
     words = relit.refused("twin", tmp_path / "rig.json", tmp_path / "scene", "--pictures", tmp_path / "card", "--picture-format", "card",
                           "--faults", "dead@3,late@4")
     assert "--faults late" in words
+
+
+@pytest.mark.long
+def test_the_owl_is_captured_as_its_files_are_imported(tmp_path, relit):
+    """Each of 96 pictures is that of its lamp, and what is solved of them is what is solved of the same files when they are imported."""
+    with owl_on_stage(tmp_path) as given:
+        said = relit.done("capture", "olat", *given, "--out", tmp_path / "capture").out
+    assert "fault " not in said and "96 of 96" in said
+    capture, imported = tmp_path / "capture", tmp_path / "imported"
+    frames, lights = (Capture.open(folder).manifest.frames for folder in (capture, OWL))
+    assert np.allclose([frame.light.direction for frame in frames], [frame.light.direction for frame in lights], atol=1e-6)
+    seen, lit = (np.stack([block_mean(images.read_pixels(path).astype(np.float32), 8) for path in paths])
+                 for paths in ([capture / frame.image for frame in frames], sorted(OWL.glob("[0-9][0-9][0-9].exr"))))
+    # the owl's lamps are three times as bright, and the exposure is a quarter
+    assert [np.abs(lit / 12 - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(96))
+
+    rows = [" ".join([frame.image, *map(repr, frame.light.direction)]) for frame in frames]
+    (capture / "dome.lp").write_text("\n".join([str(len(rows)), *rows]))
+    relit.done("import", "lp", capture / "dome.lp", imported)
+    for folder in (capture, imported):
+        relit.done("solve", folder, "--crop", CROP, "--out", folder / "maps")
+        relit.done("export", folder / "maps", "--out", folder / "asset.usdz")
+    maps = [OpenEXR.File(str(folder / "maps" / "maps.exr"), separate_channels=True).channels() for folder in (capture, imported)]
+    assert maps[0].keys() == maps[1].keys()
+    for name, channel in maps[0].items():
+        assert np.array_equal(channel.pixels, maps[1][name].pixels, equal_nan=True), name
+    assert (capture / "asset.usdz").stat().st_size > 0

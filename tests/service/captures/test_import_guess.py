@@ -1,4 +1,4 @@
-"""relit import guess: each layout is told by its files, and the printed command makes the capture."""
+"""Layouts that are guessed, and proposals for uploaded files."""
 
 import json
 import shlex
@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from service.captures.importing import import_chosen, propose
+from service.requests.base.import_choices import ImportChoices
 from stage.capture.capture import Capture
+from stage.errors import ManifestError
 from tests.scenes import near_lights
 from tests.scenes.captures import files_in, make_scene, write_image
 from tests.service.captures.test_import_laser import as_text, write_camera, write_scan
@@ -243,3 +246,19 @@ def test_damaged_files_are_passed_over(relit, tmp_path, name):
     assert outcome.code == (0 if name == "b.dome" else 2) and outcome.err.count("\n") == (0 if name == "b.dome" else 1)
     write_images(tmp_path)
     assert f"relit import {'relightlab' if name == 'b.dome' else 'photos'}" in relit("import", "guess", tmp_path).well()
+
+
+@pytest.mark.parametrize(("layout", "options"), [
+    ("gray", {"projector": [64, 32]}), ("phase", {"projector": [64, 32], "periods": [8], "steps": 4})])
+def test_a_video_is_left_to_the_machine_of_its_owner(tmp_path, layout, options):
+    """The file is no video but for its name: whoever opened it would say so."""
+    (tmp_path / "take.mp4").write_bytes(b"nothing")
+    with pytest.raises(ManifestError, match=f"take.mp4: is a video: unpack it with relit import {layout} on your machine"):
+        import_chosen(tmp_path, ImportChoices(layout=layout, file="take.mp4", options=options), (), "take")
+    assert [path.name for path in tmp_path.iterdir()] == ["take.mp4"]
+
+
+def test_a_video_is_not_proposed(tmp_path):
+    (tmp_path / "take.mp4").write_bytes(b"nothing")
+    with pytest.raises(ManifestError, match="relit import gray on your machine"):
+        propose(tmp_path)

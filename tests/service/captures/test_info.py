@@ -1,4 +1,4 @@
-"""relit info: the facts of a capture, and every fault of it at once."""
+"""What relit info says of a capture, and which contradictions it finds in its images."""
 
 import json
 import re
@@ -14,11 +14,15 @@ from stage.capture.lighting import check_solvable
 from stage.errors import ManifestError
 from stage.formats import exr
 from tests.scenes import near_lights
-from tests.scenes.captures import edit_frame, make_scene, write_capture, write_exr, write_manifest
+from tests.scenes.captures import edit_frame, make_scene, manifest_of, write_capture, write_exr, write_image, write_manifest
+from tests.scenes.ellipsoid import ellipsoid
 from tests.scenes.near_lights import lamps
 from tests.service.recording import Recording
 
 SCENE = make_scene(size=16, lights=6)
+EXPLAINED = ellipsoid(count=12)
+EXPOSURE = 0.25
+SCALED = np.maximum(EXPLAINED.images, 0) / EXPLAINED.images.max()
 
 
 def test_every_fault_is_named(tmp_path):
@@ -131,3 +135,46 @@ def test_negative_values_that_are_clipped_are_counted(tmp_path):
     assert fault.endswith("--clip-negative sets such values to 0")
     found = inspect(InfoRequest(capture=tmp_path, clip_negative=True))
     assert found.faults == [] and "3 pixels of 1 image were" in dict(found.facts)["clipped"]
+
+
+def srgb(linear):
+    return np.where(linear < 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def findings(folder, recorded, **changes):
+    """What is found in a capture of these values, [lights, rows, cols, 3] from 0 to 1, in 16 bits."""
+    frames = manifest_of(EXPLAINED)["frames"]
+    for index, (frame, values) in enumerate(zip(frames, recorded, strict=True)):
+        frame |= {"image": f"{index}.png", "exposure_s": EXPOSURE}
+        write_image(folder / frame["image"], np.round(values * 65535).astype(np.uint16))
+    write_image(folder / "mask.png", (EXPLAINED.mask * 255).astype(np.uint8))
+    write_manifest(folder, {**manifest_of(EXPLAINED), "frames": frames, **changes})
+    found = inspect(InfoRequest(capture=folder))
+    assert found.faults == []
+    return found.findings
+
+
+@pytest.mark.parametrize(("encode", "declared"), [(lambda values: values, "lin_rec709_scene"), (srgb, "srgb_texture"),
+                                                  (lambda values: values ** (1 / 2.2), "g22_rec709_scene")])
+def test_a_right_manifest_has_no_finding(tmp_path, encode, declared):
+    assert findings(tmp_path, encode(SCALED), color_space=declared) == []
+
+
+@pytest.mark.parametrize("encode", [srgb, lambda values: values ** (1 / 2.2)], ids=["sRGB", "power"])
+def test_encoded_images_that_are_declared_linear_are_named(tmp_path, encode):
+    """The curves of sRGB and of a power of 2.2 differ by less than these pixels tell."""
+    (finding,) = findings(tmp_path, encode(SCALED))
+    assert finding.startswith("color_space: the images look display-encoded, but lin_rec709")
+    assert finding.endswith(("declare srgb_texture if they are", "declare g22_rec709_scene if they are"))
+def test_other_suspicions_are_named_and_the_command_prints_them_and_ends_well(relit, tmp_path):
+    (finding,) = findings(tmp_path, SCALED, color_space="srgb_texture")
+    assert "the images look linear, but srgb_texture is declared" in finding
+    (finding,) = findings(tmp_path, SCALED[::-1])
+    assert finding.startswith("frames[].light: the order looks reversed")
+    assert "\nfinding      frames[].light: the order looks reversed" in relit("info", tmp_path).well()
+
+
+def test_a_dark_image_is_taken_off_first(tmp_path):
+    """A pedestal that hides the shadows, in the images and in the dark image."""
+    write_exr(tmp_path / "dark.exr", np.full((*EXPLAINED.mask.shape, 3), 0.2))
+    assert findings(tmp_path, 0.2 + 0.8 * SCALED, dark="dark.exr") == []

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -17,7 +18,8 @@ import service
 from service.errors import RequestError
 from service.play import play as module
 from service.play.play import play
-from service.requests.play import PlayRequest
+from service.requests.base.options import options_of
+from service.requests.play import PlayRequest, TwinRequest
 from service.twin.fixtures import DataPacket, SyncPacket, read_artnet, read_sacn
 from service.twin.listener import Listener
 from stage.errors import ManifestError
@@ -29,6 +31,12 @@ from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
 ROOT = Path(service.__file__).parents[1]
 DARK_FRAMES = 4
 """One before the show, three after it."""
+PAGE = Path(__file__).parents[3] / "docs" / "drive.md"
+TEXT = PAGE.read_text(encoding="utf-8").partition("## Play and rehearse")[2].partition("\n## ")[0]
+ELSEWHERE = {"--cache"}
+"""Options that all commands with images have."""
+CAMERA = {"--pictures", "--picture-format", "--faults", "--noise", "--seed"}
+"""Options of the twin's camera, which docs/set.md tells."""
 
 
 def counted_steps(frames: int, emitters: int) -> np.ndarray:
@@ -248,3 +256,13 @@ def test_two_hosts_of_one_universe_are_refused(tmp_path):
     cues = write_cues_file(tmp_path / "cues.json", rig, counted_steps(2, 6))
     with pytest.raises(ManifestError, match=r"lights\[1\]\.address\.host: is 127\.0\.0\.2"):
         play(PlayRequest(cues=cues, rig=rig))
+
+
+def test_the_page_names_the_options_that_there_are():
+    options = [option for model in (PlayRequest, TwinRequest) for option in options_of(model) if not option.spelling.argument]
+    named = set(re.findall(r"--[a-z][a-z-]+", TEXT))
+    known = {option.flag for option in options} | {option.off for option in options if option.kind is bool}
+    assert named <= known
+    wanted = {option.off if option.field.default is True else option.flag for option in options} - {"--device"} - ELSEWHERE
+    assert wanted & set(re.findall(r"--[a-z][a-z-]+", (PAGE.parent / "set.md").read_text(encoding="utf-8"))) >= CAMERA
+    assert wanted - CAMERA <= named

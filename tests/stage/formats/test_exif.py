@@ -1,15 +1,17 @@
-"""The exposure times that cameras record: used where the manifest asks for it, and named where it heeds none."""
+"""Exposure and orientation that cameras record in image files."""
 
+import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 
 from service.captures.info import inspect
 from service.requests.captures import InfoRequest
 from stage.capture.capture import Capture
 from stage.capture.lighting import distant_lights
-from stage.errors import ManifestError
-from stage.formats.exif import Exposure
-from stage.formats.images import read_header
+from stage.errors import ImageError, ManifestError
+from stage.formats.exif import TURNS, Exposure
+from stage.formats.images import read_header, read_recorded
 from stage.stack.brackets import merge_brackets
 from stage.stack.ingest import open_stack
 from tests.scenes.captures import edit_manifest, make_scene, manifest_of, write_image, write_manifest
@@ -19,6 +21,7 @@ TIMES = (0.25, 1 / 60)
 SETTINGS = {"FNumber": 8.0, "Exif:PhotographicSensitivity": 100}
 SCALE = 2.5
 """Recorded value of radiance 1 in a second: at 1/4 s the brightest readings clip, at 1/60 s none."""
+CODES = np.random.default_rng(1).integers(0, 256, (4, 6, 3)).astype(np.uint8)
 
 
 def write_bracketed(folder, settings=(SETTINGS, SETTINGS), **changes):
@@ -77,4 +80,69 @@ def test_exposures_are_given_once(tmp_path):
     data = [{**frame, "exposure_s": 1.0} for frame in manifest_of(SCENE)["frames"]]
     edit_manifest(tmp_path, frames=data)
     with pytest.raises(ManifestError, match=r"exposure_from: is given beside frames\[0\]\.exposure_s"):
+        Capture.open(tmp_path)
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_pixels_are_read_as_other_programs_show_them(tmp_path, suffix, orientation):
+    path = write_image(tmp_path / f"a.{suffix}", CODES, Orientation=orientation)
+    found, header = read_recorded(path), read_header(path)
+    expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.UINT8)
+    np.testing.assert_array_equal(found, expected)
+    if suffix == "png":  # OpenCV 5.0 does not read a TIFF that it has to turn
+        np.testing.assert_array_equal(found, cv2.imread(str(path))[..., ::-1])
+    assert (header.height, header.width, header.orientation) == (*found.shape[:2], orientation)
+
+
+def test_jpeg_is_turned_too(tmp_path):
+    path = write_image(tmp_path / "a.jpg", CODES, Orientation=6)
+    np.testing.assert_array_equal(read_recorded(path), cv2.imread(str(path))[..., ::-1])  # by one library
+    assert read_header(path)[:2] == (4, 6)
+
+
+def test_radiance_files_say_how_their_lines_run(tmp_path):
+    path = write_image(tmp_path / "a.hdr", (CODES / 255).astype(np.float32))
+    upright = read_recorded(path)
+    path.write_bytes(path.read_bytes().replace(b"-Y 4 +X 6", b"+Y 4 +X 6"))  # the first line is the lowest
+    np.testing.assert_array_equal(read_recorded(path), upright[::-1])
+
+
+def test_an_orientation_that_is_none_is_ignored(tmp_path):
+    path = write_image(tmp_path / "a.png", CODES, Orientation=9)
+    np.testing.assert_array_equal(read_recorded(path), CODES)
+
+
+def write_turned(folder, orientations):
+    """A scene of 6x8 pixels whose frames are recorded lying on their side."""
+    scene = make_scene(size=8, lights=4)
+    frames = manifest_of(scene)["frames"]
+    for index, (frame, image, orientation) in enumerate(zip(frames, scene.images, orientations, strict=True)):
+        codes = np.round(image[:, :6] / scene.images.max() * 65535).astype(np.uint16)
+        write_image(folder / f"{index}.png", np.rot90(codes) if orientation == 6 else codes, Orientation=orientation)
+        frame["image"] = f"{index}.png"
+    write_manifest(folder, {"schema": "relit.capture/1", "name": "turned", "frames": frames,
+                            "camera": {"projection": "orthographic", "resolution": [6, 8]}})
+    return scene
+
+
+def test_a_capture_is_read_upright_and_info_says_so(tmp_path):
+    scene = write_turned(tmp_path, [6, 6, 6, 6])
+    stack = open_stack(Capture.open(tmp_path))
+    radiance, _ = stack.pick_radiance(np.arange(48))
+    np.testing.assert_allclose(radiance, scene.images[:, :, :6].reshape(4, 48, 3) / scene.images.max(), rtol=2.0**-10, atol=1e-5)
+    found = inspect(InfoRequest(capture=tmp_path))
+    assert dict(found.facts)["orientation"].startswith("turned by 90° clockwise, as EXIF orientation 6 of ")
+
+
+def test_frames_that_disagree_are_named(tmp_path):
+    write_turned(tmp_path, [6, 6, 1, 6])
+    with pytest.raises(ManifestError, match=r"to be turned by 90° clockwise \(EXIF orientation 6\), 2\.png"):
+        Capture.open(tmp_path)
+
+
+def test_a_resolution_of_the_recorded_pixels_is_explained(tmp_path):
+    write_turned(tmp_path, [6, 6, 6, 6])
+    edit_manifest(tmp_path, camera={"projection": "orthographic", "resolution": [8, 6]})
+    with pytest.raises(ImageError, match=r"is 6x8 once it is turned by 90° clockwise \(EXIF"):
         Capture.open(tmp_path)

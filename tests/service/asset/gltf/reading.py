@@ -1,13 +1,28 @@
-"""A .glb read back with pygltflib, and its arrays and images taken out by the specification."""
+"""Binary glTF read for tests, and judged by the validator of Khronos."""
 
+import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+import pytest
 from pygltflib import GLTF2
 
 COMPONENTS = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+PACKAGES = Path(os.environ.get("RELIT_TEST_NODE_MODULES", Path(__file__).parents[4] / ".clients" / "node_modules"))
+PROGRAM = """
+const validator = require(process.argv[1]), fs = require('fs');
+(async () => {
+  const reports = [];
+  for (const file of process.argv.slice(2)) reports.push(await validator.validateBytes(new Uint8Array(fs.readFileSync(file))));
+  console.log(JSON.stringify(reports));
+})();
+"""
 
 
 class Read:
@@ -52,3 +67,20 @@ class Read:
         own = np.eye(4)
         own[:3, 3] = self.document.nodes[number].translation or 0
         return matrix @ own
+
+
+def validate(*files: Path) -> list[dict[str, Any]]:
+    """Return the validator's report on each file, or skip the test where Node or the validator is missing."""
+    node, package = shutil.which("node"), PACKAGES / "gltf-validator"
+    if node is None or not package.exists():
+        missing = f"the glTF validator is missing: no node, or no {package}; RELIT_TEST_NODE_MODULES names another folder"
+        if os.environ.get("RELIT_TEST_CLIENTS") == "required":
+            pytest.fail(missing)
+        pytest.skip(missing)
+    done = subprocess.run([node, "-e", PROGRAM, str(package), *map(str, files)], capture_output=True, text=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def findings(report: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the errors, warnings and hints of a report; what is only information (severity 2, such as sizes of images) is left out."""
+    return [(message["code"], message["message"]) for message in report["issues"]["messages"] if message["severity"] != 2]

@@ -1,9 +1,9 @@
-"""Relit frames on a card: through the asset's camera the card is the frame, with its colours and coverage."""
+"""Cards of relit frames and environments beside USD assets."""
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+from pxr import Usd, UsdGeom, UsdLux, UsdShade, UsdValidation
 
 from service.asset.content.card import find_frames
 from service.asset.usd.asset import write_asset
@@ -15,6 +15,9 @@ from tests.scenes.surfaces import make_wave
 from tests.scenes.surroundings import COVERAGE, write_frames
 
 POSE = ((0.0, 0.0, 1.0, 0.3), (1.0, 0.0, 0.0, -0.1), (0.0, 1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0))
+RADIANCE = np.random.default_rng(5).random((8, 16, 3)).astype(np.float32)
+
+
 def export(tmp_path, maps, suffix=".usda", numbers=(3, 4), **frames):
     pattern = write_frames(tmp_path / "frames", numbers, maps.camera, **frames)
     report = write_asset(maps, tmp_path / f"a{suffix}", name="A", surroundings=Surroundings(card=find_frames(pattern, maps.camera)))
@@ -135,3 +138,54 @@ def test_gltf_has_no_place_for_lights_and_frames(option, out, relit, tmp_path):
     make_wave("orthographic", pixel_size_m=0.01).write(tmp_path / "maps.exr")
     outcome = relit("export", tmp_path / "maps.exr", "--out", tmp_path / out, option, tmp_path)
     assert outcome.code == 2 and f"{option}: lights and frames go with solved maps" in outcome.err
+
+
+def write_map(path, radiance=RADIANCE, space="lin_rec709_scene"):
+    exr.write(path, {name: radiance[..., index] for index, name in enumerate("RGB")}, color_space=space, metadata={})
+    return path
+
+
+def export_with_environment(relit, tmp_path, environment, suffix=".usda"):
+    make_wave("orthographic", pixel_size_m=0.01).write(tmp_path / "maps.exr")
+    return relit("export", tmp_path / "maps.exr", "--out", tmp_path / f"a{suffix}", "--name", "A", "--environment", environment)
+
+
+@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+def test_a_dome_light_has_the_map(suffix, relit, tmp_path):
+    outcome = export_with_environment(relit, tmp_path, write_map(tmp_path / "sky.exr"), suffix)
+    assert outcome.code == 0 and f"lights   {tmp_path / 'a_lights' / 'environment.usda'}\n" in outcome.out
+    usd_stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
+    assert not any(prim.HasAPI(UsdLux.LightAPI) for prim in usd_stage.Traverse())
+    provenance = usd_stage.GetRootLayer().customLayerData["relit"]
+    if suffix == ".usdz":  # ARKit knows no lights: they lie beside the package
+        usd_stage = Usd.Stage.Open(str(tmp_path / "a_lights" / "environment.usda"))
+    else:
+        usd_stage.GetDefaultPrim().GetVariantSet("light").SetVariantSelection("environment")
+    dome = UsdLux.DomeLight(usd_stage.GetPrimAtPath("/A/Environment"))
+    assert dome.GetIntensityAttr().Get() == 1 and dome.GetTextureFormatAttr().Get() == "latlong"
+    assert not UsdGeom.Xformable(dome).GetOrderedXformOps()  # UsdLux orients the map as relit does
+    file = dome.GetTextureFileAttr()
+    assert file.GetColorSpace() == "lin_rec709_scene" and file.Get().resolvedPath
+    channels, metadata = exr.read(file.Get().resolvedPath)
+    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), RADIANCE, atol=3e-4)  # half
+    assert metadata["colorInteropID"] == "lin_rec709_scene" and provenance["environment"]
+
+
+def test_other_primaries_are_converted_and_a_bright_sun_is_kept(relit, tmp_path):
+    radiance = RADIANCE.copy()
+    radiance[2, 3] = 2e5  # above the largest half
+    assert export_with_environment(relit, tmp_path, write_map(tmp_path / "sky.exr", radiance, "lin_ap1_scene")).code == 0
+    channels, _ = exr.read(tmp_path / "a_lights" / "environment.exr")
+    wanted = np.maximum(radiance @ rgb_matrix("lin_ap1_scene", "lin_rec709_scene").T, 0)
+    np.testing.assert_allclose(np.stack([channels[name] for name in "RGB"], axis=-1), wanted, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize(("radiance", "fault"), [
+    (RADIANCE[:, :12], "a lat-long map is twice as wide as high"),
+    (np.where(RADIANCE > 0.9, np.nan, RADIANCE), "not finite (NaN or infinity)"),
+    (RADIANCE - 0.5, "negative"),
+], ids=["not 2:1", "NaN", "negative"])
+def test_a_bad_map_is_refused(radiance, fault, relit, tmp_path):
+    outcome = export_with_environment(relit, tmp_path, write_map(tmp_path / "sky.exr", radiance))
+    assert outcome.code == 2 and fault in outcome.err and "sky.exr" in outcome.err
+    assert {file.name for file in tmp_path.iterdir()} == {"maps.exr", "sky.exr"}

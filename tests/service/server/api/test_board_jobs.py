@@ -13,7 +13,7 @@ from tests.scenes import stereo as scenes
 from tests.scenes.board import write_depth
 from tests.scenes.depth import BLACK_WHITE, gray_patterns, make_scene, phase_patterns, write_patterns
 from tests.scenes.stereo import POSE, Plane
-from tests.service.calibrate.test_calibrate_stereo import write_board
+from tests.service.calibrate.test_procam import write_board
 from tests.service.depth.stereo.test_two_cameras import two_captures
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 from tests.service.server.api.test_calibrating import sent

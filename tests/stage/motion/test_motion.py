@@ -1,13 +1,20 @@
-"""Flow between frames of a subject whose motion is known in closed form."""
+"""Tracking frames, the flow between them, and images at positions between pixels."""
 
 import numpy as np
 import pytest
 
+from stage.capture.capture import Capture
+from stage.errors import ManifestError
 from stage.motion.flow import Flow, display, extrapolate, find_flow, white_level
-from tests.scenes.moving import Subject
+from stage.motion.resample import bicubic, positions, touched
+from stage.motion.tracking import Interval, intervals, tracking_frames
+from tests.scenes.moving import Subject, write_moving
 
 APART = 5
 """Steps of time between the two frames."""
+RNG = np.random.default_rng(3)
+ROWS, COLS = 9, 13
+SMALL = Subject(size=16)
 
 
 def frames(subject: Subject, noise: float = 0.0, flash: float = 1.0) -> list[np.ndarray]:
@@ -115,3 +122,106 @@ def test_display_values():
     grey = np.full((1, 1, 3), 0.4, np.float32)
     assert display(grey, 0.8)[0, 0] == pytest.approx(255 * (0.5 / 1.25) ** (1 / 2.2), rel=1e-5)
     assert display(grey, 0.1)[0, 0] == 255 and display(-grey, 1.0)[0, 0] == 0
+
+
+def keys(distance: float) -> float:
+    """Keys 1981, eq. 15."""
+    d = abs(distance)
+    return 1.5 * d**3 - 2.5 * d**2 + 1 if d < 1 else -0.5 * d**3 + 2.5 * d**2 - 4 * d + 2 if d < 2 else 0.0
+
+
+def twin(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    total = np.zeros(image.shape[2])
+    for r in range(int(np.floor(y)) - 1, int(np.floor(y)) + 3):
+        for c in range(int(np.floor(x)) - 1, int(np.floor(x)) + 3):
+            inside = np.clip(r, 0, ROWS - 1), np.clip(c, 0, COLS - 1)
+            total += keys(x - c) * keys(y - r) * image[inside]
+    return total
+
+
+def somewhere() -> tuple[np.ndarray, np.ndarray]:
+    x, y = RNG.uniform(0, COLS - 1, (ROWS, COLS)), RNG.uniform(0, ROWS - 1, (ROWS, COLS))
+    x[0, :3], y[0, :3] = (0, COLS - 1, 4), (0, ROWS - 1, 4.5)  # corners, and a whole number of pixels
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def test_bicubic_is_the_kernel_of_keys():
+    image, (x, y) = RNG.uniform(0, 5, (ROWS, COLS, 3)).astype(np.float32), somewhere()
+    expected = [[twin(image.astype(np.float64), float(x[r, c]), float(y[r, c])) for c in range(COLS)] for r in range(ROWS)]
+    assert np.allclose(bicubic(image, x, y), expected, atol=2e-5)  # float32: 2^-24 of values and second differences up to 20
+
+
+def test_at_whole_pixels_nothing_is_resampled():
+    image = RNG.normal(0, 1, (ROWS, COLS, 3)).astype(np.float32)
+    x, y, inside = positions(np.zeros((ROWS, COLS, 2), np.float32))
+    assert inside.all() and np.array_equal(bicubic(image, x, y), image)
+
+
+def test_positions_outside_are_told_and_brought_to_the_edge():
+    displacement = np.zeros((3, 4, 2), np.float32)
+    displacement[1] = [[-0.01, 0], [2.5, 0], [0, -1.5], [0, 1]]
+    x, y, inside = positions(displacement)
+    assert inside[1].tolist() == [False, False, False, True] and inside[[0, 2]].all()
+    assert x[1].tolist() == [0, 3, 2, 3] and y[1].tolist() == [1, 1, 0, 2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 1.0])
+def test_every_reading_that_a_flagged_pixel_takes_part_in_is_flagged(share):
+    flags, (x, y) = RNG.random((ROWS, COLS)) < share, somewhere()
+    found = touched(flags, x, y)
+    for r in range(ROWS):
+        for c in range(COLS):
+            i, j = int(y[r, c]), int(x[r, c])
+            assert found[r, c] == flags[max(i - 1, 0) : i + 3, max(j - 1, 0) : j + 3].any()
+
+
+def opened(folder, order):
+    return Capture.open(write_moving(folder, SMALL, order))
+
+
+@pytest.mark.parametrize(("order", "times", "reference"), [
+    ("TLLLT", (0, 4), 1), ("TLTLT", (0, 2, 4), 1), ("LTLTLTLT", (1, 3, 5, 7), 2),
+])
+def test_the_middle_tracking_frame_is_the_reference(tmp_path, order, times, reference):
+    found = tracking_frames(opened(tmp_path, order))
+    assert (found.times, found.reference) == (times, reference)
+    assert [frame.image for frame in found.frames] == [f"{time:02d}.exr" for time in times]
+
+
+def test_another_may_be_named(tmp_path):
+    capture = opened(tmp_path, "TLTLT")
+    assert tracking_frames(capture, to="04.exr").reference == 2
+    with pytest.raises(ManifestError, match=r"frame: --align-to takes one of 00\.exr, 02\.exr, 04\.exr$"):
+        tracking_frames(capture, to="01.exr")
+
+
+@pytest.mark.parametrize(("order", "count"), [("LLLL", 0), ("LLTLL", 1)])
+def test_two_are_needed(tmp_path, order, count):
+    with pytest.raises(ManifestError, match=f"{count} lit by a full light: --align follows the subject"):
+        tracking_frames(opened(tmp_path, order))
+
+
+def test_an_image_too_small_to_be_followed(tmp_path):
+    capture = Capture.open(write_moving(tmp_path, Subject(size=15), "TLT"))
+    with pytest.raises(ManifestError, match=r"camera\.resolution: is 15x15: --align needs 16 to 32766"):
+        tracking_frames(capture)
+
+
+def test_intervals_go_outward_from_the_reference(tmp_path):
+    capture = opened(tmp_path, "LTLLLTLTLLTL")
+    found = intervals(capture, tracking_frames(capture, to="05.exr"), capture.sources())
+    third, fourth = pytest.approx(1 / 3), pytest.approx(4 / 3)
+    assert found == [Interval(1, (4,), (0.5,)), Interval(2, (5, 6, 7), (third, pytest.approx(2 / 3), fourth)),
+                     Interval(0, (0, 1, 2, 3), (-0.25, 0.25, 0.5, 0.75))]
+
+
+@pytest.mark.parametrize(("order", "words"), [
+    ("LLLTLT", r"frames\[0\]: lies more than one tracking interval before the"),
+    ("TLTLLL", r"frames\[5\]: lies more than one tracking interval after the"),
+])
+def test_a_frame_far_outside_is_named(tmp_path, order, words):
+    capture = opened(tmp_path, order)
+    with pytest.raises(ManifestError, match=words):
+        intervals(capture, tracking_frames(capture), capture.sources())
+    capture = opened(tmp_path / "near", order.replace("LLL", "LL"))
+    intervals(capture, tracking_frames(capture), capture.sources())  # exactly one interval is not too far
