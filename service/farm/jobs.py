@@ -121,7 +121,6 @@ def write_job(made: Job, where: Path) -> JobFiles:
 
 
 def _title(command: str, subject: Path) -> str:
-    """Return the name of a job; what a template would fill in is left out of it."""
     subject = subject.parent if subject.is_file() else subject
     shown = "".join(character for character in subject.absolute().name if character.isprintable() and character not in "{}")
     return f"relit {command} {shown}"[:LONGEST_NAME].rstrip()

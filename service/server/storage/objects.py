@@ -128,7 +128,6 @@ class ObjectStorage:
         return self._bucket.find(f"{REMOVED}/{prefix}") is not None
 
     def _objects(self, prefix: str) -> dict[str, Object]:
-        """Return the objects of a prefix by name."""
         if self._is_removed(prefix):
             return {}
         named = ((found.path.removeprefix(f"{prefix}/"), found) for found in self._bucket.below(prefix))

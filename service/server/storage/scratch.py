@@ -131,7 +131,6 @@ def _state(path: Path) -> list[object]:
 
 
 def _used_at(folder: Path) -> float:
-    """Return when a file was last fetched, sent or written."""
     return max((path.stat().st_mtime for path in (folder / LOCK, folder / FILES) if path.exists()), default=0.0)
 
 

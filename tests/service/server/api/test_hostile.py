@@ -144,7 +144,7 @@ def failures(server) -> list[str]:
 
 THROUGH = ("parent", "nul", "step link", "pipe", "truncated", "billion exr", "billion jxl", "pickle", "bins", "nested", "many frames",
            "many keys")
-"""Those that go through the service: one for each way in which a check could take the worker's life or memory. The others are checked here."""
+"""Those that go through the service: one for each way in which a check could cost the worker. The others are checked here."""
 
 
 @pytest.mark.long
