@@ -1,6 +1,7 @@
 """Found by Python at its start where this folder is on PYTHONPATH: makes the frames of a worker's jobs do what SABOTAGE says.
 
-kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
+kill  end the process by SIGKILL, as want of memory would      hang  stand still
+slow  take a tenth of a second for each frame; and before the ninth wait for a file of the name GATE, where that is given
 long  half a second in jobs of 300 frames and more and in the first attempt of jobs of the name `slow`, and a tenth in those of 60 frames
       and more: a worker is then busy without keeping the other tests from the processor
 
@@ -27,15 +28,22 @@ def hang(*_):
 
 
 class Slow:
+    made = 0
+    """Frames that this process has made."""
+
     def __init__(self, inner, frame_s=0.1):
-        self._inner, self._frame_s = inner, frame_s
+        self._inner, self._frame_s, self._stage = inner, frame_s, ""
 
     def stage(self, name, total):
+        self._stage = name
         self._inner.stage(name, total)
 
     def advance(self, done):
         time.sleep(self._frame_s)
         self._inner.advance(done)
+        Slow.made += self._stage == "frames"
+        while Slow.made == 8 and "GATE" in os.environ and not os.path.exists(os.environ["GATE"]):
+            time.sleep(0.05)
 
 
 def slow(request, chunk, files):
