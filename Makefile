@@ -8,6 +8,8 @@ WORKERS ?= 3
 export PYTHONDONTWRITEBYTECODE :=
 # as the program sets it: with more threads than cores, matrices wait for each other
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n $(WORKERS) --no-loadscope-reorder
+EMULATED := OPENBLAS_NUM_THREADS=1 nice $(BIN)/python -m pytest -q -n 2 --device-emulated -m "not long" tests/kernels tests/test_device_ways.py \
+  tests/test_gpu_benchmark.py
 
 .PHONY: demo serve test test-all compiled clients lint bench gpu-bench manifest-page figures samples screenshots lock vendor colour-table clean
 demo: $(VENV)/installed
@@ -20,10 +22,10 @@ test: $(VENV)/installed-dev
 	$(PYTEST) -m "not long"
 
 # with the long suites: workers and servers killed, databases restarted, load, random requests, calibrations of statistics, pages, CUDA builds
-# and the kernels and products as on a GPU, on an emulated one
+# and the kernels and products as on a GPU, on an emulated one, which takes what the others, who often wait, leave of the processors
 test-all: $(VENV)/installed-dev
-	$(PYTEST)
-	$(PYTEST) --device-emulated -m "not long" tests/kernels tests/test_device_ways.py tests/test_gpu_benchmark.py
+	$(EMULATED) >$(VENV)/emulated.log 2>&1 & emulated=$$!; $(PYTEST); tests=$$?; \
+	  wait $$emulated || tests=$$?; cat $(VENV)/emulated.log; exit $$tests
 
 # keeps what Python compiles of modules and tests
 compiled: $(VENV)/installed-dev

@@ -33,7 +33,6 @@ def make_group(name: str | None = None, *, help: str) -> typer.Typer:
 
 
 def _first_sentence(text: str) -> str:
-    """Return the first sentence of the first paragraph, in one line."""
     paragraph = " ".join(text.split("\n\n")[0].split())
     sentence, stop, _ = paragraph.partition(". ")
     return sentence + stop.rstrip()

@@ -113,7 +113,6 @@ def command(group: typer.Typer, name: str, function: Callable[..., None], *, wit
 
 
 def _model(annotation: Any) -> type[Options] | None:
-    """Return the model of a parameter that stands for one, or None."""
     kind = get_args(annotation)[0] if get_origin(annotation) is Given else annotation
     return kind if isinstance(kind, type) and issubclass(kind, Options) else None
 
@@ -136,7 +135,6 @@ def _parameters(models: list[type[Options]], without: frozenset[Role], own: list
 
 
 def _parameter(option: Option, required: bool, about: str) -> inspect.Parameter:
-    """Return an option as Typer takes it."""
     default = inspect.Parameter.empty if required else _default(option)
     kind = list[_typer_type(get_args(option.kind)[0])] if option.is_repeated else _typer_type(option.kind)  # type: ignore[misc]
     has_default = default not in (inspect.Parameter.empty, None)

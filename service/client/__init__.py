@@ -5,7 +5,6 @@ from typing import Self
 
 import httpx2
 
-from service.client.annotations import Annotations
 from service.client.connection import Connection
 from service.client.errors import (
     Busy,
@@ -21,9 +20,8 @@ from service.client.errors import (
     Refused,
     Unreachable,
 )
-from service.client.hooks import Hooks
-from service.client.intakes import Intakes
-from service.client.jobs import Jobs
+from service.client.intakes import Annotations, Intakes
+from service.client.jobs import Hooks, Jobs
 from service.requests.base.identifiers import DEFAULT_SERVER
 
 __all__ = ["Busy", "Client", "ClientError", "Conflict", "Faulty", "FileError", "IntakeRefused", "Invalid", "JobEnded", "NotAllowed",

@@ -1,19 +1,95 @@
-"""Captures and environments: uploaded or registered, listed and deleted."""
+"""Captures and environments: uploaded or registered, listed and deleted, and annotated; their files go by tus 1.0."""
 
 import hashlib
 import time
+from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from threading import Event
 
-from service.client.connection import Connection
-from service.client.errors import Conflict, IntakeRefused, NotFound
-from service.client.local_files import files_of, hash_files, hash_of_all
-from service.client.transfer import TransferProgress, transfer_all
-from service.client.uploads import Upload
+import httpx2
+
+from service.client.connection import LATER, PROXY, Connection, retry_after
+from service.client.errors import Conflict, FileError, IntakeRefused, NotFound, refusal
+from service.client.local_files import LocalFile, file_errors, files_of, hash_files, hash_of_all
+from service.client.transfer import PIECE_BYTES, Stopped, TransferProgress, transfer_all
 from service.reporting.progress import Progress
 from service.requests.answers import IntakePage, IntakeView
+from service.requests.base.annotations import AnnotationPage, AnnotationView
 from service.requests.states import CHECKING, READY, RECEIVING, REFUSED
+
+TUS = {"Tus-Resumable": "1.0.0"}
+OTHER_OFFSET = (409, 423)
+"""Statuses of the server when it has another number of bytes than the client assumed, or still writes those of an earlier request."""
+
+
+class Upload:
+    """The upload of one file by tus 1.0 (https://tus.io/protocols/resumable-upload); bytes that the server has are not sent again."""
+
+    def __init__(self, connection: Connection, intake: str, file: LocalFile, progress: TransferProgress) -> None:
+        self._connection, self._intake, self._file, self._progress = connection, intake, file, progress
+        self._sent = 0
+
+    def run(self, stop: Event) -> None:
+        """Send the bytes that the server does not have, until it has all or `stop` is set."""
+        if stop.is_set():
+            raise Stopped
+        file = self._file
+        upload, offset = self._create()
+        backoff, before = self._connection.backoff(), offset
+        while offset < file.size:
+            if offset > before:
+                backoff.reset()
+            before = offset
+            self._report(offset)
+            try:
+                answer = self._connection.http.request("PATCH", upload, content=self._pieces(offset, stop), headers={
+                    **TUS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream",
+                    "Content-Length": str(file.size - offset)})
+            except httpx2.TransportError as error:
+                if not backoff.wait():
+                    raise self._connection.unreachable(error) from error
+                offset = self._offset(upload)
+                continue
+            if answer.is_success:
+                offset = int(answer.headers["upload-offset"])
+            elif answer.status_code in (*OTHER_OFFSET, *LATER, *PROXY) and backoff.wait(retry_after(answer)):
+                offset = self._offset(upload)
+            else:
+                raise refusal(answer)
+        self._report(file.size)
+
+    def _create(self) -> tuple[str, int]:
+        """Return the path of the upload and the bytes it has; a second call, also by another process, returns the same upload."""
+        words = {"path": self._file.name, "sha256": self._file.sha256}
+        metadata = ",".join(f"{name} {b64encode(word.encode()).decode()}" for name, word in words.items())
+        token = hashlib.sha256(f"{self._intake}\0{self._file.name}\0{self._file.sha256}".encode()).hexdigest()
+        answer = self._connection.send("POST", f"{self._intake}/files", headers={
+            **TUS, "Upload-Length": str(self._file.size), "Upload-Metadata": metadata, "Idempotency-Key": token})
+        path = httpx2.URL(answer.headers["location"]).path  # the path alone, so that the key is never sent to another host
+        return path, int(answer.headers["upload-offset"])
+
+    def _offset(self, upload: str) -> int:
+        return int(self._connection.send("HEAD", upload, headers=TUS).headers["upload-offset"])
+
+    def _report(self, sent: int) -> None:
+        self._progress.add(sent - self._sent)
+        self._sent = sent
+
+    def _pieces(self, offset: int, stop: Event) -> Iterator[bytes]:
+        with file_errors(self._file.path), open(self._file.path, "rb", buffering=0) as opened:
+            opened.seek(offset)
+            while offset < self._file.size:
+                if stop.is_set():
+                    raise Stopped
+                piece = opened.read(min(PIECE_BYTES, self._file.size - offset))
+                if not piece:
+                    raise FileError(f"{self._file.path}: became shorter while it was sent")
+                offset += len(piece)
+                yield piece
+                self._report(offset)
+
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
 """First and longest pause, in seconds, between two requests for the state of an intake that is being checked; each pause is 1.5 times the
@@ -133,3 +209,28 @@ class Intakes:
             with suppress(NotFound):
                 return self.create(name, token=f"{token}-{number}")
         return self.create(name)
+
+
+class Annotations:
+    """The annotations of the captures of a project."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def page(self, capture: str) -> AnnotationPage:
+        """Return the annotations of a capture; `model_dump_json(by_alias=True)` of it is a file for `relit publish --annotations`."""
+        return self._connection.ask(AnnotationPage, "GET", self._at(capture))
+
+    def add(self, capture: str, text: str, x: float, y: float, width: float = 0.0, height: float = 0.0) -> AnnotationView:
+        """Add a text about a rectangle of the image, in pixels from its upper left corner; without a size about a point."""
+        selector = ({"type": "FragmentSelector", "value": f"xywh={x:g},{y:g},{width:g},{height:g}"} if width or height else
+                    {"type": "PointSelector", "x": x, "y": y})
+        body = {"body": {"type": "TextualBody", "value": text}, "target": {"selector": selector}}
+        return self._connection.ask(AnnotationView, "POST", self._at(capture), json=body, repeatable=False)
+
+    def delete(self, annotation: AnnotationView) -> None:
+        """Delete an annotation."""
+        self._connection.send("DELETE", annotation.id, repeatable=False)
+
+    def _at(self, capture: str) -> str:
+        return self._connection.path("/v1/captures", capture, "annotations")

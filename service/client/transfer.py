@@ -34,7 +34,6 @@ class TransferProgress:
 
 
 def _whole_mib(count: int) -> int:
-    """Return the MiB that bytes fill or begin."""
     return -(-count // MIB)
 
 

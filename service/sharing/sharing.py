@@ -207,7 +207,6 @@ def _add(value: object, add: Callable[[bytes], None]) -> None:
 
 
 def _packed(arrays: Sequence[np.ndarray]) -> bytes:
-    """Return arrays as sealed bytes."""
     buffer = io.BytesIO()
     np.savez(buffer, *arrays, allow_pickle=False)
     return sealed(buffer.getvalue())

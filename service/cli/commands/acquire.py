@@ -77,7 +77,6 @@ def _capture(request: AcquireRequest) -> None:
 
 
 def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
-    """Meter the light, and print what to set."""
     from service.acquisition.cameras.camera import LIVE, SPOOL
     from service.acquisition.live_view import LivePage
     from service.acquisition.meter import SHARE, meter
@@ -141,7 +140,6 @@ def _follow(request: AcquireRequest) -> None:
 
 
 def _commands(request: AcquireRequest, steps: Sequence[Then]) -> str:
-    """Return the line for a shell that does steps."""
     maps = request.out / MAPS
     words = {Then.SOLVE: ["relit", "solve", request.out, "--out", maps],
              Then.EXPORT: ["relit", "export", maps, "--out", request.out / ASSET]}

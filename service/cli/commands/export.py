@@ -74,7 +74,6 @@ def _inspect(request: InspectRequest) -> None:
 
 
 def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
-    """Yield what is printed, as names and values."""
     size = found.size_bytes
     yield "asset", f"{found.file}, {f'{size / 1e6:.3g} MB' if size >= 1e6 else f'{size / 1e3:.3g} kB'}"
     for name, value in found.facts.items():
@@ -93,7 +92,6 @@ def _lines(found: "Inspection") -> Iterator[tuple[str, str]]:
 
 
 def _text(value: Any) -> str:
-    """Return a fact in a line."""
     if isinstance(value, dict):
         return ", ".join(f"{name} {_text(each)}" for name, each in value.items()) or "none"
     if isinstance(value, list):

@@ -90,7 +90,6 @@ def _auto(folder: Path, destination: Path | None, *, kept: bool = True) -> list[
 
 
 def _upload(captures: list[Path], server: str, key: str | None) -> None:
-    """Send captures to a service, which checks them."""
     from service.cli.progress import ProgressBar
     from service.cli.remote import connected
 
@@ -109,7 +108,6 @@ def _print_guess(found: "Guess") -> None:
 
 
 def _import_as(model: type[ImportRequest]) -> Callable[..., None]:
-    """Return the function of the command of a layout."""
     def run(request: model) -> None:  # type: ignore[valid-type]
         from service.captures.importing import import_files
 

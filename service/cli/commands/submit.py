@@ -44,8 +44,6 @@ def register(app: typer.Typer) -> None:
 
 
 def _submission(job: type[JobRequest]) -> Callable[..., None]:
-    """Return the function that hands in jobs of one kind."""
-
     def submit(given: Given[job], server: ServerOption = DEFAULT_SERVER, key: KeyOption = None,  # type: ignore[valid-type]
                wait: WaitOption = False, out: ResultsOption = None, cancel_on_interrupt: CancelOption = False) -> None:
         _submit(given, server, key, wait, out, cancel_on_interrupt)
@@ -72,7 +70,6 @@ def _submit(given: Given[JobRequest], server: str, key: str | None, wait: bool, 
 
 
 def _each(given: str | list[str], identify: Callable[[str], str]) -> str | tuple[str, ...]:
-    """Return the identifier of what was given, or of each of several."""
     return identify(given) if isinstance(given, str) else tuple(map(identify, given))
 
 

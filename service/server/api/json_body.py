@@ -36,8 +36,6 @@ class JsonRoute(APIRoute):
 
 
 class _JsonRequest(Request):
-    """A request whose body is bounded."""
-
     async def body(self) -> bytes:
         try:
             async with asyncio.timeout(BODY_S):

@@ -59,8 +59,6 @@ class Metrics:
 
 
 class _DatabaseMetrics(Collector):
-    """Metrics from the database, which are asked for when they are read."""
-
     def __init__(self, settings: Settings, database: Database) -> None:
         self._settings, self._database = settings, database
 

@@ -134,7 +134,6 @@ def _with_frames(service: Service, project: str, capture: str, options: RelightO
 
 
 def _require_frames(service: Service, given: str | None, numbers: Sequence[int]) -> None:
-    """Refuse more frames than a job may have."""
     if len(numbers) > service.settings.max_frames:
         raise ApiError("invalid", f"frames {given}: {len(numbers)} frames, {service.settings.max_frames} are allowed in a job")
 
@@ -149,7 +148,6 @@ def _require_ready(service: Service, project: str, field: str, identifier: str) 
 
 
 def _require_scans(service: Service, project: str, request: asked.RegisterJob) -> list[str]:
-    """Return the identifiers of the jobs whose results are registered, or refuse if one of them is not there any more."""
     for number, identifier in enumerate(request.depths):
         _require_results(service, project, f"depths[{number}]", identifier, ("depth",))
     for number, identifier in enumerate(request.solves):

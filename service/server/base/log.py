@@ -114,7 +114,6 @@ def _kind(record: logging.LogRecord) -> tuple[Hashable, ...] | None:
 
 
 def _escape(_logger: object, _method: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
-    """Replace characters that a terminal does not print by their escapes, in names and values."""
     return {_printable(name): _printable(value) if isinstance(value, str) else value for name, value in event.items()}
 
 

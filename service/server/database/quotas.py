@@ -46,7 +46,6 @@ def pixels_of(facts: dict[str, Any] | None) -> int:
 
 
 def _bytes(connection: sa.Connection, project: str) -> int:
-    """Count files that are uploaded or announced, and results."""
     files = sa.select(sa.func.coalesce(sa.func.sum(uploads.c.length), 0)).where(uploads.c.project == project)
     results = sa.select(sa.func.coalesce(sa.func.sum(jobs.c.result_bytes), 0)).where(jobs.c.project == project)
     return int(connection.execute(files).scalar_one()) + int(connection.execute(results).scalar_one())

@@ -57,7 +57,6 @@ def help_with(job: Job, context: WorkerContext, progress: Progress) -> None:
 
 
 def _make_frames(step: JobStep, pieces: JobPieces, job: Job, context: WorkerContext, progress: Progress) -> None:
-    """Do a step unless another worker does it or has done it."""
     if step.name in _finished(job, context) or pieces.is_finished(step.name) or not pieces.claim_step(step.name):
         return
     logger.info("help with step", job=job.id, step=step.name, worker=context.worker)

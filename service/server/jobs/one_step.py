@@ -143,7 +143,6 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
 
 
 def _calibrate(request: JobRequest, files: StepFiles) -> None:
-    """Calibrate the lights or the images of one capture."""
     from service.calibrate import images, lights, response, white_balance
 
     products: dict[type[JobRequest], tuple[Callable[..., object], type[Options]]] = {
@@ -173,7 +172,6 @@ def _calibrate_chart(request: calibration_jobs.ChartJob, files: StepFiles) -> No
 
 def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.StereoCalibrationJob | calibration_jobs.LaserPlanesJob,
                    files: StepFiles) -> None:
-    """Calibrate a rig, and write a manifest for each of its captures."""
     from service.calibrate import laser_planes, procam, stereo
 
     captures = [request.capture] if isinstance(request, calibration_jobs.StereoCalibrationJob) else request.captures

@@ -78,7 +78,6 @@ class JobPieces:
             self.invite(steps)
 
     def _missing(self, pieces: int) -> int:
-        """Return how many workers more could help."""
         if self._context.queue is None or pieces < 2:
             return 0
         others = {row["id"] for row in workers.seen_lately(self._context.database)} - {self._context.worker}
@@ -124,7 +123,6 @@ class JobPieces:
         self._context.storage.remove(self._prefix)
 
     def _at_work(self) -> set[str]:
-        """Return the names of the workers that do the job or help with it."""
         queue = self._context.queue
         seen = {row["id"] for row in workers.seen_lately(self._context.database)}
         return seen if queue is None else seen & queue.workers_on(self._job.id)

@@ -51,7 +51,6 @@ class StepFiles(NamedTuple):
         return model(**({name: value for name, value in ours.items() if name in model.model_fields} | values))
 
     def _place(self, identified: Any) -> Any:
-        """Return the place of what an identifier names, those of several, or None for none."""
         if identified is None:
             return None
         if isinstance(identified, tuple):

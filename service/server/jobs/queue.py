@@ -17,6 +17,7 @@ from service.server.database import jobs
 from service.server.database.engine import Database
 from service.server.database.jobs import Claim
 from service.server.database.schema import upgrade
+from service.server.jobs.dbos_tables import set_order
 
 WORK, CHECKS = "work", "checks"
 """The queues: jobs that need a device, and quick checks of captures and environments."""
@@ -28,8 +29,6 @@ VERSION = "1"
 SERIALIZER = DBOSPortableJSONSerializer()
 HIGHEST = 101
 """DBOS starts the lowest priority first and counts from 1; a request's highest priority, 100, goes first."""
-SCHEMAS = {"sqlite": None, "postgresql": "dbos"}
-"""The schema of the tables of DBOS, by the kind of database; SQLite has no schemas."""
 
 
 def prepare(settings: Settings, database: Database) -> None:
@@ -76,11 +75,11 @@ class JobQueue:
             "workflow_name": WORKFLOW, "queue_name": CHECKS if isinstance(request, CheckJob) else WORK,
             "workflow_id": workflow_id(job, attempt), "app_version": VERSION, "priority": HIGHEST - priority,
             "queue_partition_key": project}, job, attempt)
-        _set_order(connection, workflow_id(job, attempt), created_at=int(time.time() * 1000))
+        set_order(connection, workflow_id(job, attempt), created_at=int(time.time() * 1000))
 
     def set_priority(self, connection: sa.Connection, job: str, attempt: int, priority: int) -> None:
         """Change the priority of a queued attempt in the caller's transaction; its place among equal priorities stays."""
-        _set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
+        set_order(connection, workflow_id(job, attempt), priority=HIGHEST - priority)
 
     def cancel(self, job: str, attempt: int) -> None:
         """Take an attempt out of the queue; a worker that runs it learns so from the job's row at its next sign of progress."""
@@ -134,15 +133,3 @@ class JobQueue:
         """Delete the workflows of all attempts of a job, and of the workers that helped."""
         found = self._client.list_workflows(workflow_id_prefix=f"{job}.", load_input=False, load_output=False)
         self._client.delete_workflows([status.workflow_id for status in found])
-
-
-def _set_order(connection: sa.Connection, workflow: str, **values: int) -> None:
-    """Set the priority of a queued workflow, of which the lowest goes first, or `created_at`, in milliseconds since 1970.
-
-    DBOS 3.4 sets the priority of a workflow only when it is queued, a new attempt would lose the place among equals, and with SQLite it
-    orders the jobs of one second and one priority by their random names. So this writes the two columns by which DBOS orders its queues;
-    `test_workers_take_jobs_by_priority_and_time_and_projects_take_turns` fails if a later version orders them otherwise.
-    """
-    workflows = sa.table("workflow_status", sa.column("workflow_uuid", sa.Text), *map(sa.column, values),
-                         schema=SCHEMAS[connection.dialect.name])
-    connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(**values))

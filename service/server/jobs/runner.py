@@ -241,7 +241,6 @@ class JobRunner:
         return LATER if pieces.are_shared and not pieces.claim_step(step.name) else None
 
     def _publish(self, claim: Claim, job: Job, step: JobStep, progress: JobProgress) -> None:
-        """Make the files of a step part of the storage, and tell the workers that help."""
         shared = step.frames > 0 and self._pieces[claim].are_shared
         self._context.storage.publish(layout.results(job.project, job.id), progress, alone=not shared)
         if shared:

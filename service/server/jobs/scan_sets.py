@@ -61,7 +61,6 @@ def _register(request: RegisterJob, files: StepFiles, sharing: "SharedPieces") -
 
 
 def _fuse(request: FuseJob, files: StepFiles, sharing: "SharedPieces") -> None:
-    """Fuse the depths that another job has registered."""
     from service.requests.register import FuseRequest
     from service.scans.fusion.fuse import fuse, help_fuse
 

@@ -65,8 +65,6 @@ def run_worker(settings: Settings, device: str, heartbeat: Heartbeat) -> None:
 
 @dataclass
 class _Slot:
-    """A device and the worker process on it."""
-
     device: str
     process: SpawnProcess | None = None
     heartbeat: Heartbeat | None = None

@@ -60,8 +60,6 @@ class Backup(NamedTuple):
 
 
 class _Contents(NamedTuple):
-    """The contents of backup.json."""
-
     files: dict[str, dict[str, Any]]
     storage: dict[str, Any] | None
     """The store of a service with storage_url: its URL, whether the objects are copied, and the objects; None without storage_url."""

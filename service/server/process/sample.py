@@ -58,7 +58,6 @@ def _has_results(database: Database, capture: str) -> bool:
 
 
 def _add(database: Database, storage: Storage, request: JobRequest, files: Sequence[Path], inputs: Sequence[str]) -> str:
-    """Add a job that has succeeded, with copies of its results."""
     identifier = new_id(JOB)
     prefix = layout.results(DEFAULT_PROJECT, identifier)
     folder = storage.workspace(prefix)

@@ -103,6 +103,7 @@ def test_patterns_are_linear_light_once_the_response_is_measured(tmp_path, scene
     assert farthest_from_linear(tmp_path / "plain") > 0.1
 
 
+@pytest.mark.long
 def test_a_capture_goes_on_with_the_response_that_it_measured(tmp_path, scene):
     class Enough(Exception):
         """The program ends."""

@@ -114,6 +114,7 @@ def test_a_datum_carries_the_scan(tmp_path, part):
     assert reported(result)["placement"]["open_motions"] == 3  # a plane leaves two shifts and a turn open
 
 
+@pytest.mark.long
 def test_what_the_surface_leaves_open_is_said(tmp_path):
     random = np.random.default_rng(1)
     for number, made in enumerate((cylinder(), box(40, 24, 6))):
@@ -207,6 +208,7 @@ def test_the_floor_of_a_pocket_near_the_other_side_of_a_wall_is_not_overlooked(t
     assert top.verdict == "undecided" and top.strange > 0 and top.seen > 0.9
 
 
+@pytest.mark.long
 def test_regions_of_a_part_that_looks_the_same_when_turned_are_not_decided(tmp_path):
     """A cube of which one side is half a millimetre too high in its middle: the pose may lay any side on the one that is judged."""
     made, random = box(40, 40, 40), np.random.default_rng(7)
@@ -217,6 +219,7 @@ def test_regions_of_a_part_that_looks_the_same_when_turned_are_not_decided(tmp_p
     assert [str(region.verdict) for region in result.regions] == ["undecided", "fail"]  # the whole surface is decided in any pose
 
 
+@pytest.mark.long
 def test_stray_points_decide_nothing(tmp_path, part):
     made, design = part
     random = np.random.default_rng(7)
@@ -228,6 +231,7 @@ def test_stray_points_decide_nothing(tmp_path, part):
     assert top.verdict == "undecided" and max(-top.least_m, top.most_m) > 0.8e-4
 
 
+@pytest.mark.long
 def test_points_beyond_the_border_of_an_open_design_are_not_compared(tmp_path, part):
     made, _ = part
     kept = (made.normals()[:, 2] > 1e-9) & (made.points[made.faces][:, :, 0].max(axis=1) < 20)

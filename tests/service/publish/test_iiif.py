@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 from service import __version__
+from service.publish.publish import publish
+from service.requests.publish import PublishRequest
+from service.requests.solve import SolveRequest
+from service.solve.solve import solve
 from stage.colour.configuration import current
 from tests.reference.light_basis import srgb
 from tests.scenes.captures import make_scene, write_capture
@@ -22,17 +26,23 @@ NOTES = {"type": "AnnotationPage", "items": [
     {"type": "Annotation", "body": {"value": "a corner"}, "target": "https://elsewhere/canvas#xywh=0,0,5,5"}]}
 
 
-@pytest.fixture
-def published(relit, tmp_path):
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(size=SIZE, lights=5)
+
+
+@pytest.fixture(scope="module")
+def published(scene, tmp_path_factory):
     """A cap with maps and notes, published."""
+    folder = tmp_path_factory.mktemp("published")
     camera = {"projection": "orthographic", "resolution": [SIZE, SIZE], "pixel_size_m": PIXEL_M}
-    write_capture(tmp_path / "cap", make_scene(size=SIZE, lights=5), camera=camera)
-    relit.done("solve", tmp_path / "cap", "--out", tmp_path / "maps", "--method", "lambert")
-    (tmp_path / "notes.json").write_text(json.dumps(NOTES))
-    relit.done("publish", tmp_path / "cap", "--to", tmp_path / "out", "--as", "iiif", "--url", f"{URL}/", "--maps", tmp_path / "maps",
-               "--annotations", tmp_path / "notes.json", "--rights", "https://creativecommons.org/licenses/by/4.0/", "--photographs", "2",
-               "--attribution", "A museum", "--title", "Cap")
-    return tmp_path / "out"
+    write_capture(folder / "cap", scene, camera=camera)
+    solve(SolveRequest(capture=folder / "cap", out=folder / "maps", method="lambert", device="cpu"))
+    (folder / "notes.json").write_text(json.dumps(NOTES))
+    publish(PublishRequest(capture=folder / "cap", out=folder / "out", kind="iiif", url=f"{URL}/", maps=folder / "maps", photographs=2,
+                           annotations=folder / "notes.json", rights="https://creativecommons.org/licenses/by/4.0/",
+                           attribution="A museum", title="Cap"))
+    return folder / "out"
 
 
 def halved(pixels: np.ndarray) -> np.ndarray:
@@ -109,8 +119,7 @@ def test_every_tile_that_a_viewer_asks_for_is_there(published):
         assert np.abs(largest - halved(whole)).mean() < 1  # JPEG files of the same pixels
 
 
-def test_pictures_are_what_they_say(published):
-    scene = make_scene(size=SIZE, lights=5)
+def test_pictures_are_what_they_say(published, scene):
     white = scene.images / scene.irradiance[:, None, None]
     exposure = np.quantile(white[:, scene.mask], 0.999)
     manifest = json.loads((published / "manifest.json").read_text())

@@ -4,6 +4,7 @@ import json
 import re
 
 import numpy as np
+import pytest
 
 from tests.reference.light_basis import srgb
 from tests.scenes.captures import edit_manifest, make_scene, render, write_capture
@@ -35,6 +36,7 @@ def test_captured_lights_show_the_captured_images(relit, tmp_path):
     assert np.abs(between - ends.mean(axis=0))[scene.mask].mean() < np.abs(ends[0] - ends[1])[scene.mask].mean()
 
 
+@pytest.mark.long
 def test_a_hemisphere_of_lights_is_shown_as_the_basis_has_it(relit, tmp_path):
     """32 lights, of which OpenLIME shows a picture each: within 2 levels of the components before they are bytes and JPEG files."""
     lights, truth = dome(tmp_path / "dome")

@@ -104,6 +104,7 @@ def test_another_view_reads_the_same_table(device, tables, surface):
     assert angle_degrees(fit.normal, normal).mean() < (0.15 if surface == "mirror" else 0.35)  # the table is bilinear between its cells
 
 
+@pytest.mark.long
 def test_the_rings_find_the_diffuse_lobe_whatever_the_start(device, tables):
     """The search with a table takes the place of lights: those of the samples are not looked at."""
     solve(LAMBERT[:3], device, tables)

@@ -83,6 +83,7 @@ def test_a_scan_at_a_wrong_place_is_left_out_and_named(tmp_path, shots):
     assert 0.2 * OFF < found < OFF  # along the normals, of which only those to the side are moved
 
 
+@pytest.mark.long
 def test_a_scan_that_is_there_twice_is_fused_once(tmp_path, shots):
     """The mesh is to the last byte that of the set without the second one, its σ with it."""
     file = write_scans(tmp_path / "once", shots[:3])

@@ -91,6 +91,7 @@ def test_jobs_go_on_while_a_receiver_holds_the_request_and_it_hears_of_all_in_th
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("database_url", ["postgresql"], indirect=True)
 def test_a_server_that_is_killed_after_the_end_of_a_job_tells_it_when_it_runs_again(tmp_path, database_url):
     settings = {"roots": str(SAMPLES), "hook_networks": LOOPBACK} | ({} if database_url is None else {"database_url": database_url})
     options = ("--anonymous", "--device", "none")

@@ -1,4 +1,4 @@
-"""Jobs that make no maps: bases, scans and patterns to project."""
+"""Jobs that make no maps: bases, scans, patterns to project, and a rig that is driven."""
 
 import io
 import json
@@ -9,7 +9,9 @@ import pytest
 
 from service.depth.patterns.projection import make_patterns
 from service.requests.patterns import PatternsRequest
-from tests.scenes.captures import files_in
+from stage.transforms import fibonacci_sphere
+from tests.scenes.captures import files_in, make_scene, write_capture, write_exr
+from tests.scenes.rigs import write_rig
 from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
 from tests.service.server.api.tus import Tus
 
@@ -91,3 +93,97 @@ def test_patterns_are_those_of_the_command(server, client, tmp_path):
                                       {"kind": "scan"}, {"kind": "basis", "options": {"basis": "jpeg"}}, {"kind": "calibrate"}])
 def test_what_cannot_be_is_refused(client, request_):
     refused(client.post("/v1/jobs", json=request_), 422, "")
+
+
+SUN = {"schema": "relit.keys/1", "lights": [
+    {"name": "sun", "keys": [{"frame": 1, "direction": [0, 0, 1], "irradiance": [0.2, 0.2, 0.2]}]}]}
+
+
+@pytest.fixture(scope="module")
+def lamps(tmp_path_factory) -> dict:
+    path = tmp_path_factory.mktemp("rig") / "dome.json"
+    write_rig(path, fibonacci_sphere(24), irradiance=4.0, bits=16)
+    return json.loads(path.read_text())
+
+
+@pytest.mark.long
+def test_a_job_writes_the_cues_that_the_command_line_writes(server, client, registered, lamps, relit, tmp_path):
+    radiance = np.random.default_rng(3).uniform(0.1, 1, (16, 32, 3)).astype(np.float32)
+    write_exr(registered / "noise.exr", radiance)
+    sky = admitted(server, client, registered / "noise.exr", kind="environments")["id"]
+    options = {"frames": "5-7", "spin_degrees": 90.0}
+    job = submit(client, kind="drive", rig=lamps, environment=sky, options=options)
+    finish(server, client, job)
+    assert made_by(client, job) == {"cues.csv", "cues.json", "preview.png", "report.json", "rig.json"}
+
+    def result(name: str) -> bytes:
+        return client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content
+
+    (tmp_path / "dome.json").write_text(json.dumps(lamps))
+    relit.done("drive", tmp_path / "dome.json", "--environment", registered / "noise.exr", "--frames", "5-7", "--spin-degrees", "90",
+               "--out", tmp_path / "cues", "--device", "cpu")
+    for name in ("cues.csv", "cues.json", "preview.png"):
+        assert result(name) == (tmp_path / "cues" / name).read_bytes()
+    assert json.loads(result("rig.json")) == lamps
+    report = json.loads(result("report.json"))
+    assert report["inputs"]["rig"]["path"] == f"{job['id']}/rig.json" and str(server.data) not in json.dumps(report)
+    beyond = submit(client, kind="drive", rig=lamps, environment=sky, options={"exposure": 12.0})
+    error = finish(server, client, beyond, "failed")["error"]
+    assert "is beyond all limits of the rig dome" in error and str(registered) not in error
+
+
+@pytest.mark.long
+def test_a_chart_and_a_capture_come_with_a_job(server, client, relit, tmp_path):
+    """A chart whose camera sees a quarter of the red that the irradiances say; the capture is the first sample of the service."""
+    rig = write_rig(tmp_path / "dome.json", fibonacci_sphere(24), irradiance=4.0, bits=16)
+    patches = [[0.9, 0.9, 0.9], [0.4, 0.1, 0.1], [0.1, 0.3, 0.2], [0.1, 0.1, 0.4]]
+    chart = {"schema": "relit.chart/1", "target": patches, "primaries": {name: [
+        [4 * part * (c == k) for c, part in enumerate(patch)] for patch in patches] for k, name in enumerate(("red", "green", "blue"))}}
+    chart["primaries"]["red"] = [[part / 4 for part in patch] for patch in chart["primaries"]["red"]]
+    (tmp_path / "chart.json").write_text(json.dumps(chart))
+    (tmp_path / "sun.json").write_text(json.dumps(SUN))
+    scene = write_capture(tmp_path / "object", make_scene(16, 6))
+    job = submit(client, kind="drive", rig=rig, keys=SUN, chart=chart, capture=upload(server, client, files_of(scene))["id"])
+    finish(server, client, job)
+    assert {"chart.json", "predicted.0001.exr"} <= made_by(client, job)
+    relit.done("drive", tmp_path / "dome.json", "--keys", tmp_path / "sun.json", "--chart", tmp_path / "chart.json", "--capture", scene,
+               "--out", tmp_path / "cues", "--device", "cpu")
+    for name in ("cues.csv", "predicted.0001.exr"):
+        assert client.get(f"/v1/jobs/{job['id']}/results/{name}").raise_for_status().content == (tmp_path / "cues" / name).read_bytes()
+    red = [row for row in (tmp_path / "cues" / "cues.csv").read_text().splitlines() if ",red," in row]
+    assert sum(float(row.rpartition(",")[2]) for row in red) == pytest.approx(4 * 0.05, abs=1e-3)
+
+
+@pytest.mark.long
+def test_light_keys_drive_a_rig_alone_and_lie_beside_its_cues(server, client, lamps):
+    job = submit(client, kind="drive", rig=lamps, keys=SUN)
+    finish(server, client, job)
+    assert "keys.json" in made_by(client, job)
+    frame, = client.get(f"/v1/jobs/{job['id']}/results/cues.json").raise_for_status().json()["frames"]
+    assert sum(frame["levels"]) == pytest.approx(3 * 0.05, abs=1e-3)  # .2 of 4; each level is off by half a step at most
+
+
+def test_what_cannot_be_driven_is_refused_by_name(client, lamps, relit, tmp_path):
+    def ask(**request):
+        return client.post("/v1/jobs", json={"kind": "drive", **request})
+
+    first, *others = lamps["lights"]
+    for wrong, words in (
+            ({"lights": [first | {"least": 2}, *others]}, "lights[0].least: "),
+            ({"lights": [first, first]}, "lights[1].name: L000 is already the name of lights[0]"),
+            ({"lamps": []}, "lamps: "),
+            ({"name": ""}, "name: ")):
+        response = ask(rig={**lamps, **wrong}, keys=SUN)
+        refused(response, 422, words)
+        assert response.json()["errors"][0]["field"] == "body.drive.rig"
+    (tmp_path / "wrong.json").write_text(json.dumps({**lamps, "lights": [first | {"least": 2}]}))
+    (tmp_path / "sun.json").write_text(json.dumps(SUN))
+    sentence = relit.refused("submit", "drive", tmp_path / "wrong.json", "--keys", tmp_path / "sun.json")  # before a server is asked
+    assert "wrong.json: lights[0].least: " in sentence
+    refused(ask(rig={**lamps, "schema": "relit.rig/2"}, keys=SUN), 422, "relit.rig/1")
+    refused(ask(keys=SUN), 422, "Field required")
+    refused(ask(rig=lamps), 422, "nothing lights the frames")
+    refused(ask(rig=lamps, environment=f"env_{'0' * 20}"), 404, "environment: ")
+    refused(ask(rig=lamps, keys=SUN, options={"frames": "1-20001"}), 422, "20000 are allowed in a job")
+    captured = {"schema": "relit.keys/1", "captured": [{"image": "0.exr", "keys": [{"frame": 1, "weight": 1}]}]}
+    refused(ask(rig=lamps, keys=captured), 422, "has captured images, which lamps cannot show")

@@ -22,7 +22,7 @@ from tests.service.waiting import PATIENCE_S, at_once, until
 pytestmark = pytest.mark.long
 
 DRAIN_S = 4.0
-"""Of the server that is ended while it works; its step takes longer."""
+"""Of the server that is ended while it works; its step never ends."""
 
 
 def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):
@@ -58,9 +58,10 @@ def test_a_worker_of_its_own_makes_the_service_ready_and_ends_clean(tmp_path):
 @pytest.fixture
 def busy(tmp_path) -> Iterator[tuple[Server, httpx2.Client, str]]:
     """A server whose worker is in a step that takes longer than it may take to drain."""
-    with serving(tmp_path, "--anonymous", "--device", "cpu", roots=str(SAMPLES), drain_s=str(DRAIN_S)) as server, \
+    with serving(tmp_path, "--anonymous", "--device", "cpu", sabotage="hang", roots=str(SAMPLES), drain_s=str(DRAIN_S)) as server, \
             server.client() as client:
-        job = submit(client, kind="solve", capture=admitted(server, client, SAMPLES / "owl")["id"], options={"method": "svbrdf"})["id"]
+        sky = admitted(server, client, SAMPLES / "owl" / "environment.exr", kind="environments")["id"]
+        job = submit(client, kind="relight", capture=admitted(server, client, SAMPLES / "lambert")["id"], environment=sky)["id"]
         server.wait(client, f"/v1/jobs/{job}", ("running",))
         yield server, client, job
 

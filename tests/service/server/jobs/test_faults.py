@@ -1,8 +1,9 @@
-"""What else may happen to workers: the database restarts, a step hangs, a job kills whoever takes it, they are asked to end, the disk is
-full."""
+"""What may happen to workers: they are killed, the database restarts, a step hangs, a job kills whoever takes it, they are asked to end,
+the disk is full. benchmarks/service_faults.py does the same at full size."""
 
 import errno
 import os
+import random
 import signal
 import subprocess
 from pathlib import Path
@@ -68,14 +69,14 @@ def test_a_worker_that_is_asked_to_end_finishes_its_step_and_hands_the_job_back(
     with harness(tmp_path, on_postgres) as made:
         worker = made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
         made.ready(1)
-        job = begin(made, undisturbed, chunk_frames=6)
-        frames_there(made, job, 8)  # in the second step
+        job = begin(made, undisturbed, chunk_frames=12)
+        frames_there(made, job, 14)  # in the second step, a second before its end
         worker.send_signal(signal.SIGTERM)
         assert worker.wait(60) == 0
         row = made.row(job)
         assert (row["state"], row["worker"], row["lost"]) == (jobs.QUEUED, None, 0)
-        assert row["finished_steps"] == ["frames 1-6", "frames 7-12"]
-        assert len(digests(made.results(job))) == 12
+        assert row["finished_steps"] == ["frames 1-12", "frames 13-24"]
+        assert len(digests(made.results(job))) == 24
         assert workers.seen_lately(made.database) == []
         made.start()
         assert made.ended(job)["state"] == jobs.SUCCEEDED
@@ -171,3 +172,40 @@ def test_a_job_on_a_full_disk_fails_with_a_sentence_and_goes_on_when_there_is_sp
         row = made.ended(job)
         assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
         assert digests(made.results(job)) == undisturbed.digests
+
+
+WORKERS = 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("database_url", "kills"), [
+    ("sqlite", 1), pytest.param("postgresql", 3, marks=pytest.mark.long),
+], indirect=["database_url"])
+def test_every_frame_is_there_once_and_as_undisturbed(tmp_path, database_url, kills, undisturbed):
+    seed = random.randrange(2**32)
+    print(f"seed {seed}")
+    chance = random.Random(seed)
+    with harness(tmp_path, database_url, takeover_s=0.5) as made:
+        for _ in range(WORKERS):
+            made.start()
+        made.ready(WORKERS)
+        job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
+                           undisturbed.frames, chunk_frames=8)
+        kill_at = sorted(chance.sample(range(undisturbed.frames // 2), kills))  # frames that are there
+        victim = None
+        for kill, frames in enumerate(kill_at):
+            made.until(lambda at=frames: made.frames_there(job) >= at, f"{frames} frames", every_s=0.002)
+            victim = made.holder(job, other_than=victim)
+            pid = made.pid_of(victim)
+            if kill % 2:  # with the process that looks after it, as a machine dies
+                supervisor = next(process for process in made.supervisors if os.getpgid(pid) == process.pid)
+                os.killpg(supervisor.pid, signal.SIGKILL)
+                supervisor.wait()
+                made.start()
+            else:
+                os.kill(pid, signal.SIGKILL)
+        row = made.ended(job)
+        assert (row["state"], row["error"]) == (jobs.SUCCEEDED, None)
+        assert row["worker"] != victim
+        assert digests(made.results(job)) == undisturbed.digests  # and no file besides, hidden ones neither
+        made.never_two_at_once(job)

@@ -17,6 +17,7 @@ from service.server.storage.objects import open_storage
 from tests.scenes.foreign import write_photographs
 from tests.service.server.jobs.harness import PROJECT
 
+ON_SQLITE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 SILENT = SimpleNamespace(stage=lambda *_: None, advance=lambda *_: None)
 CHOICES = ImportChoices(layout="olat", options={"axes": "right,up,towards", "sense": "to-light"})
 
@@ -57,6 +58,7 @@ class Killed(BaseException):
     """As if the process had ended."""
 
 
+@pytest.mark.parametrize("database_url", ["sqlite", pytest.param("postgresql", marks=pytest.mark.long)], indirect=True)
 @pytest.mark.parametrize("last", ["before", "after"])
 def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harness, uploaded, monkeypatch, last):
     identifier, names = uploaded
@@ -79,6 +81,7 @@ def test_an_import_that_is_killed_is_done_again_as_if_nothing_had_been(idle_harn
     assert list(idle_harness.settings.data.rglob(".import-*")) == []
 
 
+@ON_SQLITE
 @pytest.mark.parametrize("limit", ["max_project_bytes", "max_project_pixels"])
 def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_harness, uploaded, limit):
     """The photographs have 9 × 32 × 32 pixels, and capture.json some hundred bytes."""
@@ -89,6 +92,7 @@ def test_a_project_without_room_for_what_is_made_has_its_files_as_before(idle_ha
     assert stored(idle_harness, identifier) == (names,) * 2
 
 
+@ON_SQLITE
 def test_an_import_that_was_killed_after_its_capture_was_ready_changes_nothing_when_it_is_run_again(idle_harness, uploaded):
     """The capture's own pixels use the quota up, which would refuse it if they were asked for twice."""
     identifier, names = uploaded
@@ -98,16 +102,12 @@ def test_an_import_that_was_killed_after_its_capture_was_ready_changes_nothing_w
     run(idle_harness, identifier, max_project_pixels=9 * 32 * 32)
     assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
     assert (intakes.find(idle_harness.database, identifier, PROJECT), made.read_bytes()) == before
-
-
-def test_a_capture_that_another_run_has_let_be_ready_is_not_asked_for_its_quota(idle_harness, uploaded):
-    identifier, _ = uploaded
-    run(idle_harness, identifier)
     asked = []
     intakes.accept(idle_harness.database, identifier, {}, asked.append)
     assert asked == []
 
 
+@ON_SQLITE
 def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_harness, uploaded, tmp_path):
     identifier, names = uploaded
     own, length = tmp_path / "own.json", 5
@@ -122,6 +122,7 @@ def test_a_capture_json_that_was_uploaded_stays_and_its_import_is_refused(idle_h
     assert stored(idle_harness, identifier) == (["capture.json", *names],) * 2
 
 
+@ON_SQLITE
 def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness, uploaded, monkeypatch):
     identifier, names = uploaded
     put = FolderStorage.put
@@ -141,6 +142,7 @@ def test_what_a_killed_import_has_left_is_not_taken_for_the_capture(idle_harness
     assert stored(idle_harness, identifier) == (names,) * 2
 
 
+@ON_SQLITE
 def test_an_import_that_fails_in_any_way_takes_what_it_made_away(idle_harness, uploaded, monkeypatch):
     identifier, names = uploaded
 

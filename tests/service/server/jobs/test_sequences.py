@@ -67,6 +67,7 @@ def run(job: Job, context: WorkerContext, name: str) -> None:
     context.storage.publish(f"projects/{PROJECT}/jobs/{job.id}", Recording())
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.long
 def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence, undisturbed, tmp_path, monkeypatch):
     """Each finds what the other has left in the store, and joins without solving again."""
@@ -87,6 +88,7 @@ def test_machines_that_share_a_store_do_the_steps_in_turn(idle_harness, sequence
     assert str(tmp_path).encode() not in (store / "step03" / "alone" / "report.json").read_bytes()
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 def test_a_sequence_that_has_lost_steps_is_one_sentence(idle_harness, sequence):
     capture = idle_harness.register(sequence, CAPTURE, captures=STEPS + 1, steps=STEPS + 1)
     job = Job(new_id("job"), PROJECT, DepthJob(kind="depth", capture=capture), 1)

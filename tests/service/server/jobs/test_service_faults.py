@@ -16,7 +16,7 @@ from tests.service.waiting import until
 pytestmark = pytest.mark.long
 
 OPTIONS = ("--anonymous", "--device", "cpu")
-SETTINGS = {"chunk_frames": "6"}
+SETTINGS = {"chunk_frames": "12"}
 
 
 def begin(server: Server, client, undisturbed, *, frames: int | None = None) -> str:
@@ -55,13 +55,13 @@ def test_jobs_go_on_after_the_api_was_killed(tmp_path, undisturbed):
     settings = SETTINGS | {"roots": str(undisturbed.capture.parent)}
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         job = begin(server, client, undisturbed)
-        frames_there(server, job, 8)
+        frames_there(server, job, 14)
         os.kill(server.process.pid, signal.SIGKILL)
         server.process.wait()
         until(lambda: "worker ended" in server.log.read_text(), "ended")  # after its step
         with server.database() as database:
             row = jobs.find(database, job)
-        assert (row["state"], row["lost"], row["finished_steps"]) == (jobs.QUEUED, 0, ["frames 1-6", "frames 7-12"])
+        assert (row["state"], row["lost"], row["finished_steps"]) == (jobs.QUEUED, 0, ["frames 1-12", "frames 13-24"])
     with serving(tmp_path, *OPTIONS, sabotage="slow", **settings) as server, server.client() as client:
         assert server.wait(client, f"/v1/jobs/{job}", jobs.ENDED)["state"] == jobs.SUCCEEDED
         assert digests(results(server, job)) == undisturbed.digests

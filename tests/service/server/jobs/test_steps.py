@@ -48,6 +48,7 @@ def only_step(harness, request, roots, settings=None):
     return step
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["002.exr", "capture.json", "mask.png"])
 def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harness, capture, tmp_path, monkeypatch, name):
@@ -70,6 +71,7 @@ def test_a_file_that_becomes_a_link_after_it_was_checked_is_not_read(idle_harnes
         step_of(idle_harness, capture, (capture.parent,)).run(Recording())
 
 
+@pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
 @pytest.mark.long
 def test_the_worker_decodes_no_image_of_a_capture_and_closes_its_folder(idle_harness, capture, monkeypatch):
     before = len(os.listdir("/proc/self/fd"))

@@ -21,7 +21,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_u
         pytest.skip("the client programs of PostgreSQL are not on the path")
     roots = str(undisturbed.capture.parent)
     with harness(tmp_path / "first", database_url, roots=roots) as made:
-        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backup
         job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
                            undisturbed.frames, chunk_frames=6)
         made.until(lambda: made.frames_there(job) >= 8, "8 frames")
@@ -30,6 +30,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service(tmp_path, database_u
         contents = json.loads((tmp_path / "saved" / CONTENTS).read_text())["files"]
         frames = [name for name in contents if name.endswith(".exr")]
         assert saved.files == len(contents) and 8 <= len(frames) < undisturbed.frames
+        (tmp_path / "gate").touch()
         assert made.ended(job)["state"] == jobs.SUCCEEDED  # the backup did not disturb it
         assert digests(made.results(job)) == undisturbed.digests
     second = None if database_url is None else request.getfixturevalue("server_postgres").new_database()

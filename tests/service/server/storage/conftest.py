@@ -18,8 +18,7 @@ import pytest
 
 from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage
-from service.server.storage.objects import ObjectStorage, Storage
-from service.server.storage.scratch import Scratch
+from service.server.storage.objects import ObjectStorage, Scratch, Storage
 from tests.service.waiting import free_port, until
 
 LIMIT = 1 << 30

@@ -13,8 +13,7 @@ from service.server.base.settings import Settings
 from service.server.storage import bucket as buckets
 from service.server.storage.bucket import Bucket
 from service.server.storage.folder import FolderStorage
-from service.server.storage.objects import ObjectStorage, open_storage
-from service.server.storage.scratch import IN_USE_S, Scratch
+from service.server.storage.objects import IN_USE_S, ObjectStorage, Scratch, open_storage
 from stage.errors import StorageError
 from tests.service.recording import Recording
 from tests.service.server.tcp_proxy import tcp_proxy

@@ -138,7 +138,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service_in_another_store(tmp
     roots = str(undisturbed.capture.parent)
     first, other = ((tmp_path / name).as_uri() for name in ("store", "other"))
     with harness(tmp_path / "first", roots=roots, storage_url=first) as made:
-        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow")
+        made.start(PYTHONPATH=SABOTAGE, SABOTAGE="slow", GATE=str(tmp_path / "gate"))  # so that the job runs as long as the backups
         job = made.relight(made.register(undisturbed.capture, CAPTURE), made.register(undisturbed.environment, ENVIRONMENT),
                            undisturbed.frames, chunk_frames=6)
         made.until(lambda: made.row(job)["finished_steps"], "the first frames sent")
@@ -147,6 +147,7 @@ def test_a_job_that_ran_is_finished_by_the_restored_service_in_another_store(tmp
         assert made.row(job)["state"] == jobs.RUNNING and saved.objects >= 6 and named.objects >= saved.objects
         listed = json.loads((tmp_path / "named" / CONTENTS).read_text())["storage"]["objects"]
         assert all(entry.get("changes") for entry in listed.values())  # the job goes on
+        (tmp_path / "gate").touch()
         assert made.ended(job)["state"] == jobs.SUCCEEDED
     assert restore(Settings(data=tmp_path / "again" / "data", storage_url=first), tmp_path / "named").differing == 0
     restore(Settings(data=tmp_path / "second" / "data", storage_url=other), tmp_path / "saved")

@@ -9,7 +9,7 @@ import pytest
 from service.requests.base import identifiers
 from service.server.base.settings import Settings
 from service.server.jobs.one_step import KEYS_FILE
-from service.server.storage import layout, objects, scratch
+from service.server.storage import layout, objects
 from service.server.storage.bucket import PIECE_BYTES
 from service.server.storage.folder import FolderStorage
 from service.server.storage.objects import SCRATCH, Storage
@@ -151,4 +151,4 @@ def test_every_name_is_in_the_docs(tmp_path):
                  objects.PROBE, "storage_url", "scratch_bytes", "chunk_frames", "database_url"):
         assert name in TEXT, name
     assert {"storage_url", "scratch_bytes", "chunk_frames", "database_url"} <= Settings.model_fields.keys()
-    assert scratch.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT
+    assert objects.IN_USE_S == 6 * 3600 and "the last six hours" in TEXT

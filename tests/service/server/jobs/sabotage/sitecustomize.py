@@ -1,8 +1,9 @@
 """Found by Python at its start where this folder is on PYTHONPATH: makes the frames of a worker's jobs do what SABOTAGE says.
 
-kill  end the process by SIGKILL, as want of memory would      hang  stand still      slow  take a tenth of a second for each frame
-long  half a second in jobs of 300 frames and more, and a tenth in those of 60 and more: a worker is then busy without keeping the other
-      tests from the processor
+kill  end the process by SIGKILL, as want of memory would      hang  stand still
+slow  take a tenth of a second for each frame; and before the ninth wait for a file of the name GATE, where that is given
+long  half a second in jobs of 300 frames and more and in the first attempt of jobs of the name `slow`, and a tenth in those of 60 frames
+      and more: a worker is then busy without keeping the other tests from the processor
 
 With PIECES the bands and batches of solves are small, and each takes about that many seconds more. The first waits until a second worker
 has begun one of the same job, so that neither does all of them before the other has come: TOGETHER is the folder in which each leaves a
@@ -27,15 +28,22 @@ def hang(*_):
 
 
 class Slow:
+    made = 0
+    """Frames that this process has made."""
+
     def __init__(self, inner, frame_s=0.1):
-        self._inner, self._frame_s = inner, frame_s
+        self._inner, self._frame_s, self._stage = inner, frame_s, ""
 
     def stage(self, name, total):
+        self._stage = name
         self._inner.stage(name, total)
 
     def advance(self, done):
         time.sleep(self._frame_s)
         self._inner.advance(done)
+        Slow.made += self._stage == "frames"
+        while Slow.made == 8 and "GATE" in os.environ and not os.path.exists(os.environ["GATE"]):
+            time.sleep(0.05)
 
 
 def slow(request, chunk, files):
@@ -44,7 +52,8 @@ def slow(request, chunk, files):
 
 def slow_if_long(request, chunk, files):
     frames = len(frame_numbers(request.options.frames, 1))
-    relight(request, chunk, files._replace(progress=Slow(files.progress, 0.5 if frames >= 300 else 0.1)) if frames >= 60 else files)
+    frame_s = 0.5 if frames >= 300 or (request.name == "slow" and files.job.attempt == 1) else 0.1 if frames >= 60 else 0.0
+    relight(request, chunk, files._replace(progress=Slow(files.progress, frame_s)) if frame_s else files)
 
 
 is_worker = "--multiprocessing-fork" in sys.orig_argv  # as Python calls a process that multiprocessing starts

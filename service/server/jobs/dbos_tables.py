@@ -1,0 +1,18 @@
+"""The one place that knows a table of DBOS, and what is written there because no public call does it: the order of the queues.
+
+DBOS 3.4 sets the priority of a workflow only when it is queued, a new attempt would lose the place among equals, and with SQLite it orders
+the jobs of one second and one priority by their random names. `tests/service/server/jobs/test_queue_order.py` fails where a later version
+orders its queues otherwise.
+"""
+
+import sqlalchemy as sa
+
+SCHEMAS = {"sqlite": None, "postgresql": "dbos"}
+"""The schema of the tables of DBOS, by the kind of database; SQLite has no schemas."""
+
+
+def set_order(connection: sa.Connection, workflow: str, **values: int) -> None:
+    """Set the `priority` of a queued workflow, of which the lowest goes first, or `created_at`, in milliseconds since 1970."""
+    workflows = sa.table("workflow_status", sa.column("workflow_uuid", sa.Text), *map(sa.column, values),
+                         schema=SCHEMAS[connection.dialect.name])
+    connection.execute(workflows.update().where(workflows.c.workflow_uuid == workflow).values(**values))
