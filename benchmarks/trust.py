@@ -32,6 +32,8 @@ PANEL, PANEL_COLUMNS, MARGIN = (260, 170), 5, 24
 """Width and height of one curve in pixels, curves in a row, and the room around each for its words."""
 HEAD = """# How far confidence can be trusted
 
+*After reading this page you can tell by how much the results of each method may be wrong where they say that they are sure.*
+
 `python -m benchmarks.trust --data DIR` measures this table and the picture below. Errors count every pixel whose truth is known.
 
 - *Solved*: part of these pixels that counts as solved with the defaults.

@@ -41,7 +41,7 @@ NO_LAMPS = Rig.model_construct(schema_="relit.rig/1", name="no lamps", color_spa
 
 
 class AcquireResult(NamedTuple):
-    """What was taken."""
+    """A summary of what was taken."""
 
     path: Path
     """The folder of the capture."""

@@ -50,7 +50,7 @@ BINS = 64
 
 
 class Reading(NamedTuple):
-    """What a picture of one lamp shows."""
+    """The reading of a picture of one lamp."""
 
     shot: str
     lamp: str
@@ -65,7 +65,7 @@ class Reading(NamedTuple):
 
 
 class Metered(NamedTuple):
-    """What the meter found."""
+    """The result of metering."""
 
     readings: tuple[Reading, ...]
     brightest: Reading

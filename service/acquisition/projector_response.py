@@ -1,4 +1,4 @@
-"""What a projector is given so that its patterns are linear light: by its gamma, or by a response that is measured before them."""
+"""Levels for a projector with which its patterns are linear light: by its gamma, or by a response that is measured before them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

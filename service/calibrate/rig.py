@@ -63,7 +63,7 @@ class Shot(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What the table says of the frames of a capture."""
+    """The frames of a capture as the table of the sweep lists them."""
 
     shots: dict[int, list[Shot]]
     """By the index of the emitter in `rig.emitters`."""

@@ -25,7 +25,7 @@ BESIDE, FACING = 1.5, 1.5
 
 
 class RegionVerdict(NamedTuple):
-    """What a scan says of a region."""
+    """The verdict of a scan on a region."""
 
     name: str
     verdict: Verdict

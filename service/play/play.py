@@ -25,7 +25,7 @@ SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class PlayResult(NamedTuple):
-    """What was sent."""
+    """A summary of what was sent."""
 
     frames: int
     """Number of frames that were sent, without the dark ones."""

@@ -22,7 +22,7 @@ SIDE, LAMP = 720, 7
 
 
 class RigCheck(NamedTuple):
-    """What a rig holds, and what is wrong with it."""
+    """The contents of a rig, and its faults."""
 
     rig: Rig
     universes: dict[Universe, int]

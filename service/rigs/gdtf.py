@@ -83,7 +83,7 @@ class Channel(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """What a DMX mode of a type of fixtures drives."""
+    """The channels of a DMX mode of a type of fixtures, and what they drive."""
 
     cells: list[Cell]
     """Empty if it has no light that Relit can drive."""

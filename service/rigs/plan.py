@@ -1,4 +1,4 @@
-"""What domes of so many lamps achieve under environments: errors of the irradiance and of highlights, against the number of lamps.
+"""Plans of domes: how well so many lamps render environments, as errors of the irradiance and of highlights, against the number of lamps.
 
 Highlights are those of a GGX lobe with the view from the front, as relit's materials have them (Walter et al., EGSR 2007).
 """
@@ -32,7 +32,7 @@ BATCH = 64
 
 
 class PlanRow(NamedTuple):
-    """What a dome achieves under an environment: root mean square errors over the normals, as parts of what the environment gives."""
+    """The errors of a dome under an environment: root mean square errors over the normals, as parts of what the environment gives."""
 
     environment: str
     lights: int

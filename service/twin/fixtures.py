@@ -1,4 +1,4 @@
-"""What the fixtures of a rig show when packets of sACN and Art-Net arrive.
+"""Fixtures of a rig, which take packets of sACN and Art-Net and show their levels.
 
 Source: ANSI E1.31-2018, sections 4 to 7; Art-Net 4 protocol specification, ArtDmx and ArtSync.
 """

@@ -43,7 +43,7 @@ PICTURE_ROWS = 480
 
 
 class TwinResult(NamedTuple):
-    """What was received."""
+    """A summary of what was received."""
 
     frames: int
     """Number of whole frames."""

@@ -1,4 +1,4 @@
-"""What cameras record in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright.
+"""Records of cameras in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright.
 
 Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tag Orientation, which TIFF 6.0 defines; in Radiance
 files the order of the rows and columns says the same.

@@ -1,4 +1,4 @@
-"""What the images of a folder show, told from their pixels alone: stripes of a code, waves, masks, an object under changing light.
+"""Tells from their pixels alone what the images of a folder show: stripes of a code, waves, masks, an object under changing light.
 
 Images are compared at a few thousand pixels, along rows and columns. Nothing is decoded here: the counts, contrasts and orders of the
 images are what `relit import gray` and `photos` ask for.

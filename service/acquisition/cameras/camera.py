@@ -33,7 +33,7 @@ class Picture(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """What a camera is told when it is opened."""
+    """The settings that a camera is opened with."""
 
     spool: Path
     """A folder for the files of cameras that do not write them into one themselves."""

@@ -1,1 +1,1 @@
-"""What is wrong with pictures while they can be taken again: each check one idea, in a module of its own."""
+"""Checks of pictures while they can be taken again: each check one idea, in a module of its own."""

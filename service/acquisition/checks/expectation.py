@@ -1,4 +1,6 @@
-"""What a picture should be: under one lamp, the prediction from the lamps around it; under several, the median of those of equal levels.
+"""The picture that is expected, and the faults that a picture can have.
+
+Under one lamp the prediction from the lamps around it is expected; under several, the median of pictures of equal levels.
 
 Per pixel, the light of a distant lamp is linear in the unit vector towards it where a matte surface faces it; near the borders of shadows
 it is so over small angles only. So the prediction at a direction is a fit, linear in the vector, to the pictures of the lamps, weighted by
@@ -32,7 +34,7 @@ FAR_DEGREES = 45.0
 
 
 class FaultKind(Choice):
-    """What is wrong with a picture."""
+    """The kind of a fault of a picture."""
 
     CLIPPED = "clipped", "too many readings of the object are at full scale"
     DARK = "too_dark", "the brightest readings are near the noise"

@@ -1,1 +1,1 @@
-"""What is captured: plans, and the pictures that they ask for."""
+"""Plans of captures, and the pictures that they ask for."""

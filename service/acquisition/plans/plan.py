@@ -16,7 +16,7 @@ PLAN_SCHEMA = "relit.plan/1"
 
 
 class Sequence(Strict):
-    """What every sequence of pictures has."""
+    """The fields of every sequence of pictures."""
 
     prompt: Text | None = None
     """What a person does before the first picture, such as placing a card: the pictures wait until it is confirmed. None: nothing."""

@@ -82,7 +82,7 @@ def test_a_camera_at_usb_that_does_not_open(setup, reflex, error, words):
 
 def test_of_several_cameras_one_must_be_named(setup, reflex):
     reflex.ports = (("Reflex", "usb:001,004"), ("Other", "usb:001,007"))
-    with pytest.raises(RequestError, match=r"several cameras: name one, gphoto2:usb:001,004 \(Reflex\) or gphoto2:usb:001,007 \(Other\)$"):
+    with pytest.raises(RequestError, match=r"usb:001,004 \(Reflex\) or gphoto2:usb:001,007 \(Other\)$"):
         open_camera("gphoto2", setup)
 
 
@@ -106,7 +106,7 @@ def test_automatic_sensitivity_is_switched_off_or_the_camera_is_refused(setup, r
     reflex.values, reflex.choices = {"iso": "100", "autoiso": "On"}, {"autoiso": ["On", "Off"]}
     assert open_camera("gphoto2", setup).settings == {"iso": "100", "autoiso": "Off"}
     reflex.values["autoiso"], reflex.fixed = "On", True
-    with pytest.raises(RequestError, match=r"^--camera gphoto2: the sensitivity is automatic \(autoiso is On\): switch that off"):
+    with pytest.raises(RequestError, match=r"^--camera gphoto2: .* automatic \(autoiso is On\)"):
         open_camera("gphoto2", setup)
 
 
@@ -234,7 +234,7 @@ def test_a_serial_board_that_never_answers(tmp_path):
     stage = Stage(tmp_path / "watch")
     serial = {"port": os.ttyname(board), "on": "on {index}\n", "off": "off\n", "acknowledge": "^ok", "ready_s": 0, "timeout_s": 0.1}
     rig = write_rig(tmp_path / "rig.json", stage, "serial", {"serial": serial})
-    with pytest.raises(RequestError, match=r"no answer to 'off' within 0.1 s: check the cable, the power and controllers.serial.baud$"):
+    with pytest.raises(RequestError, match=r"no answer to 'off' within 0.1 s: .* controllers.serial.baud$"):
         acquire(request(tmp_path, stage, rig), refuse_to_ask)
     os.close(host)
     os.close(board)

@@ -133,7 +133,7 @@ def test_the_virtual_camera_has_none_and_the_sentence_says_so(tmp_path):
         environment = virtual_camera(tmp_path / "card") | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
     assert (done.returncode, stage.on) == (1, set())
-    assert json.loads(done.stdout.splitlines()[-1])["refused"] == "--camera gphoto2: libgphoto2 does not know how this camera does that"
+    assert json.loads(done.stdout.splitlines()[-1])["refused"].startswith("--camera gphoto2: libgphoto2 does not know")
 
 
 @pytest.mark.long

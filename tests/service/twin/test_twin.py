@@ -84,7 +84,8 @@ def test_a_lamp_far_from_every_captured_light_is_named(tmp_path):
     away = np.array([0.0, np.sin(np.radians(5)), np.cos(np.radians(5))])
     rig = write_rig_file(tmp_path / "rig.json", np.stack([away, *directions[1:]]), host="127.0.0.1")
     twin = open_twin(TwinRequest(rig=rig, capture=write_capture(tmp_path / "capture", make_scene(lights=LAMPS))))
-    assert twin.picture.warnings == ["the lamp lamp 0 stands 5° from the nearest captured light, whose image stands for it"]
+    warning, = twin.picture.warnings
+    assert "the lamp lamp 0 stands 5° from" in warning
 
 
 def test_the_page_shows_frames_until_it_is_interrupted(tmp_path):
@@ -139,7 +140,7 @@ def test_bad_input_is_one_sentence(tmp_path, relit):
         taken.bind((host, 6454))
         outcome = relit("twin", rig, capture, "--interface", host, "--after", "1")
         assert (outcome.code, outcome.err.count("\n")) == (2, 1)
-        assert f"--interface {host}: cannot listen on port 6454 (Art-Net): address already in use" in outcome.err
+        assert f"--interface {host}: cannot listen on port 6454 (Art-Net)" in outcome.err
     with socket.create_server(("127.0.0.1", 0)) as taken:
         outcome = relit("twin", rig, capture, "--interface", host, "--port", taken.getsockname()[1])
         assert (outcome.code, outcome.err.count("\n")) == (2, 1) and "cannot serve the page" in outcome.err

@@ -10,7 +10,7 @@ import pytest
 
 from stage.errors import ImageError, StorageError
 from stage.formats import exr, exr_rows, exr_scan
-from stage.formats.exr_scan import ATTRIBUTE, is_intact, write_checksum
+from stage.formats.exr_scan import CHECKSUM_ATTRIBUTE, is_intact, write_checksum
 from tests.scenes.captures import files_in, write_exr
 
 PIXELS = np.random.default_rng(3).random((37, 23, 3)).astype(np.float32)
@@ -249,12 +249,12 @@ def test_every_flipped_bit_is_found(tmp_path, parts):
     exr.write_parts(path, parts, metadata={"relit:capture": "owl"}, checksum=True)
     assert is_intact(path)
     channels, metadata = exr.read(path)
-    assert len(channels) == 3 * len(parts) and len(metadata[ATTRIBUTE]) == 32  # and other readers do not mind it
+    assert len(channels) == 3 * len(parts) and len(metadata[CHECKSUM_ATTRIBUTE]) == 32  # and other readers do not mind it
     whole = path.read_bytes()
     for place in range(len(whole)):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
         assert not is_intact(path), place
-    for other in (whole[:-1], whole + b"\0", b"", whole[: whole.index(ATTRIBUTE.encode()) + 30]):
+    for other in (whole[:-1], whole + b"\0", b"", whole[: whole.index(CHECKSUM_ATTRIBUTE.encode()) + 30]):
         path.write_bytes(other)
         assert not is_intact(path)
     path.write_bytes(whole)
@@ -302,7 +302,7 @@ def test_parts_with_chunks_of_different_heights(tmp_path):
     assert exr_scan.is_intact(tmp_path / "blocks.exr")
     whole, header = exr.read(tmp_path / "whole.exr")
     found, own = exr.read(tmp_path / "blocks.exr")
-    assert own.keys() - header.keys() == {exr_scan.CHECKSUM_ATTRIBUTE}
+    assert own.keys() - header.keys() == {CHECKSUM_ATTRIBUTE}
     assert {name: own[name] for name in header if name != "channels"}["note"] == "dataWindow"
     assert whole.keys() == found.keys()
     assert all(np.array_equal(plane, found[name]) for name, plane in whole.items())

@@ -19,6 +19,7 @@ WINDOW = reference.Device(60, 44, 90.0, (-0.1, 0.02, 0.0), (0.001, -0.001))
 NORMALS_CAMERA = Camera.model_validate({
     "projection": "perspective", "resolution": [60, 44], "focal_px": [90.0, 90.0], "principal_px": WINDOW.principal.tolist(),
     "distortion": {"model": "brown_conrady", "k": WINDOW.k, "p": WINDOW.p}})
+NORMALS_RAYS = reference.pixel_rays(WINDOW)
 ALL = np.ones((44, 60), bool)
 
 
@@ -153,17 +154,17 @@ def test_small_images_and_offsets_beyond_them():
 @pytest.mark.parametrize("radius", [1, 2])
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.5, -0.4, 1.0), (-1.2, 0.3, 0.9)])
 def test_a_plane_has_its_normal_everywhere(normal, radius):
-    depth = reference.plane_depth(RAYS, (0.0, 0.0, -2.0), normal)
+    depth = reference.plane_depth(NORMALS_RAYS, (0.0, 0.0, -2.0), normal)
     found = depth_normals(depth, ALL, NORMALS_CAMERA, radius=radius)
     # corners have only three neighbours
     assert angles_degrees(found[1:-1, 1:-1], normal / np.linalg.norm(normal)).max() < 1e-3  # float32
 
 
 def test_a_sphere(monkeypatch):
-    depth = reference.sphere_depth(RAYS, (0.1, 0.0, -2.0), 0.6)
+    depth = reference.sphere_depth(NORMALS_RAYS, (0.1, 0.0, -2.0), 0.6)
     mask = np.isfinite(depth)
     found = depth_normals(np.nan_to_num(depth, nan=0.0), mask, NORMALS_CAMERA)
-    truth = (RAYS * np.nan_to_num(depth)[..., None] - (0.1, 0.0, -2.0)) / 0.6
+    truth = (NORMALS_RAYS * np.nan_to_num(depth)[..., None] - (0.1, 0.0, -2.0)) / 0.6
     middle = mask & (truth[..., 2] > 0.8)
     assert angles_degrees(found[middle], truth[middle]).max() < 1.5  # a pixel spans two degrees of the sphere
     assert not found[~mask].any()
@@ -184,7 +185,7 @@ def test_pixels_without_neighbours_have_none():
 
 def test_a_floor_has_normals_up_to_the_horizon():
     with np.errstate(divide="ignore"):
-        depth = reference.plane_depth(RAYS, (0.0, -0.3, 0.0), (0.0, 1.0, 0.0))
+        depth = reference.plane_depth(NORMALS_RAYS, (0.0, -0.3, 0.0), (0.0, 1.0, 0.0))
     mask = (depth > 0) & (depth < 20)
     grazing = mask & (depth > 0.3 * 8)  # steeper than 80°
     assert grazing.sum() > 60
@@ -193,7 +194,7 @@ def test_a_floor_has_normals_up_to_the_horizon():
 
 
 def test_noise_takes_no_normal_away():
-    depth = reference.plane_depth(RAYS, (0.0, 0.0, -3.0), (0.2, 0.1, 1.0))
+    depth = reference.plane_depth(NORMALS_RAYS, (0.0, 0.0, -3.0), (0.2, 0.1, 1.0))
     sigma = np.full(depth.shape, 0.15)  # a step to a neighbour is often steeper than 80°
     noisy = depth + sigma * np.random.default_rng(5).standard_normal(depth.shape)
     missing, blind = (int((~depth_normals(noisy, ALL, NORMALS_CAMERA, sigma=given).any(axis=-1)).sum()) for given in (sigma, None))

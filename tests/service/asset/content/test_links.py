@@ -20,6 +20,7 @@ PERSPECTIVE = Camera(projection="perspective", resolution=(SIZE, SIZE), focal_px
 cameras = pytest.mark.parametrize("camera", [ORTHOGRAPHIC, PERSPECTIVE], ids=["orthographic", "perspective"])
 REPAIRED_ORTHOGRAPHIC = Camera(projection="orthographic", resolution=(80, 60), pixel_size_m=0.002)
 REPAIRED_PERSPECTIVE = Camera(projection="perspective", resolution=(80, 60), focal_px=(150.0, 160.0), surface_z_m=-0.4)
+repaired_cameras = pytest.mark.parametrize("camera", [REPAIRED_ORTHOGRAPHIC, REPAIRED_PERSPECTIVE], ids=["orthographic", "perspective"])
 
 
 def ball_before_a_wall(camera: Camera, gap_px: float) -> tuple[SurfaceMaps, np.ndarray]:
@@ -158,7 +159,7 @@ def spiked(maps: SurfaceMaps, count: int, seed: int = 0) -> tuple[SurfaceMaps, n
     return dataclasses.replace(maps, height=np.where(where, maps.height + moved, maps.height).astype(np.float32)), where
 
 
-@cameras
+@repaired_cameras
 def test_spikes_are_put_back_along_the_normals(camera):
     maps = plane(camera)
     bad, where = spiked(maps, 60)
@@ -179,7 +180,7 @@ def test_a_few_spikes_are_no_warning():
     assert (repaired.spikes, repaired.warnings) == (3, ())
 
 
-@cameras
+@repaired_cameras
 def test_a_height_of_another_surface_is_refused(camera):
     with pytest.raises(AssetError, match=r"more than 5% of the pixels.*--method svbrdf"):
         repair_heights(spiked(plane(camera), 600)[0])
@@ -196,7 +197,7 @@ def test_islands_are_told():
     assert warning.startswith(f"geometry: {4 * 10} pixels are left out") and "fewer than 8 pixels" in warning
 
 
-@cameras
+@repaired_cameras
 @pytest.mark.parametrize("noise_degrees", [0, 4])
 def test_steep_surfaces_are_left_alone(camera, noise_degrees):
     """A plane of 72 degrees with a break, and a sphere to its limb, with normals that are wrong by some degrees."""
