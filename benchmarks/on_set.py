@@ -17,8 +17,8 @@ import numpy as np
 
 from service.acquisition.acquire import acquire, refuse_to_ask
 from service.acquisition.checks.expectation import FaultKind
+from service.acquisition.early_ingest import PREVIEW_FILE
 from service.acquisition.plans.plan import read_plan
-from service.acquisition.preview import PREVIEW_FILE
 from service.requests.acquire import AcquireRequest
 from tests.service.acquisition.scenes import KINDS, ROOT, Scene, named, owl, owl_on_stage, relief
 from tests.service.acquisition.test_acquire import faults_at_random

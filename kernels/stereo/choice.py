@@ -12,8 +12,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import sliding
-from kernels.stereo.cost import CHANCE, Labels, Margins
+from kernels.stereo.cost import CHANCE, Labels, Margins, sliding
 from kernels.stereo.paths import FAR
 
 SPREAD = 2

@@ -12,9 +12,8 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import sliding
 from kernels.stereo.choice import APART, SPREAD
-from kernels.stereo.cost import CHANCE, SCALE, Labels, census_pair
+from kernels.stereo.cost import CHANCE, SCALE, Labels, census_pair, sliding
 from kernels.stereo.paths import FAR
 
 

@@ -16,7 +16,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.device import once
 from kernels.packs import new_array, pack_type
-from kernels.stereo.census import sliding
+from kernels.stereo.cost import sliding
 
 LANES_CPU, LANES_CUDA = 16, 1
 """Columns of the window that a thread takes together: on the CPU all nine, as SIMD."""

@@ -16,12 +16,12 @@ import numpy as np
 
 from service.acquisition.cameras.camera import LIVE
 from service.acquisition.capture_files import JOURNAL_FILE, lines_of, record
+from service.acquisition.early_ingest import PREVIEW_FILE
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.live_view import LiveView
 from service.acquisition.meter import PICTURE_FILE
 from service.acquisition.plans.plan import NAMED, Plan, needs_projector, read_plan
 from service.acquisition.plans.shots import FLAT, Shot, shots_of
-from service.acquisition.preview import PREVIEW_FILE
 from service.errors import RequestError
 from service.relight.sheet import display, fit
 from service.reporting.provenance import REPORT_FILE

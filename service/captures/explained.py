@@ -14,8 +14,7 @@ from service.light_estimation.explanations import (
     fit_manifest,
     grey_readings,
 )
-from service.light_estimation.lambertian import Fit
-from service.light_estimation.suspects import Suspect, suspects
+from service.light_estimation.lambertian import Fit, Suspect, suspects
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight
 from stage.capture.lighting import has_placeholders

@@ -8,9 +8,19 @@ import numpy as np
 from kernels import device as devices
 from service.boards.inspection_picture import HIGH, LOW, MIDDLE, OUTSIDE
 from service.boards.stitching.regions import Verdict
-from service.comparison.deviations import Deviations, deviations_of, patches_of, sigma_of, standing_on
+from service.comparison.deviations import (
+    REGIONS_FILE,
+    Deviations,
+    RegionVerdict,
+    decide,
+    deviations_of,
+    inside,
+    patches_of,
+    sigma_of,
+    standing_on,
+    table,
+)
 from service.comparison.placing import Placement, place
-from service.comparison.regions import REGIONS_FILE, RegionVerdict, decide, inside, table
 from service.comparison.surfaces import Design, Offsets, ScannedSurface, read_design, read_scanned
 from service.errors import RequestError
 from service.relight.sheet import write_sheet

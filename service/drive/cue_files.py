@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from service.drive.chart_view import ChartView
 from service.drive.judgement import Judgement
 from service.drive.levels import Dilated, Quantised, WantedLevels
-from service.drive.light import Light
+from service.drive.light import ChartView, Light
 from service.relight.environments import Environments
 from service.reporting.progress import Timings
 from service.reporting.provenance import REPORT_FILE, report

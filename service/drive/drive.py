@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from kernels import device as devices
-from service.drive.chart_view import ChartView, view_chart
 from service.drive.cue_files import WORTH_SAYING, drive_warnings, report_sections, write_cue_files
 from service.drive.judgement import Judgement, far_irradiance, irradiance_of, lamp_irradiance
 from service.drive.levels import Dilated, WantedLevels, dilate, levels_for_light, quantise
-from service.drive.light import collect_light, judge_all
+from service.drive.light import ChartView, collect_light, judge_all, view_chart
 from service.errors import RequestError
 from service.relight.attributes import FRAMES_PER_SECOND
 from service.relight.environments import Environments

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from service.asset.content.inspection import Inspection
-from service.asset.content.surface import AssetReport
+from service.asset.content.surface import AssetReport, Inspection
 from service.asset.gltf import asset as gltf
 from service.asset.gltf.inspect import inspect_glb
 from service.asset.usd import asset as usd

@@ -1,14 +1,16 @@
 """Make a rig of the lamps that lit a capture, or of a table of lamps."""
 
-
+from collections.abc import Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import ValidationError
 
 from service.errors import RequestError
-from service.requests.rig import Primaries, RigFromCaptureRequest, RigFromCsvRequest
-from service.rigs.lamps import addresses, checked
+from service.requests.play import Protocol
+from service.requests.rig import PatchOptions, Primaries, RigFromCaptureRequest, RigFromCsvRequest
 from stage.capture.capture import Capture
 from stage.capture.light import PointLight
 from stage.capture.lighting import lights_from_centre
@@ -16,11 +18,14 @@ from stage.capture.point_lights import place_lights
 from stage.colour.colour_spaces import linear_space
 from stage.errors import ManifestError
 from stage.formats.csv_table import read_table
-from stage.rig.rig import RIG_SCHEMA, Lamp, Primary, Rig, write_rig
+from stage.model import Strict
+from stage.records import describe
+from stage.rig.rig import CHANNELS, RIG_SCHEMA, UNIVERSES, Address, Lamp, Primary, Rig, write_rig
 
 RGB = ("red", "green", "blue")
 COLOURS = {"red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0), "white": (1.0, 1.0, 1.0), "amber": (1.0, 0.5, 0.0)}
 """The nominal colours of primaries by name; `relit calibrate rig` measures those of a stage."""
+Part = TypeVar("Part", bound=Strict)
 
 
 def rig_from_capture(request: RigFromCaptureRequest) -> Rig:
@@ -97,3 +102,31 @@ def rig_from_csv(request: RigFromCsvRequest) -> Rig:
     rig = checked(Rig, {"schema": RIG_SCHEMA, "name": request.table.stem, "lights": tuple(lamps)}, str(request.table))
     write_rig(rig, request.out)
     return rig
+
+
+def addresses(patch: PatchOptions, primaries: Sequence[str]) -> Iterator[Address]:
+    """Yield the addresses of lamps of these primaries, one after another.
+    Raises RequestError if a universe is beyond those of the protocol, or a lamp has more channels than a universe."""
+    width = len(primaries) * patch.bits // 8
+    if width > CHANNELS:
+        raise RequestError(f"--primaries: a lamp would have {width} channels, a universe has {CHANNELS}")
+    first, last = UNIVERSES[patch.protocol.value]
+    universe, channel = patch.universe, 1
+    while True:
+        if channel + width > CHANNELS + 1:
+            universe, channel = universe + 1, 1
+        if not first <= universe <= last:
+            raise RequestError(f"--universe {patch.universe}: lamps would lie in universe {universe}: {patch.protocol} has {first} to "
+                               f"{last}")
+        yield Address(protocol="sacn" if patch.protocol is Protocol.SACN else "artnet", universe=universe,
+                      host=patch.host,
+                      channels={name: channel + index * patch.bits // 8 for index, name in enumerate(primaries)})
+        channel += width
+
+
+def checked(model: type[Part], data: dict[str, Any], where: str) -> Part:
+    """Return a part of a rig, or raise ManifestError with what is wrong and where."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ManifestError(f"{where}: {describe(error)}") from error

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from service.errors import RequestError
 from service.requests.rig import RigFromMvrRequest
-from service.rigs.lamps import checked
+from service.rigs.from_capture import checked
 from stage import inputs
 from stage.errors import ManifestError
 from stage.rig.rig import CHANNELS, RIG_SCHEMA, Lamp, Rig, write_rig

@@ -11,8 +11,7 @@ coordinates and relief, so that texture coordinates follow from the places of th
 import fast_simplification
 import numpy as np
 
-from service.asset.content.fans import drawn_apart, split_fans
-from service.asset.content.links import height_of, joined, relief
+from service.asset.content.links import drawn_apart, height_of, joined, relief, split_fans
 from service.asset.content.mesh import SurfaceMesh, camera_points, vertex_normals
 from stage.capture.camera import Camera
 

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.asset.content.fans import drawn_apart, split_fans
-from service.asset.content.links import Links, height_of, relief, surface_links, touched, without_islands
+from service.asset.content.links import Links, drawn_apart, height_of, relief, split_fans, surface_links, touched, without_islands
 from service.errors import AssetError
 from stage.capture.camera import Camera
 from stage.results.depth_breaks import STEEPEST

@@ -11,7 +11,7 @@ from urllib.parse import unquote
 
 from pygltflib import GLTF2, POINTS, TRIANGLES
 
-from service.asset.content.inspection import Inspection, Part, image_facts
+from service.asset.content.surface import Inspection, Part, image_facts
 from service.asset.gltf.container import COMPONENT_BYTES, ELEMENT_SIZES, GlbContents, read_glb
 from service.errors import AssetError
 from stage.errors import storage

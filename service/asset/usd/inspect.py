@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, UsdUtils, UsdValidation
 
-from service.asset.content.inspection import Inspection, Part, image_facts
+from service.asset.content.surface import Inspection, Part, image_facts
 from service.asset.usd.files import reason_of
 from service.asset.usd.layers import PURPOSES
 from service.asset.usd.scene import APERTURE_UNIT

@@ -105,7 +105,7 @@ def _meter(request: AcquireRequest, ask: Callable[[str], None]) -> None:
 
 def _preview(request: AcquireRequest, taken: int) -> None:
     """Write the preview, unless there is one of the same pictures and no view is asked for; a capture without one is as good as others."""
-    from service.acquisition.preview import PREVIEW_FILE, write_preview
+    from service.acquisition.early_ingest import PREVIEW_FILE, write_preview
     from service.relight.sheet import AS_EVER
 
     if taken == 0 and request.review == AS_EVER and (request.out / PREVIEW_FILE).exists():

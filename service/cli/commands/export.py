@@ -17,7 +17,7 @@ from service.requests.publish import PublishRequest
 from service.requests.solve import JoinRequest
 
 if TYPE_CHECKING:
-    from service.asset.content.inspection import Inspection, Part
+    from service.asset.content.surface import Inspection, Part
 
 LONGEST_TEXT = 100
 """Characters of a text of the provenance that relit inspect prints; --json has all."""

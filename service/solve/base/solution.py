@@ -13,7 +13,7 @@ from kernels.photometric.lambertian.readings import Lights, channel_weights
 from kernels.photometric.model.samples import evenly
 from kernels.status import ESTIMATED, Status, refuse_unsure
 from kernels.surface.integrate import Integration
-from service.light_estimation.suspects import LEAST_PIXELS, suspects
+from service.light_estimation.lambertian import LEAST_PIXELS, suspects
 from service.reporting.progress import Timings
 from service.sharing.sharing import SharedSolve
 from stage.capture.camera import Camera
@@ -75,7 +75,7 @@ class SuspectLight(NamedTuple):
 
     image: str
     misfit: float
-    """The misfit of `service.light_estimation.suspects`."""
+    """The misfit of `service.light_estimation.lambertian`."""
 
 
 @dataclass

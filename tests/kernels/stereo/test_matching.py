@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from kernels.stereo.census import BITS, REACH_X, REACH_Y, census
 from kernels.stereo.choice import choose
-from kernels.stereo.cost import CHANCE, SCALE, Labels, matching_cost
+from kernels.stereo.cost import BITS, CHANCE, REACH_X, REACH_Y, SCALE, Labels, census, matching_cost
 from kernels.stereo.paths import DIRECTIONS, LARGE_STEP, SMALL_STEP, gather
 from kernels.stereo.probe import probe
 from kernels.stereo.refine import refine

@@ -13,7 +13,7 @@ from service.acquisition.acquire import acquire, refuse_to_ask
 from service.acquisition.cameras.camera import open_camera
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
-from service.acquisition.preview import PREVIEW_FILE, write_preview
+from service.acquisition.early_ingest import PREVIEW_FILE, write_preview
 from service.errors import RequestError
 from service.relight.sheet import MARGIN, TITLE
 from stage.capture.capture import Capture

@@ -7,7 +7,7 @@ import OpenImageIO as oiio
 import pytest
 from scipy.optimize import nnls
 
-from service.drive.chart_view import ChartView, view_chart
+from service.drive.light import ChartView, view_chart
 from service.relight.far_light import FarLight
 from stage.formats import exr
 from stage.rig.chart import read_chart

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from service.light_estimation.explanations import Cause, Sample, better_explanation, fit_manifest
-from service.light_estimation.lambertian import fit_lambertian, median_of
+from service.light_estimation.lambertian import fit_lambertian, median_of, suspects
 from service.light_estimation.semi_calibrated import check_directions, fit_intensities
-from service.light_estimation.suspects import suspects
 from stage.errors import CalibrationError
 from tests.scenes.captures import angles_degrees, ring
 from tests.scenes.ellipsoid import ellipsoid

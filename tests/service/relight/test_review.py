@@ -6,8 +6,8 @@ import numpy as np
 import PyOpenColorIO
 import pytest
 
+from service.acquisition.early_ingest import write_preview
 from service.acquisition.meter import zebra
-from service.acquisition.preview import write_preview
 from service.relight import sheet
 from service.reporting.progress import Timings
 from service.requests.play import TwinRequest
