@@ -1,4 +1,4 @@
-"""Cast shadows of a height field, and which pixels support it."""
+"""Cast shadows of a height field, which pixels support it, and light between its patches."""
 
 import math
 
@@ -7,12 +7,20 @@ import pytest
 import warp as wp
 
 from kernels.errors import ArrayError
+from kernels.photometric.lambertian.near import NearField, pad_places
+from kernels.photometric.material.material import fit_tinted
+from kernels.photometric.model.samples import readings_of, to_host
+from kernels.photometric.search.hypotheses import Diffuse
+from kernels.photometric.shadows.bounce import bounce_albedo, subtract_bounce
 from kernels.photometric.shadows.shadowing import exclude_shadows
+from kernels.surface.interreflection import gather_light
 from kernels.surface.normal_map import supported_normals
 from kernels.surface.shadows import NO_REACH, Projection, Relief, in_shadow_within, relief_of
 from tests.kernels.photometric.test_svbrdf import LIGHTS, render, sample, tilted
+from tests.kernels.scenes import cap
 from tests.kernels.surface import shapes
 from tests.kernels.surface.test_integrate import solve, worst
+from tests.reference.groove import Groove
 
 STEP_AT, STEP_HEIGHT = 40, 10.0
 
@@ -148,3 +156,147 @@ def test_a_surface_of_unsure_normals_alone_keeps_its_span(device):
     truth = np.ptp(shape.z[shape.mask])
     assert np.ptp(solve(bad, device).height.numpy()[shape.mask]) > 4 * truth
     assert np.ptp(solve(bad, device, sigma=spread(shape, 45)).height.numpy()[shape.mask]) < 2 * truth
+
+
+def arriving_on(groove: Groove, radiance: np.ndarray, device: str, *, height=None, normals=None, opening=0.0) -> np.ndarray:
+    """What arrives at each patch of a groove; with the unit matrix as radiance these are the form factors."""
+    side = groove.side
+    z = (groove.points[:, 2].reshape(side, side) if height is None else height).astype(np.float32)
+    cells = np.stack(np.divmod(np.arange(side**2), side), axis=1)
+    return gather_light(groove.points, groove.normals if normals is None else normals, groove.areas, cells, radiance,
+                        wp.array(z, dtype=wp.float32, device=device), wp.ones((side, side), dtype=wp.uint8, device=device),
+                        Projection(False, wp.vec2(1.0, 1.0), wp.vec2(side / 2, side / 2)), device=device, opening=opening)
+
+
+def factors_of(groove: Groove, device: str, *, height=None) -> np.ndarray:
+    return arriving_on(groove, np.eye(groove.side**2, dtype=np.float32), device, height=height)
+
+
+def test_factors_agree_with_float64(device):
+    groove = Groove(16)
+    np.testing.assert_allclose(factors_of(groove, device), groove.factors(), rtol=1e-4, atol=1e-7)  # float32
+
+
+@pytest.mark.parametrize("opening, within", [(0.25, 0.03), (0.5, 0.15)])
+def test_far_patches_send_as_groups(device, opening, within):
+    """A group stands for its members to second order in its size over its distance. The seam is the worst place, because the groups
+    that face it are large; the light of uneven patches is weighted by their area."""
+    groove = Groove(32)
+    radiance = np.random.default_rng(1).uniform(0.5, 1.5, (32**2, 5)).astype(np.float32)
+    exact = groove.factors() @ radiance
+    found = arriving_on(groove, radiance, device, opening=opening)
+    np.testing.assert_allclose(found, exact, atol=within * exact.mean())
+    assert np.abs(found - exact).max() > 1e-4 * exact.mean()  # groups did send
+
+
+def test_the_two_sides_of_a_ridge_do_not_cancel(device):
+    """Narrow pleats seen from afar: those of their faces that look at a patch send it light, and those that look away do not take it
+    back, as a group of mean normal would."""
+    side = 32
+    groove = Groove(side)
+    pleats = np.tile(np.where(np.arange(side) % 2 == 0, 1.0, -1.0), side)
+    left = groove.points[:, 0] < 0
+    slant = np.stack([pleats, np.zeros(side**2), np.ones(side**2)], axis=1) / np.sqrt(2)
+    normals = np.where(left[:, None], slant, groove.normals)
+    radiance = np.ones((side**2, 1), dtype=np.float32)
+    exact, found = (arriving_on(groove, radiance, device, normals=normals, opening=opening)[~left] for opening in (0.0, 0.25))
+    np.testing.assert_allclose(found, exact, atol=0.05 * exact.mean())
+
+
+def plates_at_right_angles(width: float, length: float) -> float:
+    """What one rectangle sends to an equal one that shares its long edge at a right angle (Howell, configuration C-14)."""
+    h = w = width / length
+    both = h * h + w * w
+    logarithm = np.log((1 + w**2) * (1 + h**2) / (1 + both)
+                       * (w**2 * (1 + both) / ((1 + w**2) * both)) ** (w**2) * (h**2 * (1 + both) / ((1 + h**2) * both)) ** (h**2))
+    return (2 * w * np.arctan(1 / w) - np.sqrt(both) * np.arctan(1 / np.sqrt(both)) + logarithm / 4) / (np.pi * w)
+
+
+@pytest.mark.parametrize("side", [20, pytest.param(40, marks=pytest.mark.long)])
+def test_a_groove_has_its_closed_form(device, side):
+    """The faces' mean row sum is the form factor between them. Patches at the seam are as far apart as they are large, which costs
+    some of their exchange: an error that falls with the size of the patches, 12 % and 6 % of the whole here."""
+    total = factors_of(Groove(side), device).sum(axis=1)
+    expected = plates_at_right_angles(side / np.sqrt(2), side)
+    assert total.mean() == pytest.approx(expected, rel=2.4 / side)
+    middle = total.reshape(side, side)[side // 2]
+    assert (np.diff(middle[: side // 2]) > 0).all()  # more, the closer to the seam
+
+
+def test_a_wall_between_hides(device):
+    """A ridge along the seam, in the height but in no patch: the faces no longer see each other through it."""
+    groove = Groove(16)
+    height = groove.points[:, 2].reshape(16, 16).copy()
+    height[:, 7:9] = 40.0
+    free, hidden = factors_of(groove, device), factors_of(groove, device, height=height)
+    across = np.ix_(np.flatnonzero(groove.points[:, 0] < -4), np.flatnonzero(groove.points[:, 0] > 4))
+    seen = free[across] > 1e-4
+    assert seen.any() and (hidden[across][seen] == 0).mean() > 0.95
+
+
+def test_shapes_are_checked(device):
+    groove = Groove(4)
+    with pytest.raises(ArrayError, match="radiance"):
+        arriving_on(groove, np.ones((15, 1), np.float32), device)
+    groove.areas = groove.areas[:-1]
+    with pytest.raises(ArrayError, match="areas"):
+        factors_of(groove, device)
+
+
+def test_taking_off_the_bounce_leaves_the_direct_light(device):
+    """radiance = direct + ρ K radiance: with the true K and albedo what is left is the direct light, to half rounding of the images."""
+    groove, lights, albedo = Groove(12), cap(16, 40.0), 0.7
+    whole, direct = groove.radiance(lights, albedo)
+    assert np.median(whole / np.maximum(direct, 1e-9)) > 1.05  # the bounces are no trifle
+    samples, _ = sample(np.repeat(whole[None], 3, axis=0), device, lights=lights)
+    arriving = np.repeat((groove.factors() @ whole.T)[:, None], 3, axis=1)
+    count = groove.side**2
+    corners = np.stack([np.arange(count)] * 4, axis=1)
+    shares = np.tile(np.array([0.1, 0.2, 0.3, 0.4], dtype=np.float32), (count, 1))
+    subtract_bounce(samples, arriving, corners, shares, np.full((count, 3), albedo), np.array([0.3, 0.6, 0.1]))
+    at = np.array([[p * samples.pack_stride + light * samples.light_stride for p in range(samples.packs)] for light in range(16)])
+    grey = samples.grey.numpy().reshape(-1, samples.lanes)[at].reshape(16, -1)[:, :count] * to_host(samples, samples.level)
+    red = samples.colour.numpy().reshape(3, -1, samples.lanes)[0][at].reshape(16, -1)[:, :count]
+    np.testing.assert_allclose(grey, direct, atol=1.2 * 2**-11 * whole.max())  # and the float32 of what is taken off
+    np.testing.assert_allclose(red, direct, atol=1.2 * 2**-11 * whole.max())
+    with pytest.raises(ArrayError, match="corners must be"):
+        subtract_bounce(samples, arriving, corners + 1, shares, np.full((count, 3), albedo), np.array([0.3, 0.6, 0.1]))
+
+
+def test_bounced_light_is_that_of_the_whole_reflection(device):
+    """Soft light added to a surface is taken by the fit for a wide tinted lobe, in place of the diffuse one; a matt fit keeps it. A
+    metal has no diffuse reflection, whatever a matt fit would call it."""
+    normal = tilted(60)
+    colour = np.array([0.6, 0.5, 0.4])
+    soft = 0.04 * colour[:, None, None] * (1 + LIGHTS[None, :, None, 0])  # as a wall beside it sends
+    samples, _ = sample(render(normal, albedo=colour, alpha=0.1) + soft, device)
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
+    found = bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse())
+    wrong, alone = (np.quantile(np.abs(np.log(np.maximum(albedo, 1e-3) / colour)), 0.9) for albedo in (found, tinted.diffuse_albedo))
+    assert wrong < 0.3  # the added light is 10 to 20 % of the diffuse
+    assert alone > 0.3
+    samples, _ = sample(render(normal, albedo=np.zeros(3), alpha=0.16, f0=0.8), device)
+    tinted = fit_tinted(samples, normal.astype(np.float32), shape=Diffuse())
+    assert bounce_albedo(samples, normal.astype(np.float32), tinted, shape=Diffuse()).max() < 0.05
+
+
+def test_near_light_is_taken_off_in_the_unit_of_each_reading(device):
+    """A reading under a near light is radiance over intensity and falloff, and what arrives is radiance over intensity."""
+    rng = np.random.default_rng(5)
+    count, lights, albedo = 40, 8, 0.5
+    points = rng.uniform(-1, 1, (3, count)).astype(np.float32)
+    lamps = np.concatenate([rng.uniform(2, 3, (lights, 3)), np.ones((lights, 1))], axis=1)
+    lamps[-1] = 0, 0, 1, 0  # a distant one among them
+    field = NearField(pad_places(lamps, np.zeros((lights, 4))), points)
+    way = lamps[:, None, :3] - points.T
+    falloff = np.where(lamps[:, 3:] > 0, 1 / (way**2).sum(axis=-1), 1)
+    direct, arriving = rng.uniform(0.2, 0.4, (lights, count)), rng.uniform(0.1, 0.3, (count, lights))
+    stored = (direct * falloff + albedo * arriving.T).astype(np.float16).astype(float)
+    samples, _ = sample(np.repeat(stored[None], 3, axis=0), device, lights=np.tile([0.0, 0.0, 1.0], (lights, 1)), field=field)
+    corners = np.stack([np.arange(count)] * 4, axis=1)
+    subtract_bounce(samples, np.repeat(arriving[:, None], 3, axis=1), corners, np.full((count, 4), 0.25, np.float32),
+                    np.full((count, 3), albedo), np.full(3, 1 / 3), field)
+    np.testing.assert_allclose(readings_of(samples).T, direct, atol=2**-11 * (stored / falloff).max())  # half rounding of the images
+    with pytest.raises(ArrayError, match="points are"):
+        subtract_bounce(samples, np.repeat(arriving[:, None], 3, axis=1), corners, np.full((count, 4), 0.25, np.float32),
+                        np.full((count, 3), albedo), np.full(3, 1 / 3), field.at(np.arange(3)))
