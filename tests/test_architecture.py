@@ -107,7 +107,7 @@ def test_a_layer_imports_only_its_own_libraries(layer, allowed):
     ("stupidArtnet", ["service.play.artnet_output"]), ("jinja2", ["service.server.pages"]), ("dbos", ["service.server.jobs"]),
     ("laspy", ["stage.formats.las"]), ("pye57", ["stage.formats.e57"]),
     ("small_gicp", ["service.scans.points.neighbours"]), ("rawpy", ["stage.formats.camera_raw"]),
-    ("fast_simplification", ["service.asset.content.levels", "service.asset.content.uv_unwrap"]),
+    ("fast_simplification", ["service.asset.content.levels_of_detail", "service.asset.content.uv_unwrap"]),
     ("xatlas", ["service.asset.content.uv_unwrap"]),
     ("MaterialX", ["service.asset.content.openpbr"]),
 ])

@@ -19,7 +19,7 @@ import numpy as np
 
 from service.acquisition.cameras.camera import LIVE, Setup, open_camera
 from service.acquisition.checks.judge import FULL_SCALE
-from service.acquisition.checks.sample import TILE_PX, place_of_tile
+from service.acquisition.checks.picture_sample import TILE_PX, place_of_tile
 from service.acquisition.lights.lights import Lights
 from service.acquisition.meter import BINS, bars, focus_of, zebra
 from service.acquisition.plans.shots import even_levels

@@ -12,7 +12,7 @@ from scipy import ndimage
 from service.acquisition.cameras.camera import Camera, NoPictureError, Setup, open_camera
 from service.acquisition.capture_files import JOURNAL_FILE
 from service.acquisition.checks.judge import FULL_SCALE
-from service.acquisition.checks.sample import TILE_PX, bands_of, place_of_tile
+from service.acquisition.checks.picture_sample import TILE_PX, bands_of, place_of_tile
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import Shot, shots_of

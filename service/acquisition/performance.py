@@ -10,7 +10,7 @@ import numpy as np
 
 from service.acquisition.acquire import NO_LAMPS
 from service.acquisition.capture_files import CaptureFiles
-from service.acquisition.checks.sample import sample_of
+from service.acquisition.checks.picture_sample import sample_of
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import FLAT, TRACKING, Shot, shots_of
 from service.errors import RequestError

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.acquisition.cameras.camera import Picture
 from service.acquisition.checks.judge import Judge
-from service.acquisition.checks.sample import MOST_PIXELS
+from service.acquisition.checks.picture_sample import MOST_PIXELS
 from service.acquisition.plans.shots import TRACKING, Shot
 from service.errors import RequestError
 from stage.colour.colour import linearise

@@ -24,7 +24,7 @@ from service.basis.capture import WHITE_PERCENTILE, BasisCapture, BasisResult, D
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.requests.basis import BasisKind, BasisRequest
-from service.viewing.transfer import KEY_LIGHTS, key_weights
+from service.viewing.light_transfer import KEY_LIGHTS, key_weights
 from stage.errors import ManifestError
 from stage.formats.rti import Hsh, Ptm, Quantization, dequantize, quantization_of_range, quantize, write_hsh, write_ptm
 from stage.results.light_basis import layer_name, layer_types, numbers, write_facts, write_layers

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.calibrate.images import mean_image
 from service.calibrate.results import color_matrix, digits, open_capture, write_results
+from service.calibrate.sensor import mean_image
 from service.errors import RequestError
 from service.reporting.progress import Progress
 from service.requests.calibrate import WhiteBalanceRequest

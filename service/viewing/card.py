@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from service.viewing.capture_frames import CaptureImages, fit, one_frame
+from service.viewing.light_transfer import weights_of
 from service.viewing.reduction import TileRow, block_sums, plane_means, put_together
-from service.viewing.transfer import weights_of
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour import convert

@@ -20,8 +20,8 @@ from service.relight.weights.triangulation import share_smooth
 from service.reporting.progress import Timings
 from service.viewing.block_file import BlockFile
 from service.viewing.card import RelitCard
+from service.viewing.light_transfer import COLS, FULL, ROWS, HeldOutLights, grid_directions, transfer_of
 from service.viewing.reduction import Tiling, plane_means, put_together, step_within, tile_rows, tiling_of
-from service.viewing.transfer import COLS, FULL, ROWS, HeldOutLights, grid_directions, transfer_of
 from stage.capture.point_lights import DistantLights
 from stage.results.light_basis import numbers
 from stage.results.matte import Matte

@@ -20,10 +20,10 @@ from service.viewing.block_file import BlockFile
 from service.viewing.capture_frames import describe_frames, read_images, write_thumbnails
 from service.viewing.card import PICTURE_FILE, SHEET_FILE, write_photograph
 from service.viewing.layers import status_codes, write_layers
+from service.viewing.pixel_readings import write_samples
 from service.viewing.points import write_points
 from service.viewing.relighting import LEAST_LIGHTS, write_relighting
 from service.viewing.result_layers import ResultLayers
-from service.viewing.samples import write_samples
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
 from stage.capture.lighting import lights_from_centre

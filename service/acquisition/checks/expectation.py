@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.acquisition.checks.sample import Bands, Sample
+from service.acquisition.checks.picture_sample import Bands, Sample
 from service.acquisition.plans.shots import Shot
 from service.requests.base.base import Choice
 

@@ -22,7 +22,7 @@ from service.acquisition.checks.expectation import (
     same_kind,
     unit_root,
 )
-from service.acquisition.checks.sample import Motion, bands_of, motion_between, place_of_tile, sample_of
+from service.acquisition.checks.picture_sample import Motion, bands_of, motion_between, place_of_tile, sample_of
 from service.acquisition.checks.unreached import glows, unreached_faults
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig

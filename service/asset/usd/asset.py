@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from service.asset.content.levels import level_meshes, with_smooth_normals
+from service.asset.content.levels_of_detail import level_meshes, with_smooth_normals
 from service.asset.content.metallic import loss_warnings
 from service.asset.content.surface import SCALE_NOTE, AssetReport, surface_of
 from service.asset.content.textures import space_warnings, write_textures

@@ -20,8 +20,8 @@ from service.asset.content.openpbr import DOCUMENT
 from service.asset.content.textures import DATA_SPACE, FILE_NAMES
 from service.asset.usd.files import install, temporary_folder_beside
 from service.asset.usd.layers import ENVIRONMENT, LAYER_FILES, RIG, AssetLayers, Description, light_folder, texture_folder
+from service.asset.usd.light_prims import define_dome, define_rig, write_dome_texture
 from service.asset.usd.materials import define_coordinates, define_image, define_shader
-from service.asset.usd.rig import define_dome, define_rig, write_dome_texture
 from service.asset.usd.scene import define_polygons
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture

@@ -29,8 +29,8 @@ from service.requests.chart import ChartRequest
 from service.requests.rig import RigCalibrationRequest
 
 if TYPE_CHECKING:
-    from service.calibrate.images import ImageCalibration
     from service.calibrate.results import LightCalibration
+    from service.calibrate.sensor import ImageCalibration
 
 LIGHT_ROWS = 12
 """The number of lights that the table shows; the report holds all."""
@@ -73,19 +73,19 @@ def _intensity(request: IntensityRequest) -> None:
 
 
 def _dark(request: DarkRequest) -> None:
-    from service.calibrate.images import dark
+    from service.calibrate.sensor import dark
 
     _print_image("dark", with_bar(dark, request))
 
 
 def _flat_field(request: FlatFieldRequest) -> None:
-    from service.calibrate.images import flat_field
+    from service.calibrate.sensor import flat_field
 
     _print_image("flat", with_bar(flat_field, request))
 
 
 def _saturation(request: SaturationRequest) -> None:
-    from service.calibrate.images import saturation
+    from service.calibrate.sensor import saturation
 
     result = with_bar(saturation, request)
     print(f"level    {result.level:g}")
@@ -167,7 +167,7 @@ def _tof(request: TofCalibrationRequest) -> None:
 
 
 def _rig(request: RigCalibrationRequest) -> None:
-    from service.calibrate.rig import calibrate_rig
+    from service.calibrate.rig_lamps import calibrate_rig
 
     result = with_bar(calibrate_rig, request)
     print(f"rig      {result.rig_path}")

@@ -90,7 +90,7 @@ def _sweep(request: RigSweepRequest) -> None:
 
 
 def _plan(request: RigPlanRequest) -> None:
-    from service.rigs.plan import plan_rig
+    from service.rigs.dome_plan import plan_rig
 
     rows = with_bar(plan_rig, request)
     print(f"table    {request.out / 'plan.csv'}")

@@ -143,16 +143,16 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
 
 
 def _calibrate(request: JobRequest, files: StepFiles) -> None:
-    from service.calibrate import images, lights, response, white_balance
+    from service.calibrate import lights, response, sensor, white_balance
 
     products: dict[type[JobRequest], tuple[Callable[..., object], type[Options]]] = {
         calibration_jobs.MirrorBallJob: (lights.mirror_ball, calibrate.MirrorBallRequest),
         calibration_jobs.LightPositionsJob: (lights.light_positions, calibrate.LightPositionsRequest),
         calibration_jobs.GreyBallJob: (lights.grey_ball, calibrate.GreyBallRequest),
         calibration_jobs.IntensityJob: (lights.intensity, calibrate.IntensityRequest),
-        calibration_jobs.DarkJob: (images.dark, calibrate.DarkRequest),
-        calibration_jobs.FlatFieldJob: (images.flat_field, calibrate.FlatFieldRequest),
-        calibration_jobs.SaturationJob: (images.saturation, calibrate.SaturationRequest),
+        calibration_jobs.DarkJob: (sensor.dark, calibrate.DarkRequest),
+        calibration_jobs.FlatFieldJob: (sensor.flat_field, calibrate.FlatFieldRequest),
+        calibration_jobs.SaturationJob: (sensor.saturation, calibrate.SaturationRequest),
         calibration_jobs.WhiteBalanceJob: (white_balance.white_balance, calibrate.WhiteBalanceRequest),
         calibration_jobs.ResponseJob: (response.response, calibrate.ResponseRequest)}
     product, model = products[type(request)]
@@ -185,7 +185,7 @@ def _calibrate_rig(request: calibration_jobs.ProcamJob | calibration_jobs.Stereo
 
 
 def _calibrate_lamps(request: calibration_jobs.RigCalibrationJob, files: StepFiles) -> None:
-    from service.calibrate.rig import calibrate_rig
+    from service.calibrate.rig_lamps import calibrate_rig
     from service.requests.rig import RigCalibrationRequest
 
     rig = files.out / RIG_FILE

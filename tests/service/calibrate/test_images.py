@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from service.calibrate.images import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
 from service.calibrate.response import fit_response
+from service.calibrate.sensor import ChannelSaturation, TopHistogram, capture_saturation, make_flat, mean_image, recorded_values
 from stage.capture.capture import Capture
 from stage.errors import CalibrationError, ImageError
 from stage.formats import exr

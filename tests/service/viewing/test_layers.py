@@ -9,7 +9,7 @@ import pytest
 from kernels.status import Status
 from service.reporting.provenance import HASHING
 from service.requests.captures import ViewRequest
-from service.viewing import samples
+from service.viewing import pixel_readings
 from service.viewing.view_files import view
 from stage.capture.camera import Camera
 from stage.capture.capture import Capture
@@ -202,7 +202,7 @@ def test_every_second_pixel_of_a_large_image(tmp_path, monkeypatch):
     write_dome(tmp_path / "cap", SURFACE, lights=8)
     write_maps(tmp_path / "maps", SURFACE)
     whole = show(tmp_path)
-    monkeypatch.setattr(samples, "MOST_BYTES", 13 * 8 * 12 * 12)
+    monkeypatch.setattr(pixel_readings, "MOST_BYTES", 13 * 8 * 12 * 12)
     found = show(tmp_path)
     assert [found.facts["samples"][name] for name in ("rows", "cols", "step")] == [12, 12, 2]
     for name in ("measured", "model", "used"):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from service.asset.content.levels import REDUCTION, level_meshes, with_smooth_normals
+from service.asset.content.levels_of_detail import REDUCTION, level_meshes, with_smooth_normals
 from service.asset.content.mesh import height_mesh
 from service.asset.content.tangent import TangentFrames, vertex_tangents
 from stage.capture.camera import Camera

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from service.calibrate.chart import calibrate_chart
-from service.calibrate.images import dark, flat_field, saturation
 from service.calibrate.laser_planes import laser_planes
 from service.calibrate.procam import procam
 from service.calibrate.response import response
+from service.calibrate.sensor import dark, flat_field, saturation
 from service.calibrate.tof import calibrate_tof
 from service.calibrate.white_balance import white_balance
 from service.requests import calibrate as requests
