@@ -17,8 +17,7 @@ from service.acquisition.checks.unreached import ADVICE
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import Plan, read_plan
 from service.acquisition.plans.shots import Shot, shots_of
-from service.acquisition.projector import Projector
-from service.acquisition.projector_response import PatternImages
+from service.acquisition.projector import PatternImages, Projector
 from service.acquisition.resuming import change_since, compared_shot, refuse_other_settings, settings_of_files
 from service.errors import RequestError
 from service.play.play import ended_by_signals
