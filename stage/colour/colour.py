@@ -62,7 +62,7 @@ def _linear_of_integers(space: str, configuration: str) -> tuple[np.ndarray, np.
 
 def convert(pixels: np.ndarray, source: str, target: str) -> np.ndarray:
     """Convert pixels from one colour space to another.
-    `pixels`: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue. Returns Float32 in the
+    `pixels`: [rows, cols, 1 or 3] float32, encoded in `source`; one channel stands for equal red, green and blue. Returns float32 in the
     shape of `pixels`; of one channel, the red channel of the converted grey. Raises ColourError if the configuration lacks a space, or
     cannot convert."""
     if source == target:
