@@ -2,6 +2,8 @@
 OpenEXR and json alone, so that nothing here leans on the code that it judges."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -139,6 +141,17 @@ def edit_frame(folder: Path, index: int, **changes: Any) -> None:
 def files_in(folder: Path) -> set[str]:
     """Every file under a folder, hidden ones too, relative to it."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} if folder.exists() else set()
+
+
+@contextmanager
+def nothing_written(folder: Path, words: str, *errors: type[Exception]) -> Iterator[None]:
+    """Expect one of the errors with one sentence that has these words, and the files of the folder as they were."""
+    import pytest
+
+    before = files_in(folder)
+    with pytest.raises(errors, match=words) as caught:
+        yield
+    assert "\n" not in str(caught.value) and files_in(folder) == before
 
 
 def angles_degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
