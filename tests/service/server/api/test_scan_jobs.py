@@ -13,7 +13,7 @@ from service.server.storage import layout
 from stage.results.depth_maps import DepthMaps
 from stage.results.maps import SurfaceMaps
 from tests.scenes.turntable import figure
-from tests.service.joining.test_join import write
+from tests.service.joining.test_depth_and_normals import write
 from tests.service.scans.registration.test_registration import seen
 from tests.service.server.api.job_calls import NOBODY, finish, made_by, refused, submit
 
