@@ -317,6 +317,7 @@ def test_every_import_of_our_own_names_what_is_there():
 
     missing = []
     for name, text in texts.items():
+        missing += [f"{name}: {place}" for place in re.findall(r'"(service\.[\w.]+:\w+)"', text) if not there(*place.split(":"))]
         for found in re.findall(rf"\b(?:from (?:{homes})\b[\w.]* import (?:\([^)]*\)|[\w ,]+)|import (?:{homes})\b[\w. ,]*)", text):
             with suppress(SyntaxError):  # a sentence
                 node, = ast.parse(found).body

@@ -12,6 +12,8 @@ service.requests becomes the options of that model, and the function gets the mo
 
     local_command(app, "solve", _solve)
 
+Where it does nothing else, `product_command` takes the model, the place of the product, and the function that prints its result.
+
 Names, defaults and help are those of the model's fields; service.requests.base.options tells the rule, and the model checks the limits. The
 help of the command is the function's docstring, or the model's where the function has none. Every other parameter of the function is an
 option of the command alone, written for Typer in the usual way. A function that takes `Given[Model]` in place of the model gets what
@@ -26,6 +28,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, get_args, get_origin
 
@@ -33,6 +36,7 @@ import typer
 from pydantic import BeforeValidator, ValidationError
 
 from service.cli.colours import OcioOption, colours
+from service.cli.progress import with_bar
 from service.requests.base.base import Options, Role
 from service.requests.base.options import Model, Option, build, help_text, is_document, options_of, typed, typed_name
 
@@ -75,6 +79,16 @@ class Given(Generic[Model]):
 def local_command(group: typer.Typer, name: str, function: Callable[..., None]) -> None:
     """Add a command that works on this machine: where its request has no device, it takes --device all the same, and --ocio."""
     command(group, name, function, local=True)
+
+
+def product_command(group: typer.Typer, name: str, model: type[Options], product: str, show: Callable[[Any], None]) -> None:
+    """Add a command that does the work of a product, a `module:function` that is loaded when it is called, and prints its result."""
+
+    def run(request: model) -> None:  # type: ignore[valid-type]
+        module, _, function = product.partition(":")
+        show(with_bar(getattr(import_module(module), function), request))
+
+    local_command(group, name, run)
 
 
 def command(group: typer.Typer, name: str, function: Callable[..., None], *, without: frozenset[Role] = frozenset(),

@@ -1,13 +1,13 @@
 """relit depth, separate, scan, simulate and patterns: from projected light, lasers and time of flight, and what to project."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from service.cli.groups import make_group
 from service.cli.printing import check_single, counted, print_sequence, print_warnings
 from service.cli.progress import ProgressBar, with_bar
-from service.cli.request_commands import Given, local_command
+from service.cli.request_commands import Given, local_command, product_command
 from service.errors import RequestError
 from service.requests.depth import DepthRequest, ScanRequest, SeparateRequest, SimulateCwRequest, SimulatePulsedRequest
 from service.requests.patterns import CodeOptions, PatternsRequest, PlanRequest
@@ -18,8 +18,8 @@ PlanOption = Annotated[bool, typer.Option("--plan", help="Print images, time and
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     local_command(app, "depth", _depth)
-    local_command(app, "separate", _separate)
-    local_command(app, "scan", _scan)
+    product_command(app, "separate", SeparateRequest, "service.depth.separate:separate", _separate)
+    product_command(app, "scan", ScanRequest, "service.depth.scan:scan", _scan)
     kinds = make_group("simulate", help="The raw frames that a time-of-flight camera would make of a depth.")
     local_command(kinds, "cw", _cw)
     local_command(kinds, "pulsed", _pulsed)
@@ -54,20 +54,14 @@ def _depth(request: DepthRequest) -> None:
         raise typer.Exit(1)
 
 
-def _separate(request: SeparateRequest) -> None:
-    from service.depth.separate import separate
-
-    result = with_bar(separate, request)
+def _separate(result: Any) -> None:
     print(f"parts    {result.separation_path}")
     print(f"report   {result.report_path}")
     print(f"global   {100 * result.global_share.get('median', 0.0):.3g} % of the light (median), period of {result.period_px:g} px")
     print(f"pixels   {counted(result.counts)}")
 
 
-def _scan(request: ScanRequest) -> None:
-    from service.depth.scan import scan
-
-    result = with_bar(scan, request)
+def _scan(result: Any) -> None:
     print(f"points   {result.points_path}")
     print(f"usd      {result.usd_path}")
     if result.las_path is not None:

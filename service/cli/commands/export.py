@@ -10,7 +10,7 @@ import typer
 
 from service.cli.printing import print_warnings
 from service.cli.progress import ProgressOption, ProgressStyle, with_bar
-from service.cli.request_commands import local_command
+from service.cli.request_commands import local_command, product_command
 from service.requests.basis import BasisRequest
 from service.requests.export import BlenderExtensionRequest, ExportRequest, InspectRequest
 from service.requests.publish import PublishRequest
@@ -28,9 +28,9 @@ def register(app: typer.Typer) -> None:
     local_command(app, "export", _export)
     local_command(app, "blender-extension", _blender_extension)
     local_command(app, "inspect", _inspect)
-    local_command(app, "basis", _basis)
+    product_command(app, "basis", BasisRequest, "service.basis.basis:make_basis", _basis)
     local_command(app, "publish", _publish)
-    local_command(app, "join", _join)
+    product_command(app, "join", JoinRequest, "service.joining.join:join", _join)
 
 
 def _export(request: ExportRequest, progress: ProgressOption = ProgressStyle.BAR) -> None:
@@ -114,10 +114,7 @@ def _publish(request: PublishRequest) -> None:
     print_warnings(result.warnings)
 
 
-def _join(request: JoinRequest) -> None:
-    from service.joining.join import join
-
-    result = with_bar(join, request)
+def _join(result: Any) -> None:
     pixels, sigma = result.facts["pixels"], result.facts["sigma_m"]
     print(f"maps     {result.maps_path}")
     print(f"report   {result.report_path}")
@@ -126,10 +123,7 @@ def _join(request: JoinRequest) -> None:
     print_warnings(result.warnings)
 
 
-def _basis(request: BasisRequest) -> None:
-    from service.basis.basis import make_basis
-
-    result = with_bar(make_basis, request)
+def _basis(result: Any) -> None:
     print(f"basis    {result.path}")
     print(f"facts    {result.facts_path}")
     shown = "" if result.levels_rms is None else f" of what is shown, {result.levels_rms:.1f} of 255"

@@ -1,7 +1,7 @@
 """Routes of captures and environments: create for an upload, or register where they lie on the server; check, list, annotate, delete."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path as FilePath
 from typing import Annotated
 
@@ -21,7 +21,6 @@ from service.server.api.json_body import JsonRoute
 from service.server.api.limits import CREATION_COST
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import submit
-from service.server.api.views import intake_views
 from service.server.base.safe_names import shown
 from service.server.database import annotations, audit, idempotency, intakes, jobs, quotas, uploads
 from service.server.database.keys import Caller
@@ -62,7 +61,12 @@ def row_of(service: Service, caller: Caller, identifier: str) -> sa.RowMapping:
 
 
 def _view(service: Service, caller: Caller, identifier: str) -> IntakeView:
-    return intake_views(service.database, [row_of(service, caller, identifier)])[0]
+    return _views(service, [row_of(service, caller, identifier)])[0]
+
+
+def _views(service: Service, rows: Sequence[sa.RowMapping]) -> list[IntakeView]:
+    views = jobs.views_of(service.database, [row["id"] for row in rows])
+    return [IntakeView.model_validate({**row, "registered": row["folder"] is not None, "view": views.get(row["id"])}) for row in rows]
 
 
 def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) -> IntakeView:
@@ -102,7 +106,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
             row = row_of(service, caller, before)
             after = row["created_at"], row["id"]
         rows = intakes.latest(service.database, caller.project, prefix, limit=limit + 1, before=after)
-        return IntakePage(items=intake_views(service.database, rows[:limit]), next=rows[limit - 1]["id"] if len(rows) > limit else None)
+        return IntakePage(items=_views(service, rows[:limit]), next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
     @router.get(one, name=f"get_{kind}", summary=f"Look at {a}", responses=responses(404),
                 description=f"Return the state of {a} and the facts that its check found.")

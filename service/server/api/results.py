@@ -19,7 +19,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from service.requests.answers import ResultPage
+from service.requests.answers import ResultPage, ResultView
 from service.requests.base.identifiers import EnvironmentId
 from service.requests.export import FORMATS
 from service.requests.states import READY
@@ -27,7 +27,6 @@ from service.server.api.context import Reader, ServiceDep
 from service.server.api.intakes import row_of
 from service.server.api.jobs import JobName, view
 from service.server.api.problems import ApiError, responses
-from service.server.api.views import result_view
 from service.server.base.safe_names import NameFault, check_path
 from service.server.storage import layout
 from stage import inputs
@@ -125,7 +124,8 @@ def list_results(service: ServiceDep, caller: Reader, job: JobName,
     """List the files by name, one page at a time; of a running job, the complete ones."""
     view(service, caller, job)
     files = [file for file in service.storage.files(layout.results(caller.project, job)) if after is None or file.name > after]
-    return ResultPage(results=[result_view(job, file) for file in files[:limit]],
+    return ResultPage(results=[ResultView.model_validate({**file._asdict(), "url": f"/v1/jobs/{job}/results/{quote(file.name)}"})
+                               for file in files[:limit]],
                       next=files[limit - 1].name if len(files) > limit else None)
 
 

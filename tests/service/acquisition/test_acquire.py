@@ -11,7 +11,6 @@ import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from unittest import mock
 from urllib.parse import urlsplit
@@ -29,6 +28,7 @@ from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
 from stage.errors import StageError
 from tests.scenes.captures import make_scene, rgb, write_exr
+from tests.service.answering import Asked, answering
 from tests.service.full_disk import files_of_at_most
 from tests.service.waiting import until
 
@@ -101,27 +101,14 @@ def by_hand(folder: Path, stage: Stage) -> tuple[Path, object]:
 @contextmanager
 def controller(folder: Path, stage: Stage) -> Iterator[tuple[Path, str]]:
     """Yield a rig whose lamps a server switches, and the address of the server, at whose /shoot the camera is released."""
-    class Controller(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            self.do_GET()
+    def answer(asked: Asked) -> tuple[int, bytes]:
+        word = asked.path.strip("/").replace("/", " ")
+        stage.release() if word == "shoot" else stage.command(word)
+        return 200, b""
 
-        def do_GET(self) -> None:
-            word = self.path.strip("/").replace("/", " ")
-            stage.release() if word == "shoot" else stage.command(word)
-            self.send_response(200)
-            self.end_headers()
-
-        def log_message(self, *what: object) -> None:
-            """Say nothing."""
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Controller) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-        url = f"http://127.0.0.1:{server.server_port}"
-        try:
-            requests = {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}
-            yield write_rig(folder / "rig.json", stage, "http", {"http": requests}), url
-        finally:
-            server.shutdown()
+    with answering(answer) as url:
+        requests = {"on": {"url": url + "/on/{index}"}, "off": {"url": url + "/off"}}
+        yield write_rig(folder / "rig.json", stage, "http", {"http": requests}), url
 
 
 def posting(url: str) -> str:

@@ -31,8 +31,8 @@ def errors(folder):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pose", [{}, {"elevation": 30.0}, {"elevation": 52.0, "turn": -10.0}, {"turn": 20.0, "distance": 0.7}])
-@pytest.mark.parametrize("even", [True, False])
+@pytest.mark.parametrize(("pose", "even"), [({}, True), ({"elevation": 30.0}, False), ({"elevation": 52.0, "turn": -10.0}, True),
+                                            ({"turn": 20.0, "distance": 0.7}, False)])
 def test_planes_are_found_within_their_sigma(relit, tmp_path, pose, even):
     """Noise of 0.4 % and texture of 15 % move stripes by hundredths of a pixel; the block is right-angled, which is not known to 0.25°."""
     folder = photograph(tmp_path / "step", Step(**pose), PLANES, even=even)

@@ -5,9 +5,6 @@ models of its schema. What these do not ask and the validator does is asked here
 """
 
 import json
-import threading
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import iiif_prezi3
 import jsonschema
@@ -15,17 +12,13 @@ import numpy as np
 import pytest
 
 from tests.scenes.captures import make_scene, write_capture
+from tests.service.publish.published import served
 
 LEVEL_0 = {"format_jpg", "id_basic", "id_squares", "info_json", "size_nofull"}
 SQUARE = 100
 """Pixels of a square of the validator's image, which is 10 x 10 squares of known colours."""
 NOTES = [{"body": "a place", "target": "#xywh=10,20,30,40"},
          {"body": "a point", "target": {"selector": {"type": "PointSelector", "x": 3, "y": 4.5}}}]
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_):
-        pass
 
 
 def test_the_image_validator_finds_nothing(relit, tmp_path):
@@ -40,9 +33,8 @@ def test_the_image_validator_finds_nothing(relit, tmp_path):
     white = np.ones_like(scene.irradiance)
     squares = linear.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1)
     write_capture(tmp_path / "squares", scene._replace(mask=np.ones_like(scene.mask), irradiance=white, images=np.stack(3 * [squares])))
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path)) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-        where = f"127.0.0.1:{server.server_port}"
+    with served(tmp_path) as url:
+        where = url.removeprefix("http://").strip("/")
         relit.done("publish", tmp_path / "squares", "--to", tmp_path / "out", "--as", "iiif", "--url", f"http://{where}/out",
                    "--photographs", "1")
         suite = TestSuite(known)
@@ -50,7 +42,6 @@ def test_the_image_validator_finds_nothing(relit, tmp_path):
         for name in sorted(LEVEL_0):
             outcome = suite.run_test(name, ImageAPI("photograph_0", where, "out", version="3.0", debug=False))
             assert outcome.exception is None and outcome.tests, f"{name}: {outcome.exception}"
-        server.shutdown()
 
 
 def test_the_schema_of_presentation_finds_nothing(relit, tmp_path):

@@ -9,17 +9,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, NamedTuple
+from typing import Any
+
+from tests.service.answering import Asked, answering
 
 TOLERANCE_S = 300
 
 
-class Received(NamedTuple):
+class Received(Asked):
     """A request."""
-
-    headers: dict[str, str]
-    body: bytes
 
     @property
     def id(self) -> str:
@@ -59,31 +57,17 @@ def receiving(host: str = "127.0.0.1", port: int = 0, tls: ssl.SSLContext | None
     """Run a receiver."""
     receiver = Receiver()
 
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            body = self.rfile.read(int(self.headers["Content-Length"]))
-            received = Received({name.lower(): value for name, value in self.headers.items()}, body)
-            receiver.received.append(received)
-            if receiver.held is not None:
-                receiver.held.wait(60)
-            self.send_response(receiver.status if isinstance(receiver.status, int) else receiver.status(received))
-            self.send_header("Location", "http://127.0.0.1:1/elsewhere")
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer((host, port), Handler)
-    server.daemon_threads = True
-    if tls is not None:
-        server.socket = tls.wrap_socket(server.socket, server_side=True)
-    receiver.url = f"http://{host}:{server.server_address[1]}/relit?studio=larch"
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-    try:
-        yield receiver
-    finally:
+    def answer(asked: Asked) -> tuple[int, bytes]:
+        received = Received(*asked)
+        receiver.received.append(received)
         if receiver.held is not None:
-            receiver.held.set()
-        server.shutdown()
-        server.server_close()
+            receiver.held.wait(60)
+        return receiver.status if isinstance(receiver.status, int) else receiver.status(received), b""
+
+    with answering(answer, host=host, port=port, tls=tls, Location="http://127.0.0.1:1/elsewhere") as url:
+        receiver.url = f"{url}/relit?studio=larch"
+        try:
+            yield receiver
+        finally:
+            if receiver.held is not None:
+                receiver.held.set()

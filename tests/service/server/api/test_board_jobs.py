@@ -33,13 +33,20 @@ def tile(tmp_path_factory) -> dict[str, bytes]:
     return files_of(folder)
 
 
+@pytest.fixture(scope="module")
+def board(server, client, tile) -> dict:
+    return upload(server, client, tile)
+
+
+@pytest.fixture(scope="module")
+def golden(server, client, board) -> dict:
+    return finish(server, client, submit(client, kind="inspect-board", capture=board["id"]))
+
+
 @pytest.mark.long
-def test_a_board_is_compared_with_the_result_of_a_job(server, client, tile):
+def test_a_board_is_compared_with_the_result_of_a_job(server, client, board, golden):
     """The same images pass against themselves but for what has no depth."""
-    board = upload(server, client, tile)
     assert board["facts"]["tiles"] == 1
-    golden = submit(client, kind="inspect-board", capture=board["id"])
-    finish(server, client, golden)
     assert made_by(client, golden) == {"board.exr", "inspection.png", "report.json"}
     job = submit(client, kind="inspect-board", capture=board["id"], golden=golden["id"], options={"least_inspected": 0.5})
     finish(server, client, job)
@@ -65,11 +72,8 @@ def study(*results: str, operators: int = 1) -> dict:
 
 
 @pytest.mark.long
-def test_inspections_of_regions_are_studied_and_boards_that_cannot_be_are_refused(server, client, tile, tmp_path):
+def test_inspections_of_regions_are_studied_and_boards_that_cannot_be_are_refused(server, client, tile, board, golden, tmp_path):
     """Two inspections of the same images: what repeats to the last bit has no repeatability to speak of."""
-    board = upload(server, client, tile)
-    golden = submit(client, kind="inspect-board", capture=board["id"])
-    finish(server, client, golden)
     options = {"least_inspected": 0.5}
     runs = [submit(client, kind="inspect-board", capture=board["id"], golden=golden["id"], regions=REGIONS, options=options)["id"]
             for _ in range(2)]

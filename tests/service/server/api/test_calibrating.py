@@ -29,7 +29,9 @@ from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted, finish, made_by, refused, submit
 from tests.service.server.api.test_measuring import files_of, upload
 
-LEVELS = np.linspace(0, 1, 5)
+LEVELS = np.linspace(0, 1, 5).tolist()
+DARKS, WHITES = ["dark0.exr", "dark1.exr"], ["cards/white0.exr", "cards/white1.exr"]
+GREYS = [f"grey{number}.exr" for number in range(len(LEVELS))]
 BOARD = {"board": "9x6", "square_m": 0.03, "projector": "256x192"}
 
 
@@ -80,35 +82,25 @@ def uploaded(server, client, sensor):
     return sent(server, client, sensor)
 
 
-def greys(folder: Path = Path()) -> list[str]:
-    return [str(folder / f"grey{number}.exr") for number in range(len(LEVELS))]
+KINDS = {  # the product, its request, the fields of the job, and the file that it makes beside the manifest and the report
+    "dark": (dark, requests.DarkRequest, {"images": DARKS}, "dark.exr"),
+    "flat-field": (flat_field, requests.FlatFieldRequest, {"images": WHITES, "dark_images": DARKS[:1]}, "flat.exr"),
+    "white-balance": (white_balance, requests.WhiteBalanceRequest, {"images": WHITES[:1], "options": {"region": [4, 0, 8, 16]}}, None),
+    "saturation": (saturation, requests.SaturationRequest, {}, None),
+    "response": (response, requests.ResponseRequest, {"images": GREYS, "options": {"levels": LEVELS}}, None),
+}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["dark", "flat-field", "white-balance", "saturation", "response"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_path, kind):
+    product, model, fields, made = KINDS[kind]
     here = Path(shutil.copytree(sensor, tmp_path / "cap"))
-    darks, whites = ("dark0.exr", "dark1.exr"), ("cards/white0.exr", "cards/white1.exr")
-    fields, files = {}, {"capture.json", "calibration.json"}
-    match kind:
-        case "dark":
-            fields, files = {"images": darks}, files | {"dark.exr"}
-            dark(requests.DarkRequest(capture=here, images=tuple(here / name for name in darks)))
-        case "flat-field":
-            fields, files = {"images": whites, "dark_images": darks[:1]}, files | {"flat.exr"}
-            flat_field(requests.FlatFieldRequest(
-                capture=here, images=tuple(here / name for name in whites), dark_images=(here / darks[0],)))
-        case "white-balance":
-            fields = {"images": whites[:1], "options": {"region": [4, 0, 8, 16]}}
-            white_balance(requests.WhiteBalanceRequest(capture=here, images=(here / whites[0],), region=(4, 0, 8, 16)))
-        case "saturation":
-            saturation(requests.SaturationRequest(capture=here, write=True))
-        case "response":
-            fields = {"images": greys(), "options": {"levels": LEVELS.tolist()}}
-            response(requests.ResponseRequest(capture=here, images=tuple(map(Path, greys(here))), levels=tuple(LEVELS.tolist())))
+    given = {name: tuple(here / each for each in value) for name, value in fields.items() if name != "options"} | fields.get("options", {})
+    product(model(capture=here, **given, **({"write": True} if kind == "saturation" else {})))
     job = submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
     finish(server, client, job)
-    compare(client, job, here, {name: name for name in files}, {here: uploaded})
+    compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", made) if name}, {here: uploaded})
 
 
 @pytest.mark.long
@@ -134,17 +126,16 @@ def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("away", ["/etc", "d0/../../{other}/d0"])
-def test_a_sweep_of_another_capture(server, client, tmp_path, away):
+def test_a_sweep_of_another_capture(server, client, tmp_path):
     """What it names beside its own captures may be of another project."""
     path = sweep(tmp_path / "sweep", [(f"d{k}", 1.0 + k, 0.0, None) for k in range(2)], cw)
-    other = sent(server, client, path.parent)
-    data = json.loads(path.read_text())
-    data["steps"][1]["capture"] = away.format(other=other)
-    path.write_text(json.dumps(data))
-    job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
-    error = finish(server, client, job, "failed")["error"]
-    assert "is none of the captures" in error and str(server.data) not in error
+    other, data = sent(server, client, path.parent), json.loads(path.read_text())
+    for away in ("/etc", f"d0/../../{other}/d0"):
+        data["steps"][1]["capture"] = away
+        path.write_text(json.dumps(data))
+        job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
+        error = finish(server, client, job, "failed")["error"]
+        assert "is none of the captures" in error and str(server.data) not in error
     away_too = submit(client, kind="calibrate-tof", capture=other, sweep="../sweep.json")
     assert "sweep: '../sweep.json' leads out" in finish(server, client, away_too, "failed")["error"]
 
@@ -196,7 +187,7 @@ def test_the_planes_of_a_laser(server, client, tmp_path):
     ({"kind": "calibrate-dark"}, "images"), ({"kind": "calibrate-dark", "images": []}, "images"),
     ({"kind": "calibrate-dark", "images": ["a\0b"]}, "images"),
     ({"kind": "calibrate-response", "images": ["a.exr", "b.exr"]}, "images"),
-    ({"kind": "calibrate-response", "images": greys(), "options": {"levels": [0, 2]}}, "levels"),
+    ({"kind": "calibrate-response", "images": GREYS, "options": {"levels": [0, 2]}}, "levels"),
     ({"captures": []}, "captures"), ({"captures": ["cap_x"]}, "captures"), ({"captures": None}, "captures"),
     ({"options": {"square_m": 0.03}}, "board"), ({"options": {"board": [9], "square_m": 0.03}}, "board"),
     ({"options": {"board": "9", "square_m": 0.03}}, "board"), ({"options": {"board": "9x6", "square_m": 75}}, "square"),
@@ -214,7 +205,7 @@ def test_images_or_a_ball_that_are_not_there(server, client, uploaded, dome):
     for kind, names in (("dark", ["none.exr"]), ("dark", ["../x.exr"]), ("flat-field", ["/etc/passwd"])):
         error = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, images=names), "failed")["error"]
         assert error.startswith(f"images: {names[0]!r} ") and str(server.data) not in error
-    job = submit(client, kind="calibrate-response", capture=uploaded, images=greys(), options={"levels": [0, 1]})
+    job = submit(client, kind="calibrate-response", capture=uploaded, images=GREYS, options={"levels": [0, 1]})
     assert "--levels: has 2 values, there are 5 images" in finish(server, client, job, "failed")["error"]
     missing = client.post("/v1/jobs", json={"kind": "calibrate-procam", "captures": [f"cap_{'0' * 20}"], "options": BOARD})
     refused(missing, 404, "captures: cap_00000000000000000000 is not in this project")

@@ -3,11 +3,9 @@
 import base64
 import hmac
 import json
-import threading
 import time
 from collections.abc import Iterator
 from functools import cache
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 from joserfc import jwt
@@ -19,6 +17,7 @@ from service.server.api.problems import ApiError
 from service.server.api.tokens import TokenReader
 from service.server.base.settings import Settings
 from service.server.database import audit
+from tests.service.answering import Asked, answering
 from tests.service.server_process import serving
 
 GRANTS = "artists=larch:write,td=larch:admin,guests=willow:read"
@@ -36,25 +35,12 @@ class Issuer:
     def __init__(self) -> None:
         self.keys = KeySet([rsa_key("one")])
         self.requests: list[str] = []
-        issuer = self
+        self.url = ""
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                issuer.requests.append(self.path)
-                found = {"/.well-known/openid-configuration": {"issuer": issuer.url, "jwks_uri": f"{issuer.url}/keys"},
-                         "/keys": issuer.keys.as_dict(private=False)}[self.path]
-                body = json.dumps(found).encode()
-                self.send_response(200)
-                self.send_header("Content-Length", str(len(body)))
-                self.end_headers()
-                self.wfile.write(body)
-
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
-        threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+    def answer(self, asked: Asked) -> tuple[int, bytes]:
+        self.requests.append(asked.path)
+        return 200, json.dumps({"/.well-known/openid-configuration": {"issuer": self.url, "jwks_uri": f"{self.url}/keys"},
+                                "/keys": self.keys.as_dict(private=False)}[asked.path]).encode()
 
     def token(self, *, key=None, algorithm: str = "RS256", **claims: object) -> str:
         key = key or self.keys.keys[-1]
@@ -66,16 +52,12 @@ class Issuer:
     def rotate(self) -> None:
         self.keys = KeySet([rsa_key("two")])
 
-    def close(self) -> None:
-        self.server.shutdown()
-        self.server.server_close()
-
 
 @pytest.fixture
 def issuer() -> Iterator[Issuer]:
     made = Issuer()
-    yield made
-    made.close()
+    with answering(made.answer) as made.url:
+        yield made
 
 
 @pytest.fixture
@@ -141,14 +123,15 @@ def test_tokens_with_unknown_keys_do_not_flood_the_provider(issuer, reader):
     assert len(issuer.requests) == 2
 
 
-def test_a_provider_that_is_away(issuer, tmp_path, monkeypatch):
+def test_a_provider_that_is_away(tmp_path, monkeypatch):
     monkeypatch.setattr(tokens, "KEEP_S", 0.0)
     monkeypatch.setattr(tokens, "AGAIN_S", 0.0)
-    settings = Settings(data=tmp_path, oidc_issuer=issuer.url, oidc_grants=GRANTS)
-    known, fresh = TokenReader(settings), TokenReader(settings)
-    token = issuer.token()
-    assert known.caller(token, None)
-    issuer.close()
+    issuer = Issuer()
+    with answering(issuer.answer) as issuer.url:
+        settings = Settings(data=tmp_path, oidc_issuer=issuer.url, oidc_grants=GRANTS)
+        known, fresh = TokenReader(settings), TokenReader(settings)
+        token = issuer.token()
+        assert known.caller(token, None)
     assert known.caller(token, None)  # by the keys that it has
     with pytest.raises(ApiError, match="the identity provider does not answer"):
         fresh.caller(token, None)

@@ -2,9 +2,7 @@
 
 import signal
 import sys
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
@@ -12,6 +10,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from service.errors import RequestError
 from service.server.base import telemetry
 from service.server.base.settings import Settings
+from tests.service.answering import Asked, answering
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import admitted
 from tests.service.server_process import serving
@@ -19,35 +18,20 @@ from tests.service.server_process import serving
 PATIENCE_S = 60.0
 
 
-class Collector(BaseHTTPRequestHandler):
-    """Takes OTLP over HTTP as collectors do."""
-
-    spans: list
-
-    def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        assert self.path == "/v1/traces"
-        for resource in ExportTraceServiceRequest.FromString(body).resource_spans:
-            attributes = {pair.key: pair.value.string_value for pair in resource.resource.attributes}
-            assert attributes["service.name"] == "relit"
-            self.spans.extend(span for scope in resource.scope_spans for span in scope.spans)
-        self.send_response(200)
-        self.end_headers()
-
-    def log_message(self, *_arguments: object) -> None:
-        """Say nothing."""
-
-
 @pytest.fixture
 def collector() -> Iterator[tuple[str, list]]:
+    """The address of a collector, which takes OTLP over HTTP, and the spans that came."""
     spans: list = []
-    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Collecting", (Collector,), {"spans": spans}))
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}", spans
-    server.shutdown()
-    thread.join()
-    server.server_close()
+
+    def take(asked: Asked) -> tuple[int, bytes]:
+        assert asked.path == "/v1/traces"
+        for resource in ExportTraceServiceRequest.FromString(asked.body).resource_spans:
+            assert {pair.key: pair.value.string_value for pair in resource.resource.attributes}["service.name"] == "relit"
+            spans.extend(span for scope in resource.scope_spans for span in scope.spans)
+        return 200, b""
+
+    with answering(take) as address:
+        yield address, spans
 
 
 @pytest.mark.long
