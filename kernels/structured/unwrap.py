@@ -65,7 +65,8 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
 
     The amplitude is the mean over the periods. UNDECIDED: another wrap within the projector fits about as well. MULTIPATH: none fits. Both
     keep the coordinate that fits best, and its deviation in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has
-    no phase says why.
+    no phase says why. Where the periods disagree by more than their deviations, sigma grows by the root of χ² over its degrees of freedom:
+    light below the surface, motion between frames and bent waves shift each period otherwise.
 
     Args:
         extent: projector pixels along the axis.
@@ -236,7 +237,7 @@ def _joint_kernel(pack: int) -> Any:
                 code[k] = judge(best[k], second[k])
             if keeps_place(code[k]):
                 u_out[k] = place[k] - slope_sum[k] / information[k]
-                error[k] = 1.0 / wp.sqrt(information[k])
+                error[k] = wp.sqrt(wp.max(best[k] / float(wp.max(periods - 1, 1)), 1.0) / information[k])
             else:
                 mean[k] = 0.0
             result[k] = wp.uint8(code[k])

@@ -139,6 +139,9 @@ class LaserPlane(Strict):
     """Any point of the plane in the camera frame."""
     normal: Direction
     """The normal of the plane in the camera frame, of either sign."""
+    accuracy_deg: Positive | None = None
+    """The standard deviation of the plane's angle as it was calibrated, which the deviations of its depths then hold. None: it is not
+    known, and they hold that of the light alone."""
 
 
 Laser = Annotated[LaserRay | LaserPlane, Field(discriminator="type")]

@@ -11,6 +11,7 @@ import numpy as np
 from kernels.status import Status
 from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
+from service.depth.laser.plane_accuracy import CLEAR_SIGMAS, compare_sweeps, unconfirmed
 from service.depth.laser.spot import find_spot, nearest_points
 from service.depth.laser.stripe_curves import WHOLE
 from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
@@ -88,6 +89,7 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
                 doubled.append(frame.image)
         timings.advance(number + 1)
     kept = {along: StripeSamples.joined(parts) for along, parts in samples.items() if parts}
+    one_sweep = [sentence for along in kept if (sentence := unconfirmed(samples[along], _planes(capture, along), camera, along=along))]
     for along, part in kept.items():
         _check_order(capture, part, [len(one.line) for one in samples[along]], along)
     _refuse_faint(kept)
@@ -106,15 +108,21 @@ def solve_laser(capture: Capture, mask: np.ndarray, request: DepthRequest, devic
         raise ManifestError(f"{capture.folder}: no laser frame has a depth ({_words(seen)}): {advice}")
     timings.stage("map", 1)
     solution = _combine(capture, shape, kept, spots, brightest, {"laser_frames": len(frames), "ambient": source, "found": dict(seen)})
+    if "sweeps_differ_m" not in solution.facts and any(plane.accuracy_deg is None for along in kept for plane in _planes(capture, along)):
+        solution.warnings += one_sweep[:1]
     if doubled:
         solution.warnings.append(_second_stripes(doubled, len(frames)))
     return solution
 
 
+def _planes(capture: Capture, along: str) -> list[LaserPlane]:
+    """Return the planes whose stripes cross the rows, or the columns, in the order of their frames."""
+    return [frame.laser for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane) and along_of(frame.laser) == along]
+
+
 def _check_order(capture: Capture, samples: StripeSamples, counts: list[int], along: str) -> None:
     """Refuse planes whose stripes move the other way, as those of a sweep that is declared in reverse order do."""
-    planes = [frame.laser for frame in capture.manifest.frames if isinstance(frame.laser, LaserPlane) and along_of(frame.laser) == along]
-    found = concordance(samples, np.repeat(np.arange(len(counts)), counts), planes, capture.camera, along=along)
+    found = concordance(samples, np.repeat(np.arange(len(counts)), counts), _planes(capture, along), capture.camera, along=along)
     if found < AGAINST:
         raise ManifestError(f"{capture.folder / FILE_NAME}: frames[].laser: {50 * (1 - found):.0f} % of the stripes move against the order "
                             "of their planes: the planes look declared in reverse order; check point_m and normal, or image, of the frames")
@@ -198,6 +206,15 @@ def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSam
             for along, part in kept.items()]
     doubtful = [stripe_map(part._replace(status=np.where(part.status == Status.MULTIPATH, Status.OK, Status.UNSOLVED)),
                            shape if along == "row" else shape[::-1], camera, along=along) for along, part in kept.items()]
+    warnings = []
+    differ = compare_sweeps(*maps) if len(maps) > 1 else None
+    if differ is not None:
+        facts["sweeps_differ_m"] = float(f"{differ[0]:.3g}")
+        if differ[1] > CLEAR_SIGMAS:
+            warnings.append(f"frames[].laser: the stripes across the rows and those across the columns differ by {1000 * differ[0]:.3g} "
+                            f"mm, {differ[1]:.2g} standard deviations: planes of one sweep are off; check point_m and normal, and their "
+                            "order; the standard deviations hold this difference")
+            maps = [found._replace(sigma=np.hypot(found.sigma, differ[0])) for found in maps]
     depth, sigma, amplitude = np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros(shape, np.float32)
     for found in maps:
         better = found.solved & (found.sigma < sigma)
@@ -227,7 +244,8 @@ def _combine(capture: Capture, shape: tuple[int, ...], kept: dict[str, StripeSam
     kind = "laser stripe" if kept and not spots else "laser spot" if spots and not kept else "laser spot and stripe"
     return DepthSolution(
         method=kind, depth=depth, status=status, sigma=sigma, confidence=confidence, range_m=along_ray, amplitude=amplitude,
-        colour=np.repeat(brightest[..., None], 3, axis=-1), points=np.concatenate(points), pixels=np.concatenate(pixels), facts=facts)
+        colour=np.repeat(brightest[..., None], 3, axis=-1), points=np.concatenate(points), pixels=np.concatenate(pixels), facts=facts,
+        warnings=warnings)
 
 
 def _words(seen: Counter[str]) -> str:

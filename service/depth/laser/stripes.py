@@ -17,6 +17,7 @@ import numpy as np
 
 from kernels.status import Status
 from kernels.structured.stripe import REACH, find_stripe, plane_depths
+from service.depth.laser.plane_accuracy import depth_per_turn
 from service.depth.laser.stripe_curves import PEAKS, Chosen, choose_curves
 from service.depth.laser.stripe_map import StripeSamples
 from stage.capture.camera import Camera
@@ -186,6 +187,8 @@ def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: S
         near = np.isfinite(met.depth) & (met.depth >= near_m) & (met.depth <= far_m)
     code[found & ~near] = Status.OUT_OF_RANGE
     spread = spread_px * met.per_pixel / camera.focal_px[0 if along == "row" else 1]
+    if laser.accuracy_deg:
+        spread = np.hypot(spread, np.radians(laser.accuracy_deg) * depth_per_turn(x, y, met.depth, laser))
     return Stripes(StripeSamples(lines, centre, np.nan_to_num(met.depth), np.nan_to_num(spread), peak, code), chosen.curve,
                    int(chosen.doubled.sum()), int(chosen.second.sum()))
 

@@ -41,11 +41,22 @@ class PatternProjector(NamedTuple):
     crosstalk: tuple[Rgb, Rgb, Rgb] | None = None
     exponent: float = 1.0
     """The exponent γ of light = level^γ that the waves show though no response is given: their error is added to the deviation."""
+    left_rad: float | None = None
+    """The error of a phase that is left when waves are bent back by the exponent; None: they are not bent back."""
+
+    @property
+    def wave_response(self) -> Sequence[float] | None:
+        """Return the response by which waves are bent back, declared or found; None: none."""
+        if self.response is None and self.left_rad is not None:
+            return tuple((np.linspace(0, 1, 256)**self.exponent).tolist())
+        return self.response
 
     def wave_error(self, shifts: Sequence[float], period_px: float) -> float:
         """Return the RMS error in radians of a phase that is fitted to waves of the exponent as if they were linear."""
         if self.response is not None or self.exponent == 1.0:
             return 0.0
+        if self.left_rad is not None:
+            return self.left_rad
         own = np.array(shifts)
         return wave_error(np.linspace(0, 1, 256)**self.exponent, weights(own, period_px), own)
 
@@ -213,7 +224,7 @@ def _wrapped_phase(phase: PhaseCode, axis: AxisCodes, readings: Readings, noise:
     errors = [axis.projector.wave_error([s for s, p in zip(phase.shifts, phase.periods_px, strict=True) if p == period], period)
               for period in dict.fromkeys(phase.periods_px)]
     return decode_phase(readings.grey, phase.frames, phase.periods_px, phase.shifts, black=axis.black,
-                        response=axis.projector.response, wave_errors=errors, noise=noise)
+                        response=axis.projector.wave_response, wave_errors=errors, noise=noise)
 
 
 def _unwrapped(name: str, axis: AxisCodes, waves: Sequence[PhaseCode | ModulatedCode], periods_px: Sequence[float],

@@ -295,7 +295,9 @@ def _exponent_of_fit(sample: Sample, code: PhaseCode, collected: Collected, proj
     return best if misfit[best] < BETTER_FIT * plain else 1.0
 
 
-def response_sentence(exponent: float, codes: Sequence[str]) -> str:
+def response_sentence(found: PatternProjector, codes: Sequence[str]) -> str:
     """Return what is said of waves that a projector bends."""
-    return (f"projector.response: is not given, but the projected waves look like light = level^{exponent:.2g}, not linear: the error that "
-            f"this makes is in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")
+    done = ("the error that this makes is" if found.left_rad is None else
+            f"they were bent back by it, and the {found.left_rad:.2g} rad that this leaves are")
+    return (f"projector.response: is not given, but the projected waves look like light = level^{found.exponent:.2g}, not linear: {done} "
+            f"in the standard deviation of {' and '.join(codes)}; measure the response with relit calibrate response")

@@ -22,6 +22,7 @@ from service.depth.patterns.epipolar import contradiction
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
+from service.depth.patterns.wave_checks import bent_back, check_waves
 from service.errors import RequestError
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
@@ -161,15 +162,18 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
     wrong = (check_unevenness(sample, patterns, shown, noise, device) if projector is None
              else check_declaration(sample, patterns, shown, projector_model(projector), noise, device))
     wrong = wrong or check_codes(sample, codes.collected, shown, noise) or check_levels(sample, codes.collected, shown, noise)
+    waves = check_waves(sample, codes.collected, shown, None if projector is None else projector_model(projector), noise)
+    wrong = wrong or waves.wrong
     if wrong is not None:
         return [wrong], codes
+    said = [] if waves.unconfirmed is None else [waves.unconfirmed]
     if shown.response is None:
-        exponent = find_exponent(sample, codes.collected, shown, noise, device)
-        if exponent != 1.0:
+        bent = bent_back(sample, codes.collected, shown, noise) or shown._replace(
+            exponent=find_exponent(sample, codes.collected, shown, noise, device))
+        if bent.exponent != 1.0:
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
-            return ([response_sentence(exponent, names)],
-                    read_codes(capture, frames, shown._replace(exponent=exponent), refine=request.refine))
-    return [], codes
+            return [*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine)
+    return said, codes
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:

@@ -1,0 +1,101 @@
+"""Waves without stripes that are declared otherwise than they were shown are named, and right ones raise no doubt: waves of a hilly field
+and a post before it, in closed form, under shot noise, of a projector that is seen whole or in part."""
+
+import numpy as np
+import pytest
+
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.triangulate import ProjectorModel
+from service.depth.patterns.decoders import PatternProjector
+from service.depth.patterns.pattern_checks import Sample
+from service.depth.patterns.wave_checks import bent_back, check_waves
+from stage.patterns.codes import collect
+from stage.patterns.phase import phase_patterns
+
+EXTENT, ROWS, COLS = 400, 24, 150
+NOISE = NoiseModel(0.004, 1e-4)
+BASELINE = 0.2
+
+
+def rig(side=1):
+    """The projector beside the camera, looking the same way: x right, y down, z forward of it."""
+    turn = np.diag([1.0, -1.0, -1.0])
+    return ProjectorModel((EXTENT, 300), (500.0, 500.0), (EXTENT / 2, 150.0), (0, 0, 0), (0, 0),
+                          np.column_stack([turn, [-side * BASELINE, 0, 0]]))
+
+
+def seen(side=1, field=0.42):
+    """Lines of sight and columns of a hilly field with a post before it; NaN beyond the projector."""
+    x, y = np.meshgrid(np.linspace(-field, field, COLS), np.linspace(0.2, -0.2, ROWS))
+    z = 1.5 + 0.12 * np.sin(5 * x + 2 * y) * np.cos(4 * y) - 0.3 * (np.abs(x - 0.1) < 0.02)
+    u = EXTENT / 2 + 500 * (x - side * BASELINE / z)
+    return x, y, np.where((u >= 0) & (u < EXTENT), u, np.nan)
+
+
+def said(patterns, declared, *, side=1, field=0.42, gamma=1.0, calibrated=True):
+    """Both sentences about frames of these patterns."""
+    rng = np.random.default_rng(7)
+    x, y, u = seen(side, field)
+    albedo = 0.55 + 0.35 * np.sign(np.sin(60 * x) * np.sin(50 * y))
+    light = np.stack([np.nan_to_num(pattern.level(u, u, EXTENT)) ** gamma for pattern in patterns])
+    frames = albedo * (0.75 * light + 0.04)
+    frames = frames + rng.normal(0, 1, frames.shape) * np.sqrt(NOISE.read**2 + NOISE.gain * frames)
+    sample = Sample(frames.reshape(len(frames), 1, -1).astype(np.float32), None, x.astype(np.float32), y.astype(np.float32),
+                    np.isfinite(u))
+    projector = PatternProjector((EXTENT, 300))
+    found = check_waves(sample, collect(list(declared)), projector, rig(side) if calibrated else None, NOISE)
+    return (*found, bent_back(sample, collect(list(declared)), projector, NOISE))
+
+
+def changed(patterns, **fields):
+    return [pattern.model_copy(update={name: change(pattern) for name, change in fields.items()}) for pattern in patterns]
+
+
+def reversed_steps(patterns):
+    return changed(patterns, step=lambda p: -p.step % p.steps)
+
+
+def offset(patterns, by):
+    return changed(patterns, offset_rad=lambda p: p.offset_rad + by)
+
+
+ONE, FOUR = phase_patterns("column", (EXTENT,), 3), phase_patterns("column", (EXTENT,), 4)
+THREE, TWO = phase_patterns("column", (19.0, 22.0, 26.0), 3), phase_patterns("column", (EXTENT, 50.0), 4)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("patterns", [ONE, FOUR, THREE, TWO], ids=["one", "four steps", "three", "two"])
+def test_right_waves_raise_no_doubt(patterns, side):
+    assert said(patterns, patterns, side=side) == (None, None, None)
+
+
+@pytest.mark.parametrize(("patterns", "declared", "words"), [
+    (ONE, reversed_steps(ONE), "steps run backwards"),
+    (ONE, offset(ONE, -np.pi / 2), "check offset_rad"),
+    (FOUR, offset(FOUR, np.pi), "check offset_rad"),
+    (THREE, reversed_steps(THREE), "if their steps run backwards"),
+    (THREE, offset(THREE, -np.pi / 2), "offset is changed by π/2"),
+    (THREE, changed(THREE, period_px=lambda p: {22.0: 21.4}.get(p.period_px, p.period_px)), "as waves of 22 px"),
+    (TWO, changed(TWO, period_px=lambda p: {50.0: 52.0}.get(p.period_px, p.period_px)), "check period_px"),
+], ids=["reversed", "sine", "four, half a turn", "three reversed", "three, sine", "period", "period of two"])
+def test_a_wrong_declaration_is_named(patterns, declared, words):
+    assert words in said(patterns, declared)[0]
+
+
+def test_what_one_wave_does_not_tell_is_said():
+    """In a narrow field the projector's borders are not seen, and other offsets give other depths before camera and projector."""
+    wrong, unconfirmed, _ = said(ONE, ONE, field=0.06)
+    assert wrong is None and "nothing in the capture confirms" in unconfirmed
+
+
+def test_a_wave_that_runs_backwards_is_said_without_calibration():
+    wrong, unconfirmed, _ = said(ONE, reversed_steps(ONE), calibrated=False)
+    assert wrong is None and "run against the image" in unconfirmed
+
+
+@pytest.mark.parametrize("gamma", [1.5, 2.1])
+def test_bent_waves_are_bent_back_by_the_exponent_that_makes_them_agree(gamma):
+    """Grid of 0.05 in the exponent; what is left is that of half a step, 0.004 rad, and noise."""
+    wrong, _, found = said(THREE, THREE, gamma=gamma)
+    assert wrong is None and found.exponent == pytest.approx(gamma, abs=0.051) and found.left_rad < 0.03
+    assert "if their steps run backwards" in said(THREE, reversed_steps(THREE), gamma=gamma)[0]
