@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from stage.capture.manifest import Frame
 from stage.formats.images import write_png
@@ -86,6 +87,10 @@ class World:
     gamma: float = 1.0
     mixed: float = 0.0
     """Part of the next pattern in each frame, as a camera records that is not synchronised."""
+    scattered: float = 0.0
+    """Part of the light that runs below the surface, to one side, before it leaves it."""
+    scatter_px: float = 6.0
+    """Mean distance of that, projector pixels."""
     read_noise: float = 0.003
     electrons: float = 10000.0
     """At full scale."""
@@ -235,6 +240,10 @@ def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarra
         following = patterns[(number + 1) % len(patterns)]
         light_of, then = (draw(each, world.rig.projector).astype(np.float64) ** world.gamma for each in (pattern, following))
         shown = _focus((1 - world.mixed) * light_of + world.mixed * then, world.blur_px)
+        if world.scattered:
+            kernel = np.exp(-np.arange(8 * world.scatter_px * FINE) / (world.scatter_px * FINE))
+            below = convolve1d(shown, kernel / kernel.sum(), axis=1, mode="nearest", origin=-(len(kernel) // 2))
+            shown = (1 - world.scattered) * shown + world.scattered * below
         recorded = np.bincount(light.pixel, light.weight * shown[row, column], width * height) * world.light
         recorded += light.ambient * world.ambient
         recorded = rng.poisson(recorded * world.electrons) / world.electrons + rng.normal(0, world.read_noise, recorded.shape)

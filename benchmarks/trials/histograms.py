@@ -50,6 +50,10 @@ class Case:
     smoothed: bool = False
     reference: float = 0.0
     """Photons of the camera's own light, at 0.25 m in every histogram."""
+    fog: float = 0.0
+    """Scattering coefficient of fog, 1/m: single scattering from 0.2 m on, evenly in all directions."""
+    ceiling: int | None = None
+    """The largest number that the counter holds."""
 
 
 CASES = (
@@ -69,6 +73,9 @@ CASES = (
     Case("pulsed, mean of 25 frames, rounded to 1/100", in_model=False, scale=0.04, rounded=True, background=3),
     Case("pulsed, smoothed over the bins", in_model=False, smoothed=True, background=3),
     Case("pulsed, the camera's own light", in_model=False, reference=4000),
+    Case("pulsed, fog of 0.05 / m", in_model=False, photons=12000, fog=0.05),
+    Case("pulsed, fog of 0.2 / m", in_model=False, photons=30000, fog=0.2),
+    Case("pulsed, counters of 8 bits, full", in_model=False, photons=12000, ceiling=255),
 )
 
 
@@ -94,7 +101,7 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[i
     ranges, normals, albedo = (values[:240, :300] for values in room())
     rows, cols = ranges.shape[0] // RAYS, ranges.shape[1] // RAYS
     facing = np.clip(np.abs(normals[..., 2]), 0.2, 1)  # of the room's surfaces; the rays are nearly along the axis
-    strength = case.photons * albedo * facing / ranges**2 / RAYS**2
+    strength = case.photons * albedo * facing / ranges**2 / RAYS**2 * np.exp(-2 * case.fog * ranges)
     pixel = (np.arange(rows * RAYS)[:, None] // RAYS * cols + np.arange(cols * RAYS) // RAYS).ravel()
     times, power = pulse_of(case)
     mean = np.repeat(case.background * np.bincount(pixel, albedo.ravel())[:, None] / RAYS**2, BINS, axis=1)
@@ -103,6 +110,9 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[i
         ways.append((np.full(ranges.shape, 0.6), np.full(ranges.shape, case.glass / RAYS**2)))
     if case.reference:
         ways.append((np.full(ranges.shape, 0.25), np.full(ranges.shape, case.reference / RAYS**2)))
+    for near in np.arange(0.2, 7.0, 0.05) if case.fog else ():
+        back = case.photons * case.fog / 4 / near**2 * np.exp(-2 * case.fog * near) * 0.05 / RAYS**2
+        ways.append((np.full(ranges.shape, near), np.where(near < ranges, back, 0.0)))
     for distance, light in ways:
         for time, part in zip(times, power, strict=True):
             if part > 1e-7:
@@ -116,6 +126,8 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[i
         missed = np.exp(-(np.cumsum(mean, axis=1) - mean) / case.pulses)
         first = missed * -np.expm1(-mean / case.pulses)
         counts = random.multinomial(case.pulses, np.concatenate([first, 1 - first.sum(axis=1, keepdims=True)], axis=1))[:, :-1]
+    if case.ceiling is not None:
+        counts = np.minimum(counts, case.ceiling)
     if case.smoothed:
         counts = 0.5 * counts + 0.25 * np.roll(counts, 1, axis=1) + 0.25 * np.roll(counts, -1, axis=1)
     counts = counts * case.scale

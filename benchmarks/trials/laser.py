@@ -41,6 +41,11 @@ class Case:
     """Angle between the two planes."""
     second_every: int = 1
     """The second plane is on in every so many frames."""
+    late: int = 0
+    """Frames by which the declared planes are late."""
+    turned_rad: float = 0.0
+    """Angle by which they are turned."""
+    accuracy_deg: float | None = None
 
 
 def grey(points: np.ndarray) -> np.ndarray:
@@ -77,6 +82,9 @@ CASES = (
     Case("a second plane, brighter, on a chessboard", board, planes=24, in_model=False, second=1.4, second_rad=-0.09),
     Case("a second plane in every eighth frame", cloth, planes=60, in_model=False, second=0.7, second_every=8),
     Case("a faint second plane in every fifth frame", grain, planes=60, in_model=False, second=0.2, second_every=5),
+    Case("planes declared one frame late", cloth, planes=60, in_model=False, late=1),
+    Case("planes declared 1° aside", grain, planes=60, in_model=False, turned_rad=float(np.radians(1))),
+    Case("planes declared 1° aside, accuracy_deg 1", grain, planes=60, turned_rad=float(np.radians(1)), accuracy_deg=1.0),
     Case("a second plane of a half on grain", grain, planes=40, in_model=False, second=0.5, second_rad=0.03),
 )
 
@@ -140,7 +148,10 @@ def swept(case: Case, seed: int = 5) -> Trial:
             values = np.maximum(pixel + 0.05, 0).astype(np.float32)  # 0.05: a pedestal, so that noise is not cut
             exr.write(folder / f"{index:03d}.exr", dict.fromkeys("RGB", values), color_space="lin_rec709_scene", metadata={})
             light = {"light": {"type": "off"}} if angle is None else {
-                "laser": {"type": "plane", "point_m": LASER.tolist(), "normal": plane_normal(angle).tolist()}}
+                "laser": {"type": "plane", "point_m": LASER.tolist(), "normal": plane_normal(
+                    angle + case.turned_rad + case.late * (last - first) / (case.planes - 1)).tolist()}}
+            if angle is not None and case.accuracy_deg is not None:
+                light["laser"]["accuracy_deg"] = case.accuracy_deg
             frames.append({"image": f"{index:03d}.exr", **light})
         camera = {"projection": "perspective", "resolution": [COLS, ROWS], "focal_px": [FOCAL_PX, FOCAL_PX]}
         (folder / "capture.json").write_text(json.dumps({"schema": "relit.capture/1", "name": "sweep", "camera": camera, "frames": frames}))

@@ -40,6 +40,7 @@ CODES: dict[str, Sequence[Pattern]] = {
     "micro": micro_patterns(WIDTH, "column"),
     "modulated": modulated_patterns("column", 1.1 * WIDTH),
 }
+ONE = phase_patterns("column", (WIDTH,), 3)
 BENT = {"phase 16/18/21, 3 steps": CODES["phase 16/18/21, 3 steps"],
         "phase 16, 3 steps, Gray": (*phase_patterns("column", (16,), 3), *binary_patterns(WIDTH, "column", stripe_px=8)),
         "k-ary, reflected": CODES["k-ary, reflected"]}
@@ -79,11 +80,16 @@ def trials(data: Path | None) -> Iterator[Trial]:
                    camera_from_projector=(rig.pose @ turn).tolist(), focal_px=[rig.projector_focal * zoom] * 2)
     for name, (patterns, change) in wrong().items():
         yield _run(name, False, World(shapes=SHELF), patterns, light, declared=[change(pattern) for pattern in patterns])
-    one = phase_patterns("column", (WIDTH,), 3)
-    yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), one, light)
-    yield _run(f"phase {WIDTH}, 3 steps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), one, light)
+    yield _run(f"phase {WIDTH}, 3 steps", True, World(shapes=SHELF), ONE, light)
+    yield _run(f"phase {WIDTH}, 3 steps, gamma {GAMMA} not declared", False, World(shapes=SHELF, gamma=GAMMA), ONE, light)
     for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3)):
         yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES[name], light)
+
+
+    for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
+        for part in (0.3, 0.9):
+            yield _run(f"{name}, {100 * part:.0f} % of the light below the surface", False, World(shapes=SHELF, scattered=part), CODES[name],
+                       light)
 
 
 def _turn(first: int, second: int, degrees: float) -> np.ndarray:
@@ -106,6 +112,12 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
         "Gray, bits 5 and 6 exchanged": (GRAY, _changed(bit=lambda p: {5: 6, 6: 5}.get(getattr(p, "bit", 0), getattr(p, "bit", 0)))),
         "phase 16, 4 steps, Gray, steps backwards": (PHASE_GRAY, _changed(step=lambda p: -getattr(p, "step", 0) % getattr(p, "steps", 1))),
         "phase 16, 4 steps, Gray, a step late": (PHASE_GRAY, _changed(step=lambda p: (getattr(p, "step", 0) + 1) % getattr(p, "steps", 1))),
+        **{f"{name}, {words}": (CODES.get(name, ONE), change)
+           for name in (f"phase {WIDTH}, 3 steps", "phase 16/18/21, 4 steps")
+           for words, change in (("steps backwards", _changed(step=lambda p: -getattr(p, "step", 0) % getattr(p, "steps", 1))),
+                                 ("offset declared -π/2", _changed(offset_rad=lambda p: -np.pi / 2)))},
+        "phase 16/18/21, 4 steps, 18 px declared as 17.5": (
+            CODES["phase 16/18/21, 4 steps"], _changed(period_px=lambda p: {18: 17.5}.get(getattr(p, "period_px", 0), getattr(p, "period_px", 0)))),
         "phase 16, 4 steps, Gray, declared as 17 px": (PHASE_GRAY, _changed(period_px=lambda p: 17.0)),
     }
 

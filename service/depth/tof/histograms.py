@@ -16,6 +16,7 @@ from kernels.tof.histogram.rivals import vote_on_returns
 from kernels.tof.histogram.undeclared_pileup import PulseCount, estimate_pulses
 from service.depth.base.solution import RangeImage
 from service.depth.tof.count_scale import CountScale, estimate_count_scale
+from service.depth.tof.fog import find_fog
 from service.errors import RequestError
 from service.requests.depth import TofOptions, WhichReturn
 from stage.tof.calibration import TofCalibration
@@ -167,19 +168,28 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
     usable = usable.reshape(-1)
     pattern = pattern_bins(frames.counts[usable])
     photons_of, scale_facts, warnings = _photons(frames, usable, pattern)
+    fog = find_fog(photons_of[usable], start_m, bin_m)
+    if fog is not None:
+        pattern = fog.head
     if limit is None and (full := full_count(frames.counts[usable])) is not None:
         limit = full
         warnings.append(f"saturation: is not given, and the counts of {(frames.counts[usable] >= full).any(axis=1).sum()} pixels stop at "
                         f"{full:g}, as those of a full counter: these are taken for saturated")
     first_bin, last_bin = max((nearest - start_m) / bin_m, 0.0), min((farthest - start_m) / bin_m, float(frames.counts.shape[1]))
-    if pattern[int(first_bin) :].any():
+    if fog is not None:
+        ends = [start_m + bin_m * value for value in (0, np.flatnonzero(fog.head)[-1] + 1)]
+        warnings.append("frames[].tof: all pixels show light that begins near the camera and falls slowly with distance, as fog returns "
+                        f"it: returns are not looked for from {ends[0]:.3g} to {ends[1]:.3g} m, where it is strongest; what is no stronger "
+                        "than the fog has a low confidence, and the standard deviations hold the shift that its slope makes")
+    elif pattern[int(first_bin) :].any():
         warnings.append(f"frames[].tof: nearly all pixels show the same pulse at {start_m + bin_m * (np.argmax(pattern) + 0.5):.3g} to "
                         f"{start_m + bin_m * (len(pattern) - np.argmax(pattern[::-1]) - 0.5):.3g} m, which is taken for the camera's own "
                         "light: returns are looked for outside of these bins; give --near-m beyond it, or before it to keep it")
     histograms, shape, pile_up = _live(frames, photons_of, calibration, pattern, usable, device, warnings)
     pulse, source, zero_bins = _zero_of(shape, frames, calibration, warnings)
     found = find_returns(histograms, pulse, most=MOST_RETURNS, first_bin=first_bin, last_bin=last_bin)
-    chosen = _choose(found, options.which)
+    chosen = _choose(found, options.which, None if fog is None else np.stack([
+        fog.stands_out(photons_of, found.background.numpy(), place, pulse.width) for place in found.position.numpy()]))
 
     def of(values: np.ndarray) -> np.ndarray:
         return np.asarray(np.take_along_axis(values, chosen[None], axis=0)[0])
@@ -199,6 +209,9 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         weak = int((taken & ~missing).sum())
     if pile_up is not None and pile_up.relative > 0:
         sigma = np.hypot(sigma, _doubt(frames, photons_of, pile_up, pulse, position, device))
+    if fog is not None:
+        sigma = np.hypot(sigma, fog.shift(position, photons, pulse.width))
+        confidence = np.where(fog.stands_out(photons_of, found.background.numpy(), position, pulse.width), confidence, np.minimum(confidence, IN_TURN))
     if limit is not None:
         status = np.where((frames.counts >= limit).any(axis=1), int(Status.SATURATED), status)
     solved = np.isin(status, SOLVED)
@@ -324,11 +337,13 @@ def _zero_of(shape: PulseShape, frames: Histograms, calibration: TofCalibration,
     return shape.pulse, facts, shape.pulse.mean / math.sqrt(3)
 
 
-def _choose(found: Returns, which: WhichReturn) -> np.ndarray:
-    """Return the index of the return to take, [pixel]; 0 where there is none."""
+def _choose(found: Returns, which: WhichReturn, surface: np.ndarray | None = None) -> np.ndarray:
+    """Return the index of the return to take, [pixel]; 0 where there is none. `surface`: which of them may be one, [return, pixel]."""
     position, there = found.position.numpy(), found.photons.numpy() > 0
+    if surface is not None:
+        there &= surface
     if which is WhichReturn.FIRST:
         return np.argmin(np.where(there, position, math.inf), axis=0)
     if which is WhichReturn.LAST:
         return np.argmax(np.where(there, position, -math.inf), axis=0)
-    return np.zeros(position.shape[1], dtype=np.int64)
+    return np.asarray(np.argmax(there, axis=0)) if surface is not None else np.zeros(position.shape[1], dtype=np.int64)
