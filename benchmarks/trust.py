@@ -105,7 +105,8 @@ def renewed(before: str, rows: list[str]) -> str:
     """Return the page with the rows of some trials replaced, each with the sentence under it; new ones follow the last of them."""
     found = {row.split("|")[1]: row for row in rows}
     lines: list[str] = []
-    inside, last = False, len(before.split("\n"))  # whether a trial's old sentence goes; the line behind the last row
+    ends = [number for number, line in enumerate(before.split("\n"), start=1) if line.startswith("|")]
+    inside, last = False, ends[-1] if ends else len(before.split("\n"))  # whether a trial's old sentence goes; the line behind the last row
     for line in before.split("\n"):
         name = line.split("|")[1] if line.startswith("| ") else ""
         if inside and name.startswith(" *"):

@@ -88,8 +88,8 @@ def trials(data: Path | None) -> Iterator[Trial]:
 
     for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
         for part in (0.3, 0.9):
-            yield _run(f"{name}, {100 * part:.0f} % of the light below the surface", False, World(shapes=SHELF, scattered=part), CODES[name],
-                       light)
+            yield _run(f"{name}, {100 * part:.0f} % of the light below the surface", False, World(shapes=SHELF, scattered=part),
+                       CODES[name], light)
 
 
 def _turn(first: int, second: int, degrees: float) -> np.ndarray:
@@ -117,7 +117,7 @@ def wrong() -> dict[str, tuple[Sequence[Pattern], Callable[[Pattern], Pattern]]]
            for words, change in (("steps backwards", _changed(step=lambda p: -getattr(p, "step", 0) % getattr(p, "steps", 1))),
                                  ("offset declared -π/2", _changed(offset_rad=lambda p: -np.pi / 2)))},
         "phase 16/18/21, 4 steps, 18 px declared as 17.5": (
-            CODES["phase 16/18/21, 4 steps"], _changed(period_px=lambda p: {18: 17.5}.get(getattr(p, "period_px", 0), getattr(p, "period_px", 0)))),
+            CODES["phase 16/18/21, 4 steps"], _changed(period_px=lambda p: 17.5 if getattr(p, "period_px", 0) == 18 else p.period_px)),
         "phase 16, 4 steps, Gray, declared as 17 px": (PHASE_GRAY, _changed(period_px=lambda p: 17.0)),
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 from kernels.structured.stripe import plane_depths
 from service.depth.laser.stripe_map import StripeMap, StripeSamples
 from stage.capture.camera import Camera
-from stage.capture.ranging import LaserPlane
+from stage.capture.light import LaserPlane
 
 ENOUGH = 30
 """Number of pixels under both sweeps from which on these are compared."""

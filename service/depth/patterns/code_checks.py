@@ -35,6 +35,8 @@ MENDED = 5.0
 """Jumps that another order mends over those that it makes."""
 BEYOND_SHARE = 0.02
 """Share of the neighbours whose stripes lie beyond the projector, side by side, from which on its size is doubted."""
+LEAST_PERIODS = 4
+"""Number of periods that must be seen for a wave to be compared: over fewer, uneven light makes other periods fit as well."""
 CLEAR_WAVE = 0.4
 """Least length of the mean of a wave's phasors over its stripes: 0.64 where stripes are half a period wide, and 1 where they are narrow."""
 SOME = 3000
@@ -231,7 +233,7 @@ def _compare_wave(phasors: np.ndarray, place: np.ndarray, period: float, *, wide
     `wide` says that the places are those of stripes wider than half a period.
     """
     span = float(np.ptp(np.percentile(place, [2, 98])))
-    if span < 2 * period:
+    if span < LEAST_PERIODS * period:
         return None
     fine = 1 / (8 * span)
     frequencies = np.arange(-2 / period, 2 / period, 4 * fine)

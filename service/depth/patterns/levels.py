@@ -65,12 +65,12 @@ class EvenLevels(NamedTuple):
                 if len(members) >= FULL_STEPS:
                     shifts = np.array([phase.shifts[index] for index in members])
                     table = weights(shifts, period)
-                    waves.append(_row(frames, [phase.frames[index] for index in members], table[:, 0]))
+                    waves.append(row_of(frames, [phase.frames[index] for index in members], table[:, 0]))
                     means.extend(fitted_curve(light, table, shifts)[1] if response is not None else ())
         several = len(pairs) > 1
-        return cls(np.stack([_row(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
+        return cls(np.stack([row_of(frames, two, np.array([0.5, 0.5])) for two in pairs]) if several else None,
                    np.stack(waves) if len(waves) > 1 else None,
-                   np.stack([_row(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None,
+                   np.stack([row_of(frames, two, np.array([0.5, -0.5])) for two in pairs]) if several else None,
                    float(np.ptp(means)) if means else 0.0)
 
     def mixed(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
@@ -98,7 +98,7 @@ class EvenLevels(NamedTuple):
         return found
 
 
-def _row(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:
+def row_of(frames: int, places: Sequence[int], values: np.ndarray) -> np.ndarray:
     """Return [frames] weights that are 0 elsewhere."""
     row = np.zeros(frames)
     row[list(places)] = values

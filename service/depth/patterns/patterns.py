@@ -13,13 +13,14 @@ from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.triangulate import ProjectorModel, triangulate
 from service.depth.base.solution import DepthSolution
 from service.depth.base.triangulation_check import check_projector, missing_calibration
-from service.depth.patterns.agreement import ADVICE, conclude, doubt_coordinates, doubt_pixels
+from service.depth.patterns.agreement import ADVICE, DOUBTED, conclude, doubt_coordinates, doubt_pixels
 from service.depth.patterns.code_checks import check_codes
 from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import contradiction
 from service.depth.patterns.levels import check_levels
+from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
 from service.depth.patterns.readings import Readings, even_light
 from service.depth.patterns.wave_checks import bent_back, check_waves
@@ -100,8 +101,12 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
                 timings.advance(band.stop)
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
+        moved = _moved(planes, mask, capture, codes.collected, noise)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
+    if moved.any():
+        warnings.append(f"frames[]: the even light of the frames differs at {100 * moved.sum() / mask.sum():.2g} % of the pixels, as where "
+                        "something has moved during the sequence: they are unsure")
     facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
@@ -109,13 +114,14 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         facts |= {"exposures_s": list(series.times_s), "pixels_of_exposures": list(joined.counts)}
     spanned = request.near_m is not None or request.far_m is not None  # which may be what refuses all depths
     if projector is not None and (spanned or solution.estimated.any() or not np.isin(coordinates.status(), SOLVED).any()):
-        conclude(solution, right, mask, request, warnings)
+        conclude(solution, np.where(moved, np.minimum(right, DOUBTED), right), mask, request, warnings)
         solution.colour = scene_colour(capture, frames, codes.collected, joined)
         solution.facts |= facts
         return solution
     reason = missing or f"no decoded pixel has a depth ({_refused(solution, mask)}"
     decoded_only = DecodedSolution(method=codes.method, coordinates=coordinates, extents=shown.resolution, status=coordinates.status())
-    conclude(decoded_only, doubt_coordinates(decoded_only), mask, request, warnings)
+    right = doubt_coordinates(decoded_only)
+    conclude(decoded_only, np.where(moved, np.minimum(right, DOUBTED), right), mask, request, warnings)
     decoded_only.warnings.insert(0, f"decoded only, without depth: {reason}")
     decoded_only.facts |= facts | {"decoded_only": reason}
     return decoded_only
@@ -174,6 +180,18 @@ def _checked(planes: Planes, mask: np.ndarray, codes: PatternCodes, shown: Patte
             names = [f"{decoder.axis}s" for decoder in (codes.columns, codes.rows) if decoder is not None]
             return [*said, response_sentence(bent, names)], read_codes(capture, frames, bent, refine=request.refine)
     return said, codes
+
+
+def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collected, noise: NoiseModel) -> np.ndarray:
+    """Return where surfaces have moved between frames, [rows, cols] bool; nowhere if it is too little to tell."""
+    sample = sample_of(planes, capture.camera, mask)
+    sums = EvenSums.of(sample, collected, noise)
+    moved = np.zeros(mask.shape, bool)
+    if sums is not None and sums.moved(sample.grey, noise).mean() > 0:
+        for band in planes.bands(DECODE_BYTES_PER_PIXEL):
+            grey = sample._replace(values=planes.band(band)).grey
+            moved[band] = mask[band] & sums.moved(grey, noise).reshape(-1, mask.shape[1])
+    return moved if moved.sum() > SAID * mask.sum() else np.zeros_like(moved)
 
 
 def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjector, *, refine: bool = False) -> PatternCodes:

@@ -1,4 +1,4 @@
-"""Fog before the camera in histograms: light that every pixel sees from near on, and that falls with distance until its surface stands there.
+"""Fog in histograms: light that every pixel sees from near on, and that falls with distance until the pixel's surface stands there.
 
 Its peak is no surface, though it is often the strongest return; and a surface within it stands on a slope, which shifts its time.
 """

@@ -211,7 +211,8 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
         sigma = np.hypot(sigma, _doubt(frames, photons_of, pile_up, pulse, position, device))
     if fog is not None:
         sigma = np.hypot(sigma, fog.shift(position, photons, pulse.width))
-        confidence = np.where(fog.stands_out(photons_of, found.background.numpy(), position, pulse.width), confidence, np.minimum(confidence, IN_TURN))
+        outside = fog.stands_out(photons_of, found.background.numpy(), position, pulse.width)
+        confidence = np.where(outside, confidence, np.minimum(confidence, IN_TURN))
     if limit is not None:
         status = np.where((frames.counts >= limit).any(axis=1), int(Status.SATURATED), status)
     solved = np.isin(status, SOLVED)

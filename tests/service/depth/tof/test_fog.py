@@ -1,5 +1,5 @@
-"""Fog in histograms is named and no surface, and clipped counters are not taken for returns: a slope with a box before it and printed albedo,
-pulses integrated over the bins in closed form."""
+"""Fog in histograms is named and no surface, and clipped counters are not taken for returns: a slope with a box before it and printed
+albedo, pulses integrated over the bins in closed form."""
 
 import json
 

@@ -1,0 +1,82 @@
+"""Pixels whose surface has moved between frames: sums of frames that are even light, of one part of the sequence and of another, differ.
+
+A bit and its inverse, a wave over its shifts, and white and black add up to parts of white that are the same at all pixels, whatever the
+projector's response. Where one of them is another part, another surface was seen, or an edge or a texture has passed.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from kernels.structured.pattern_frames import NoiseModel
+from kernels.structured.phase import weights
+from service.depth.patterns.levels import row_of
+from service.depth.patterns.pattern_checks import ENOUGH, Sample
+from stage.patterns.binary import BinaryCode
+from stage.patterns.codes import Collected
+from stage.patterns.phase import FULL_STEPS, PhaseCode
+
+CLEAR_SIGMAS, LEAST_PART = 6.0, 0.04
+"""Least difference of a sum from its usual part of white, in deviations of noise and in white, from which on a surface has moved: lamps
+flicker by less."""
+LIT_SIGMAS = 20.0
+"""Least difference of white and black, in deviations of a reading, of pixels that are compared."""
+MOST_MOVED, SAID = 0.2, 0.005
+"""Parts of the compared pixels above which it is no motion but a camera that is not linear, and from which on it is said."""
+
+
+class EvenSums(NamedTuple):
+    """Sums of the frames that are even light."""
+
+    rows: np.ndarray  # [sums, frames]
+    usual: np.ndarray  # [sums] parts of white, less black
+    white: int
+    black: int
+
+    @classmethod
+    def of(cls, sample: Sample, collected: Collected, noise: NoiseModel) -> "EvenSums | None":
+        """Return the sums of a capture that has waves beside bits with inverses, white and black; None of another, or if what differs is
+        more than motion would make."""
+        if collected.white is None or collected.black is None:
+            return None
+        frames = len(sample.values)
+        rows: list[np.ndarray] = []
+        for code in collected.codes:
+            if isinstance(code, BinaryCode) and code.inverses is not None:
+                for pair in zip(code.frames, code.inverses, strict=True):
+                    rows.append(row_of(frames, pair, np.array([0.5, 0.5])))
+        bits = len(rows)
+        for code in collected.codes:
+            if isinstance(code, PhaseCode):
+                for period in dict.fromkeys(code.periods_px):
+                    members = [index for index, other in enumerate(code.periods_px) if other == period]
+                    if len(members) >= FULL_STEPS:
+                        shifts = np.array([code.shifts[index] for index in members])
+                        rows.append(row_of(frames, [code.frames[index] for index in members], weights(shifts, period)[:, 0]))
+        if not bits or len(rows) == bits:
+            return None
+        found = cls(np.stack(rows), np.zeros(len(rows)), collected.white, collected.black)
+        lit = sample.whole & found.lit(sample.grey, noise)
+        if lit.sum() < ENOUGH:
+            return None
+        part, _ = found.parts(sample.grey[:, lit], noise)
+        found = found._replace(usual=np.median(part, axis=1))
+        return found if found.moved(sample.grey[:, lit], noise).mean() <= MOST_MOVED else None
+
+    def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return which pixels are compared, of readings [frames, pixels]."""
+        spread = np.sqrt(noise.read**2 + noise.gain * np.maximum(grey[self.white], 0))
+        return np.asarray(grey[self.white] - grey[self.black] > LIT_SIGMAS * spread)
+
+    def parts(self, grey: np.ndarray, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums less black as parts of white less black, [sums, pixels], and their deviations, [pixels]."""
+        white = np.maximum(grey[self.white] - grey[self.black], 1e-9)
+        sums = self.rows.astype(np.float32) @ grey
+        deviation = np.sqrt(2 * (noise.read**2 + noise.gain * np.maximum(grey[self.white], 0))) / white
+        return (sums - grey[self.black]) / white, deviation
+
+    def moved(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
+        """Return where surfaces have moved, of readings [frames, pixels], [pixels] bool."""
+        part, deviation = self.parts(grey, noise)
+        away = np.abs(part - self.usual[:, None]).max(axis=0)
+        return np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))

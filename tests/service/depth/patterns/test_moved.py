@@ -1,0 +1,47 @@
+"""What moves during a sequence is told from what stands still, under projectors of any response: an edge and a print that shift half way."""
+
+import numpy as np
+import pytest
+
+from kernels.structured.pattern_frames import NoiseModel
+from service.depth.patterns.moved import EvenSums
+from service.depth.patterns.pattern_checks import Sample
+from stage.patterns.binary import binary_patterns
+from stage.patterns.codes import collect
+from stage.patterns.phase import phase_patterns
+
+ROWS, COLS, EXTENT = 32, 120, 256
+NOISE = NoiseModel(0.003, 1e-4)
+PATTERNS = [*phase_patterns("column", (16.0,), 3), *binary_patterns(EXTENT, "column", stripe_px=8)]
+
+
+def moved(by_px, gamma):
+    """Where frames, in the second half of which a dark strip stands farther right, show motion; and where it does."""
+    rng = np.random.default_rng(3)
+    at = np.arange(COLS) + np.zeros((ROWS, 1))
+    frames, albedos = [], []
+    for number, pattern in enumerate(PATTERNS):
+        left = 50 + 3 * np.sin(np.arange(ROWS) / 4)[:, None] + (by_px if number >= len(PATTERNS) // 2 else 0)
+        strip = (at > left) & (at < left + 20)
+        albedo = np.where(strip, 0.15, 0.6 + 0.2 * np.sin(0.4 * at))
+        u = 20 + 1.6 * at - 30 * strip
+        frames.append(albedo * (0.8 * pattern.level(u, u, EXTENT) ** gamma + 0.05))
+        albedos.append(albedo)
+    values = np.array(frames).reshape(len(PATTERNS), 1, -1)
+    values = values + rng.normal(0, 1, values.shape) * np.sqrt(NOISE.read**2 + NOISE.gain * values)
+    still = np.zeros((ROWS, COLS), np.float32)
+    sample = Sample(values.astype(np.float32), None, still, still, np.ones(still.shape, bool))
+    sums = EvenSums.of(sample, collect(PATTERNS), NOISE)
+    return sums.moved(sample.grey, NOISE), (np.abs(albedos[0] - albedos[-1]) > 0.2).ravel()
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_what_stands_still_has_not_moved(gamma):
+    """Six deviations of noise: none of 3840 pixels by chance."""
+    assert moved(0, gamma)[0].sum() == 0
+
+
+@pytest.mark.parametrize("gamma", [1.0, 2.2])
+def test_what_moves_is_found(gamma):
+    found, truth = moved(4, gamma)
+    assert found[truth].mean() > 0.9 and found[~truth].mean() < 0.01
