@@ -112,7 +112,9 @@ def photographed(case: Case, seed: int) -> tuple[np.ndarray, np.ndarray, tuple[i
         ways.append((np.full(ranges.shape, 0.25), np.full(ranges.shape, case.reference / RAYS**2)))
     for near in np.arange(0.2, 7.0, 0.05) if case.fog else ():
         back = case.photons * case.fog / 4 / near**2 * np.exp(-2 * case.fog * near) * 0.05 / RAYS**2
-        ways.append((np.full(ranges.shape, near), np.where(near < ranges, back, 0.0)))
+        seen = np.bincount(pixel, (near < ranges).ravel() * back, rows * cols)
+        bins = np.bincount(np.maximum(np.floor((2 * near / LIGHT_M_S + times) / BIN_S).astype(int), 0), power, BINS)[:BINS]
+        mean += seen[:, None] * bins
     for distance, light in ways:
         for time, part in zip(times, power, strict=True):
             if part > 1e-7:

@@ -1,4 +1,4 @@
-"""What moves during a sequence is told from what stands still, under projectors of any response: an edge and a print that shift half way."""
+"""What moves during a sequence is told from what stands still, under projectors of any response: a dark strip that shifts half way."""
 
 import numpy as np
 import pytest
