@@ -10,9 +10,12 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator
+from scipy.spatial.transform import Rotation
 
 RIGID_TOLERANCE = 1e-4
 """The largest difference between R Rᵀ and the identity: matrices are typed and printed with four digits or more."""
+ROTATION_ROUNDING = 1e-6
+"""The same of a rotation that is none but for single precision."""
 
 OPENCV_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """The rotation from the camera frame to the axes of OpenCV, x right, y down, z forward; it is its own inverse."""
@@ -24,16 +27,25 @@ def pixel_centres(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def rigid_fault(matrix: np.ndarray) -> str | None:
-    """Return why a 4×4 matrix is not a rotation and a translation, or None when it is."""
+def off_rotation(matrix: np.ndarray) -> float:
+    """Return how far the upper left [3, 3] of a matrix is from a rotation or a mirror: the largest difference of R Rᵀ and the identity."""
+    return float(np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max())
+
+
+def scaled_rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion [4] (x, y, z, w) times the square of its length, which is 1 unless it was rounded."""
+    return Rotation.from_quat(quaternion).as_matrix() * float(quaternion @ quaternion)
+
+
+def rigid_fault(matrix: np.ndarray, tolerance: float = RIGID_TOLERANCE) -> str | None:
+    """Return why a 4×4 matrix is not a rotation and a translation within a tolerance of R Rᵀ, or None when it is."""
     if not np.isfinite(matrix).all():
         return "holds a value that is not finite"
     if not np.allclose(matrix[3], (0, 0, 0, 1)):
         return "has a last row other than 0 0 0 1"
-    rotation = matrix[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=RIGID_TOLERANCE):
+    if off_rotation(matrix) > tolerance:
         return "is not a rotation and a translation"
-    if np.linalg.det(rotation) < 0:
+    if np.linalg.det(matrix[:3, :3]) < 0:
         return "mirrors (its rotation has determinant -1)"
     return None
 

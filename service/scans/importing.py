@@ -5,22 +5,32 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from service.requests.imports.scans import ScansImport, ScanUnit
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.point_files import read_point_scans
 from service.scans.points.rigid import nearest_rigid
 from service.scans.rgbd import DEPTH, depth_names, write_frames
-from service.scans.viewpoints import find_viewpoints
-from stage.errors import ManifestError, storage
+from service.scans.viewpoints import LEAST_POINTS, find_viewpoints
+from stage.errors import ManifestError, ResultError, storage
 from stage.formats.ply import PointCloud, write_ply
 from stage.importers.guess import POINT_FILES
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, write_scan_set
+from stage.transforms import ROTATION_ROUNDING, off_rotation, scaled_rotation
 
 FAR_AWAY = 100.0
 """Coordinates of more than so many times the size of a scan are counted from another origin."""
+MANY_POINTS = 1000
+"""Points of a scan that are looked at to count different ones."""
+LARGE_M, SMALL_M = 50.0, 0.001
+"""A scan of a format that has no unit is asked about if it is larger or smaller, metres."""
+METRIC = (".e57", ".ptx", ".las", ".laz")
+"""Formats of scanners of buildings and land, which are in metres."""
+USUAL_M = (0.01, 10.0)
+"""The sizes that another unit would have to give it."""
+MIXED = 100.0
+"""Scans of one object that differ so many times in size may be in different units."""
 GREY = 128
 """The colour of points without one, of 255."""
 
@@ -68,17 +78,18 @@ def import_scans(request: ScansImport) -> Imported:
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
     placed = sum(scan.pose is not None for scan in scans)
-    counts = [len(scan.points) for scan in scans]
+    counts, sizes = [len(scan.points) for scan in scans], [float(np.ptp(scan.points, axis=0).max()) for scan in scans]
     facts = [("scans", f"{len(scans)} of {min(counts)} to {max(counts)} points"),
-             ("size", f"{max(float(np.ptp(scan.points, axis=0).max()) for scan in scans):.3g} m is the widest at --unit {request.unit}"),
+             ("size", f"{max(sizes):.3g} m is the widest at --unit {request.unit}"),
              ("poses", "not known" if not placed else f"{placed} from {'their files' if table is None else table}")]
     if moved is not None:
         facts.append(("origin", f"is moved to {','.join(f'{x:.0f}' for x in moved)} of the files, from which the points lie far away"))
+    facts += _doubts(request, scans, sizes, any(name.lower().endswith(METRIC) for name in names))
     places = _viewpoints(request, scans, facts)
     entries = tuple(ScanEntry.model_validate({
         "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.path in names else "m",
         **({} if place is None else {"viewpoint_m": place}),
-        **({} if scan.pose is None else {"scan_to_world": scan.pose.tolist()})}) for scan, place in zip(scans, places, strict=True))
+        **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})}) for scan, place in zip(scans, places, strict=True))
     if folder != source:
         place_images(source, folder, [name for name in names if name not in converted and any(scan.path == name for scan in scans)])
     write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=entries), path)
@@ -97,10 +108,12 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
         if name.lower().endswith(".ply"):
             cloud = read_ply_points(request.source / name)
             pose = None if name not in poses else _in_metres(poses[name], unit)
+            _check_points(request.source / name, cloud.points)
             found.append(_Scan(stem, name, cloud.points * unit, cloud.normals, None, pose))
             continue
         parts = read_point_scans(request.source / name)
         for number, part in enumerate(parts, start=1):
+            _check_points(request.source / name, part.points)
             if moved is None and part.pose is None and np.abs(part.points).max() > FAR_AWAY * np.ptp(part.points, axis=0).max():
                 moved = np.rint(part.points.mean(axis=0))
             shift = np.zeros(3) if moved is None or part.pose is not None else moved
@@ -118,11 +131,37 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
     return found, moved
 
 
+def _check_points(path: Path, points: np.ndarray) -> None:
+    """Refuse points [n, 3] that span no surface."""
+    different = len(np.unique(points[:MANY_POINTS], axis=0))
+    if different < LEAST_POINTS:
+        raise ResultError(f"{path}: holds {different} different point{'s' * (different != 1)}: a surface has {LEAST_POINTS} or more")
+
+
 def _in_metres(pose: np.ndarray, unit: float) -> np.ndarray:
     """Return a pose [4, 4] whose translation is in a unit of so many metres."""
     found = pose.copy()
     found[:3, 3] *= unit
     return found
+
+
+def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric: bool) -> list[tuple[str, str]]:
+    """Return what is asked about the sizes of scans, metres, and said about rotations that are none; `metric`: the format
+    says the unit, or is one of large places."""
+    said = []
+    largest, smallest = int(np.argmax(sizes)), int(np.argmin(sizes))
+    if sizes[largest] > MIXED * sizes[smallest]:
+        said.append(("warning", f"{scans[largest].name} is {sizes[largest]:.3g} m large and {scans[smallest].name} "
+                                f"{sizes[smallest]:.3g} m: are they in one unit? import those of another unit apart"))
+    elif not metric and not SMALL_M < sizes[largest] < LARGE_M:
+        others = " or ".join(f"{unit} ({size:.3g} m)" for unit, metres in UNITS_M.items()
+                  if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[request.unit.value]) <= USUAL_M[1])
+        said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {request.unit}? "
+                                f"give --unit{others and f', which may be {others}'}"))
+    off = max((off_rotation(scan.pose) for scan in scans if scan.pose is not None), default=0.0)
+    if off > ROTATION_ROUNDING:
+        said.append(("turned", f"rotations were off orthonormal by up to {off:.1g}: the nearest are taken"))
+    return said
 
 
 def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str, str]]) -> list[tuple[float, ...] | None]:
@@ -145,7 +184,7 @@ def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str,
 
 
 def _conf_poses(path: Path) -> dict[str, np.ndarray]:
-    """Return world_from_scan [4, 4], in the unit of the file, of the meshes that a Stanford .conf file names.
+    """Return world_from_scan [4, 4], in the unit of the file and stretched by quaternions that are, of the meshes that a Stanford .conf file names.
 
     A line is `bmesh FILE tx ty tz qx qy qz qw`; the quaternions turn the world into the scan.
 
@@ -164,8 +203,8 @@ def _conf_poses(path: Path) -> dict[str, np.ndarray]:
         if len(words) != 9 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > 0.01:
             raise ManifestError(f"{path}: line {number}: must be {words[0]} FILE tx ty tz qx qy qz qw, with a quaternion of length 1")
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix().T, values[:3]
-        poses[words[1]] = nearest_rigid(pose)
+        pose[:3, :3], pose[:3, 3] = scaled_rotation(values[3:]).T, values[:3]
+        poses[words[1]] = pose
     if not poses:
         raise ManifestError(f"{path}: names no scans in lines of bmesh")
     return poses

@@ -21,9 +21,10 @@ from service.scans.points.rigid import about, applied
 from service.scans.read import read_scans
 from service.scans.registration.fixed_poses import check_fixed
 from service.scans.registration.pairs import Evidence, Pair, PairState
-from service.scans.registration.registration import RegistrationOptions, register_by
+from service.scans.registration.registration import NoneJoinedError, RegistrationOptions, register_by
 from service.scans.registration.target_pairs import target_places
 from service.scans.registration_words import (
+    PAIRS,
     fixed_facts,
     fixed_warnings,
     pair_facts,
@@ -35,7 +36,7 @@ from service.scans.registration_words import (
 )
 from stage.errors import ScanError
 from stage.files import write_text
-from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, write_scan_set
+from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, made_rotations, read_scan_set, write_scan_set
 
 
 class RegisterResult(NamedTuple):
@@ -65,6 +66,8 @@ class _Placed(NamedTuple):
     pairs: Sequence[Pair]
     facts: dict[str, Any]
     warnings: list[str]
+    refused: NoneJoinedError | None = None
+    """Why there are no poses; None: there are."""
 
 
 def register_scans(request: RegisterRequest, progress: Progress | None = None, sharing: SharedPieces | None = None) -> RegisterResult:
@@ -75,7 +78,7 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
 
     Raises:
         RequestError: small_gicp is not installed, or an option does not fit the set.
-        ScanError: no two scans can be joined.
+        ScanError: no two scans can be joined, or the reference cannot; report.json is written all the same.
         StageError: a file is wrong, damaged or missing.
         StorageError: the results cannot be written.
     """
@@ -97,13 +100,16 @@ def register_scans(request: RegisterRequest, progress: Progress | None = None, s
                                                          for found in (poses, covariances))) for entry in whole.scans]
     joined = [pair for pair in pairs if pair.state is PairState.JOINED and pair.fit is not None]
     report_path = request.out / REPORT_FILE
-    write_scan_set(whole.model_copy(update={"scans": tuple(entries)}), target)
+    if placed.refused is None:
+        write_scan_set(whole.model_copy(update={"scans": tuple(entries)}), target)
     write_text(report_path, report(
         request, inputs={"scan_set": str(file), "name": listed.name, "content": {scan.name: scan.content for scan in scans}},
         timings_s=timings.close(), **placed.facts, duplicates=same_as, scans=[scan_facts(number, scan, poses, spread, placed.alone, joined)
                                                                   for number, scan in enumerate(scans)],
         pairs=[pair_facts(pair, scans) for pair in pairs],
         pairs_not_tried=len(scans) * (len(scans) - 1) // 2 - sum(pair.by is Evidence.SURFACES for pair in pairs), warnings=placed.warnings))
+    if placed.refused is not None:
+        raise placed.refused
     return RegisterResult(
         target, report_path, len(poses), len(scans),
         float(np.median([pair.fit.residual for pair in joined if pair.fit is not None])) if joined else None,
@@ -116,7 +122,8 @@ def help_register(request: RegisterRequest, progress: Progress, sharing: SharedP
     file, whole = read_scan_set(request.scan_set)
     found = distinct(file, whole)
     with _pieces(request, file, found.scans, sharing) as pieces:
-        _placed(request, file, found, pieces, Timings(progress))
+        if (refused := _placed(request, file, found, pieces, Timings(progress)).refused) is not None:
+            raise refused
 
 
 @contextmanager
@@ -135,6 +142,7 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
 def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
     """Return the poses of the scans of a set."""
     listed, reference = alone.scans, _checked(request, file, alone)
+    said = alone.warnings() + made_rotations(listed)
     table, threads = listed.turntable, _threads(request)
     timings.stage("read", len(listed.scans))
     if request.turntable is TableUse.FIXED:
@@ -151,17 +159,21 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
         poses = dict(enumerate(fixed.poses))
         places = target_places({number: scan.targets for number, scan in enumerate(known)}, poses, {})
         return _Placed(known, poses, {}, {}, fixed.pairs, fixed_facts(fixed, known) | target_facts(places, known),
-                       alone.warnings() + missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
+                       said + missed + fixed_warnings(fixed, known) + wrong_targets(places, known))
     kept = KeptScans(file, listed, pieces, memory_bytes=1e9 * request.memory_gb, threads=threads)
     known = kept.facts(request, timings.advance)
     missed = _missed(request, known)
     timings.stage("register", 100)
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference, threads=threads)
-    found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known), options,
-                        table=table if request.turntable is TableUse.ANGLES else None,
-                        targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
+    said += missed + _without_viewpoint(listed, known)
+    try:
+        found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known),
+                            options, table=table if request.turntable is TableUse.ANGLES else None,
+                            targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
+    except NoneJoinedError as error:
+        return _Placed(known, {}, {}, error.alone, error.pairs, {"method": PAIRS}, said, error)
     return _Placed(known, found.poses, found.covariances, found.alone, found.pairs, registration_facts(found, known),
-                   alone.warnings() + missed + _without_viewpoint(listed, known) + registration_warnings(found, known))
+                   said + registration_warnings(found, known))
 
 
 def _without_viewpoint(listed: ScanSet, known: list[ScanFacts]) -> list[str]:

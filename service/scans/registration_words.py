@@ -18,13 +18,17 @@ SYSTEMATIC = 3.0
 """Residuals of pairs in units of σ from which it is said."""
 
 
+PAIRS = "pairs and pose graph"
+"""The method of a registration by pairs, as the report names it."""
+
+
 def _short(value: float) -> float:
     return float(f"{value:.5g}")
 
 
 def registration_facts(found: Registration, scans: Sequence[ScanFacts]) -> dict[str, Any]:
     """Return what the report says of a registration by pairs."""
-    return {"method": "pairs and pose graph", "reference": scans[found.reference].name, "cell_m": _short(found.cell_m),
+    return {"method": PAIRS, "reference": scans[found.reference].name, "cell_m": _short(found.cell_m),
             "loop_factor": None if not np.isfinite(found.factor) else _short(found.factor),
             "alike_turned": [scans[number].name for number in found.alike_turned],
             "contradicted_by_loops": [[scans[pair.a].name, scans[pair.b].name] for pair, weight in found.kept if weight <= REFUSED],

@@ -19,7 +19,7 @@ from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
 from stage.importers.layout import read_lines
 from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.sets.scan_set import ScanEntry
-from stage.transforms import OPENCV_FROM_CAMERA
+from stage.transforms import OPENCV_FROM_CAMERA, ROTATION_ROUNDING, off_rotation
 
 DEPTH = ".depth.png"
 INTRINSICS = "camera-intrinsics.txt"
@@ -29,8 +29,6 @@ EDGE, EDGE_RADIUS_PX = 0.03, 3
 """Depths in a neighbourhood that differ by this part are an edge: a plane seen at 77° by a camera of 60° is none."""
 SIGMA_PER_M2 = 0.005
 """σ of a depth over the square of the depth, 1/m: between .004 and .006 the pairs of six real frames of a room are explained."""
-ORTHONORMAL = 1e-6
-"""Rotations off by more are made rotations, and it is said."""
 
 
 def depth_names(names: list[str]) -> list[str]:
@@ -70,7 +68,7 @@ def write_frames(request: ScansImport, names: list[str]) -> tuple[list[ScanEntry
             write_ply(PointCloud(camera.points(-maps.depth)[kept].astype(np.float32), colours), request.folder / stem / POINTS_FILE)
         pose = _matrix(folder / f"{stem}.pose.txt", 4)
         if pose is not None:
-            turned = max(turned, float(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max()))
+            turned = max(turned, off_rotation(pose))
             pose = nearest_rigid(pose)
             pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_CAMERA
         entries.append(ScanEntry.model_validate({"name": stem, "path": stem, **({} if pose is None else {"scan_to_world": pose.tolist()})}))
@@ -79,7 +77,7 @@ def write_frames(request: ScansImport, names: list[str]) -> tuple[list[ScanEntry
              ("edges", f"{dropped / total:.1%} of the depths lie at edges, where they mix two surfaces, and are left out"),
              ("sigma", f"{SIGMA_PER_M2:g} z², z in metres, of a Kinect"),
              ("poses", f"{placed} of {len(entries)} from .pose.txt files")]
-    if turned > ORTHONORMAL:
+    if turned > ROTATION_ROUNDING:
         facts.append(("turned", f"rotations were off orthonormal by up to {turned:.1g}: the nearest are taken"))
     return entries, facts
 

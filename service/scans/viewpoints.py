@@ -21,6 +21,8 @@ DIRECTIONS = 600
 """Directions that are tried, 8° apart."""
 MOST_POINTS = 8000
 """Points of a scan that are looked at."""
+LEAST_POINTS = 3
+"""Fewer points span no surface."""
 CELL, BEHIND = 2.0, 3.0
 """Sides of cells in distances between points, and the depth in cells from which a point is hidden by another of its cell."""
 SAME_RAY = 0.5
@@ -54,6 +56,8 @@ def find_viewpoints(scans: Sequence[np.ndarray], normals: Sequence[np.ndarray | 
         scans: points [n, 3] of each, in its frame.
         normals: [n, 3] of each as its file has them, or None.
     """
+    if (fewest := min(map(len, scans))) < LEAST_POINTS:
+        return Viewpoints(None, 180.0, f"a scan has {fewest} points, and {LEAST_POINTS} are the fewest that tell a direction")
     drawn = [np.random.default_rng(0).permutation(len(points))[:MOST_POINTS] for points in scans]
     few = [points[chosen] for points, chosen in zip(scans, drawn, strict=True)]
     far = _far_away(few, [None if each is None else each[chosen] for each, chosen in zip(normals, drawn, strict=True)])

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stage.errors import ResultError
+from stage.transforms import scaled_rotation
 
 AXES = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -20,7 +20,7 @@ class E57Scan(NamedTuple):
 
     points: np.ndarray  # [n, 3] float64, metres, in the frame of the scanner where there is a pose
     colours: np.ndarray | None  # [n, 3] uint8
-    pose: np.ndarray | None  # [4, 4] world from scanner; None: the file says none
+    pose: np.ndarray | None  # [4, 4] world from scanner, stretched by the square of its quaternion; None: the file says none
 
 
 def read_e57(path: Path) -> Iterator[E57Scan]:
@@ -41,7 +41,7 @@ def read_e57(path: Path) -> Iterator[E57Scan]:
                 pose = None
                 if header.has_pose():
                     pose = np.eye(4)
-                    pose[:3, :3] = Rotation.from_quat(np.roll(header.rotation, -1)).as_matrix()  # E57 has w first
+                    pose[:3, :3] = scaled_rotation(np.roll(header.rotation, -1))  # E57 has w first
                     pose[:3, 3] = header.translation
                 yield E57Scan(_points(values), np.stack([values[name] for name in COLOURS], axis=1) if coloured else None, pose)
     except (pye57.libe57.E57Exception, ValueError, RuntimeError, KeyError) as error:

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from stage.files import write_text
 from stage.model import Direction, Finite, FirstFault, NotNegative, Positive, Strict, Text, Vector
 from stage.records import faults_of_each, read_record
-from stage.transforms import Transform, rotation_about
+from stage.transforms import ROTATION_ROUNDING, Row, off_rotation, rigid_fault, rotation_about
 
 SCAN_SET_FILE, SCAN_SET_SCHEMA = "scan-set.json", "relit.scan-set/1"
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6, "in": 0.0254}
@@ -22,6 +22,9 @@ SYMMETRIC = 1e-6
 MOST_M = 1e7
 """The largest coordinate, metres: beyond ten thousand kilometres single precision leaves nothing of a scan."""
 Coordinate = Annotated[float, Field(ge=-MOST_M, le=MOST_M)]
+MOST_OFF_ROTATION = 1e-3
+"""The largest difference between R Rᵀ and the identity of a pose: poses of other programs, in single precision or multiplied many times,
+are off by some 10⁻⁴; the nearest rotation is taken."""
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 
@@ -34,6 +37,15 @@ def _covariance(rows: tuple[Six, ...]) -> tuple[Six, ...]:
     return rows
 
 
+def _rigid(rows: tuple[Row, Row, Row, Row]) -> tuple[Row, Row, Row, Row]:
+    fault = rigid_fault(np.array(rows, dtype=np.float64), MOST_OFF_ROTATION)
+    if fault:
+        raise ValueError(fault)
+    return rows
+
+
+Pose = Annotated[tuple[Row, Row, Row, Row], AfterValidator(_rigid)]
+"""The rows of a rotation and a translation; the rotation may be a little off one."""
 Covariance = Annotated[tuple[Six, Six, Six, Six, Six, Six], AfterValidator(_covariance)]
 """The rows of the covariance of a pose: of a small rotation (x, y, z in radians, about the world's axes through the origin of the scan),
 then of a translation (x, y, z in metres, world)."""
@@ -65,7 +77,7 @@ class ScanEntry(Strict):
     viewpoint_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Position of the scanner for a PLY file, metres, in the frame of the scan: each point was seen from there, with nothing in the way.
     `relit fuse` needs it of PLY files. None: not known, and taken to be the origin where it only tells the side of a surface."""
-    scan_to_world: Transform | None = None
+    scan_to_world: Pose | None = None
     """The rows of world_from_scan: x_world = R x + t, in metres. None: `world_from_camera` of the depth result, or not known."""
     pose_covariance: Covariance | None = None
     """The covariance of `scan_to_world`. None: it is not known."""
@@ -156,6 +168,14 @@ def write_scan_set(scans: ScanSet, path: Path) -> None:
     entries = ",\n".join("    " + json.dumps(entry) for entry in data.pop("scans"))
     body = json.dumps({"schema": data.pop("schema"), "name": data.pop("name"), **data}, indent=2)
     write_text(path, body[:-2] + f',\n  "scans": [\n{entries}\n  ]\n}}\n')
+
+
+def made_rotations(scans: ScanSet) -> list[str]:
+    """Return a sentence on the poses of a set whose rotations are none but for more than rounding, as the nearest are taken."""
+    off = {scan.name: off_rotation(np.array(scan.scan_to_world)) for scan in scans.scans if scan.scan_to_world is not None}
+    named = [name for name, value in off.items() if value > ROTATION_ROUNDING]
+    return [] if not named else [f"{', '.join(named)}: the rotation of scan_to_world is off orthonormal by up to "
+                                 f"{max(off.values()):.1g}: the nearest rotation is taken"]
 
 
 def _faults(data: dict[str, Any]) -> Iterator[str]:

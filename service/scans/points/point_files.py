@@ -9,15 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.scans.points.rigid import nearest_rigid
 from stage.errors import ResultError, storage
 from stage.formats.e57 import read_e57
 from stage.formats.las import read_las
+from stage.sets.scan_set import MOST_OFF_ROTATION
+from stage.transforms import rigid_fault
 
 UNIT_LENGTH = 0.02
 """Vectors whose lengths are 1 within this are normals."""
-MOST_STRETCH = 1e-3
-"""A matrix that stretches by more is no pose."""
 PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8", ("I", 1): "i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
              ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8"}
 MOST_HEADER = 4096
@@ -30,7 +29,7 @@ class PointScan(NamedTuple):
     colours: np.ndarray | None = None  # [n, 3] uint8
     normals: np.ndarray | None = None  # [n, 3] float32
     viewpoint: np.ndarray | None = None  # [3] of the scanner, in the frame of the points; None: the file does not say it
-    pose: np.ndarray | None = None  # [4, 4] world from scan; None: the file does not say it
+    pose: np.ndarray | None = None  # [4, 4] world from scan, as the file has it; None: the file does not say it
 
 
 def read_point_scans(path: Path) -> list[PointScan]:
@@ -71,10 +70,10 @@ def _ptx(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
             matrix = np.empty(0)
         if rows is None or matrix.shape != (4, 4) or not np.isfinite(matrix).all() or [len(words) for words in heads[:4]] != [3] * 4:
             raise ResultError(f"{path}: its header must have columns, rows, four lines of three numbers and four of four")
-        if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > MOST_STRETCH or np.linalg.det(matrix[:3, :3]) < 0:
+        if rigid_fault(matrix, MOST_OFF_ROTATION) is not None:
             raise ResultError(f"{path}: the matrix of a scan is no rotation and translation")
         table = _table(stream, columns * rows, path)
-        yield _scan(table[table[:, :3].any(axis=1)])._replace(viewpoint=np.zeros(3), pose=nearest_rigid(matrix))
+        yield _scan(table[table[:, :3].any(axis=1)])._replace(viewpoint=np.zeros(3), pose=matrix)
 
 
 def _pcd(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
@@ -131,7 +130,7 @@ def _e57(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
     for points, colours, pose in read_e57(path):
         finite = np.isfinite(points).all(axis=1)
         yield PointScan(points[finite], None if colours is None else colours[finite], viewpoint=None if pose is None else np.zeros(3),
-                        pose=None if pose is None else nearest_rigid(pose))
+                        pose=pose)
 
 
 READERS: dict[str, Callable[[io.BufferedReader, Path], Iterator[PointScan]]] = {

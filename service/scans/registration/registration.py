@@ -88,6 +88,20 @@ class Registration(NamedTuple):
     """Joined scans of unknown start without targets that look much the same when they are turned about an axis."""
 
 
+class NoneJoinedError(ScanError):
+    """No scans could be joined, or not the reference; with what became of each pair, for a report."""
+
+    def __init__(self, names: Sequence[str], alone: dict[int, str], pairs: tuple[Pair, ...]) -> None:
+        """Say why each scan is alone.
+
+        Args:
+            names: of all scans.
+            alone: the reasons by the number of the scan, in words after its name.
+        """
+        super().__init__(*(f"{names[number]}: {words}" for number, words in alone.items()))
+        self.alone, self.pairs = alone, pairs
+
+
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
              table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object, all of which are in memory.
@@ -159,9 +173,10 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
         alone[number] = (words or _refusal(number, names, pairs.values())) + _refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:
-        raise ScanError(*(f"{names[number]}: {words}" for number, words in alone.items()))
+        raise NoneJoinedError(names, alone, (*pairs.values(), *targeted.values()))
     if options.reference is not None and options.reference not in joined:
-        raise ScanError(f"{names[options.reference]}: is the reference, but {alone[options.reference]}")
+        raise NoneJoinedError(names, {options.reference: f"is the reference, but {alone[options.reference]}"},
+                              (*pairs.values(), *targeted.values()))
     free = [number for number in joined if starts[number] is None and number not in shown] if table is None else []
     turned = tuple(number for number in free if looks_alike_turned(work.ready(number), cells[number]))
     spread = covariances(solved, kept, [edge_of(pair) for pair in kept],

@@ -162,6 +162,59 @@ def test_frames_of_a_depth_camera(relit, tmp_path, views):
     assert "camera-intrinsics.txt" in relit.refused("import", "scans", folder, tmp_path / "other")
 
 
+def test_one_point_is_no_scan(relit, tmp_path):
+    folder = write(tmp_path / "scans", [np.ones((1, 3))])
+    assert "scan_0.ply: holds 1 different point:" in relit.refused("import", "scans", folder, tmp_path / "set")
+    (folder / "scan_0.ply").unlink()
+    (folder / "a.xyz").write_text("1 2 3\n" * 9)
+    assert "a.xyz: holds 1 different point:" in relit.refused("import", "scans", folder, tmp_path / "set")
+    assert find_viewpoints([np.ones((1, 3))], [None]).place is None
+
+
+def test_sizes_that_ask_for_another_unit_are_asked_about(relit, tmp_path):
+    """An object of 100 units, and two scans of one object of which one is a thousand times as large."""
+    random = np.random.default_rng(5)
+    slab = np.vstack([random.uniform(0, 1, (400, 3)) * [1, 0.7, 0.01], [[0.0, 0, 0], [1, 0, 0]]])
+    said = relit.done("import", "scans", write(tmp_path / "large", [100 * slab]), tmp_path / "a").out
+    assert "is its unit m? give --unit" in said and "mm (0." in said and "cm" in said
+    assert "warning" not in relit.done("import", "scans", tmp_path / "large", tmp_path / "b", "--unit", "mm").out
+    said = relit.done("import", "scans", write(tmp_path / "mixed", [slab, 1000 * slab]), tmp_path / "c").out
+    assert "scan_24 is" in said and "scan_0 1 m: are they in one unit?" in said
+
+
+def test_rotations_off_orthonormal_are_made_rotations_and_said(relit, tmp_path, views):
+    """Of a scan set, a PTX file and a .conf file; stretches of a thousandth and more are no poses."""
+    folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
+    turn = Rotation.from_euler("xyz", [5, 24, -8], degrees=True)
+    quaternion = (1 + 1.6e-4) * turn.inv().as_quat()
+    (folder / "scans.conf").write_text(f"camera 0 0 0 0 0 0 1\nmesh scan_0.ply 0 0 0 0 0 0 1\n"
+                                       f"bmesh scan_24.ply 0 0 1 {' '.join(map(str, quaternion))}\nbye\n")
+    said = relit.done("import", "scans", folder, tmp_path / "set", "--viewpoint", "0,0,9").out
+    assert "off orthonormal by up to 0.0006" in said
+    data = json.loads((tmp_path / "set" / "scan-set.json").read_text())
+    pose = np.array(data["scans"][1]["scan_to_world"])
+    assert pose[:3, :3] == pytest.approx(turn.as_matrix(), abs=1e-12)
+
+    pose[:3, :3] *= 1.00016
+    data["scans"][1]["scan_to_world"] = pose.tolist()
+    (tmp_path / "set" / "scan-set.json").write_text(json.dumps(data))
+    outcome = relit("register", tmp_path / "set", "--out", tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert "scan_24: the rotation of scan_to_world is off orthonormal by up to 0.0003" in report["warnings"][0]
+    assert outcome.code == 0 or "Traceback" not in outcome.err
+    pose[:3, :3] *= 1.001
+    data["scans"][1]["scan_to_world"] = pose.tolist()
+    (tmp_path / "set" / "scan-set.json").write_text(json.dumps(data))
+    assert "scan_to_world: is not a rotation" in relit.refused("register", tmp_path / "set", "--out", tmp_path / "none")
+
+    (tmp_path / "tower").mkdir()
+    stretched = POSE @ np.diag([1.0002, 1, 1, 1])
+    (tmp_path / "tower" / "a.ptx").write_text(ptx(CORNER + 1, stretched))
+    assert "off orthonormal by up to 0.000" in relit.done("import", "scans", tmp_path / "tower", tmp_path / "ptx").out
+    pose = np.array(json.loads((tmp_path / "ptx" / "scan-set.json").read_text())["scans"][0]["scan_to_world"])
+    assert pose[:3, :3] @ pose[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)
+
+
 CORNER = np.array([[0.0, 0, 0], [1.25, 0, 0], [0, 2.5, 0], [0, 0, 0.125], [1, 2, 0.5]])
 COLOURS = np.array([[255, 0, 10], [0, 20, 30], [1, 2, 3], [4, 5, 6], [7, 8, 9]], dtype=np.uint8)
 POSE = np.eye(4)

@@ -152,7 +152,8 @@ def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
     outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
     assert outcome.code == 2
     assert "the surface looks the same when it is turned about an axis" in outcome.err
-    assert not (tmp_path / "out").exists()
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert {pair["state"] for pair in report["pairs"]} == {"ambiguous"} and not (tmp_path / "out" / "scan-set.json").exists()
     folder = write(tmp_path / "turned", seen, top=table_of(seen, 0, 40, 80))
     outcome = relit("register", folder, "--out", tmp_path / "out", "--turntable", "fixed")
     assert outcome.code == 0, outcome.err
@@ -197,8 +198,9 @@ def test_points_that_are_no_scan_are_refused(relit, tmp_path, change, sentence, 
 
 def test_scans_without_overlap_are_refused(relit, tmp_path):
     seen = views(figure, 0, 180)
-    assert "s1: " in relit.refused("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    said = relit.refused("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    why = {scan["name"]: scan["why_not"] for scan in json.loads((tmp_path / "out" / "report.json").read_text())["scans"]}
+    assert f"s1: {why['s1']}" in said and not (tmp_path / "out" / "scan-set.json").exists()
 
 
 @pytest.mark.parametrize(("options", "sentence"), [
