@@ -89,7 +89,8 @@ def import_scans(request: ScansImport) -> Imported:
     entries = tuple(ScanEntry.model_validate({
         "name": scan.name, "path": scan.path, "unit": request.unit.value if scan.path in names else "m",
         **({} if place is None else {"viewpoint_m": place}),
-        **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})}) for scan, place in zip(scans, places, strict=True))
+        **({} if scan.pose is None else {"scan_to_world": nearest_rigid(scan.pose).tolist()})})
+        for scan, place in zip(scans, places, strict=True))
     if folder != source:
         place_images(source, folder, [name for name in names if name not in converted and any(scan.path == name for scan in scans)])
     write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=entries), path)
@@ -184,7 +185,7 @@ def _viewpoints(request: ScansImport, scans: list[_Scan], facts: list[tuple[str,
 
 
 def _conf_poses(path: Path) -> dict[str, np.ndarray]:
-    """Return world_from_scan [4, 4], in the unit of the file and stretched by quaternions that are, of the meshes that a Stanford .conf file names.
+    """Return world_from_scan [4, 4] of the meshes that a Stanford .conf file names, in the unit of the file, stretched as its quaternions.
 
     A line is `bmesh FILE tx ty tz qx qy qz qw`; the quaternions turn the world into the scan.
 
