@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import rank_filter
+from scipy.ndimage import grey_dilation, label, maximum, minimum, rank_filter
 
 from service.boards.stitching.stitching import TilePoints
 from service.depth.depth import depth
@@ -19,6 +19,11 @@ from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
 
 SPIKE = 6.0
 """σ beyond its neighbours from which on a point is an outlier."""
+RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
+ANIMALS = (1, 4, 20, 110)
+"""The forms that so many pixels side by side, or corner to corner, have."""
+CHANCE = 0.001
+"""The expected number of groups of a size in a tile from which on that size comes together by chance."""
 
 
 class BoardTiles(NamedTuple):
@@ -87,16 +92,40 @@ def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> t
     """Return heights and σ, both [n], of the used pixels of a tile, [rows, cols], with outliers moved to their neighbours.
 
     An outlier lies beyond all of its eight neighbours but one by more than SPIKE σ. It is moved to the second of them, so that the slopes
-    around it are not its own, and its σ grows by as much as it was moved.
+    around it are not its own, and its σ grows by as much as it was moved. A group of outliers lies as far beyond all around it, and has
+    no more pixels than groups have that come together by chance where so many are outliers; it is moved to the nearest of those around.
     """
     image = np.full(used.shape, np.nan, dtype=np.float32)
     image[used] = height
-    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
-    low = rank_filter(np.where(used, image, np.inf), 1, footprint=ring, mode="constant", cval=np.inf)[used]
-    high = rank_filter(np.where(used, image, -np.inf), -2, footprint=ring, mode="constant", cval=-np.inf)[used]
-    beyond = np.maximum(low - height, height - high)
-    spike = np.isfinite(beyond) & (beyond > SPIKE * sigma)
-    return np.where(spike, np.clip(height, low, high), height), np.where(spike, np.hypot(sigma, beyond), sigma)
+    limit = np.zeros(used.shape, dtype=np.float32)
+    limit[used] = SPIKE * sigma
+    told = image.copy()
+    single = np.zeros(used.shape, dtype=bool)
+    groups = []
+    for sign in (1, -1):
+        up = np.where(used, sign * image, -np.inf)
+        second, fourth = (rank_filter(up, -1 - others, footprint=RING, mode="constant", cval=-np.inf) for others in (1, 3))
+        spike = used & (up - second > limit) & np.isfinite(second)
+        single |= spike
+        told[spike] = sign * second[spike]
+        marked = used & (up - fourth > limit) & np.isfinite(fourth)
+        labels, count = label(marked, structure=np.ones((3, 3)))
+        numbers = np.arange(1, count + 1)
+        around = grey_dilation(np.where(marked, -np.inf, up), footprint=RING, mode="constant", cval=-np.inf)
+        border = np.concatenate([[np.inf], np.atleast_1d(maximum(around, labels, numbers))]) if count else np.array([np.inf])
+        base = np.concatenate([[-np.inf], np.atleast_1d(minimum(up - limit, labels, numbers))]) if count else np.array([-np.inf])
+        groups.append((sign, labels, np.where(base > border, border, np.inf)))
+    most = _together(int(single.sum()), int(used.sum()))
+    for sign, labels, border in groups:
+        small = (labels > 0) & np.isfinite(border[labels]) & (np.bincount(labels.ravel())[labels] <= most)
+        told[small] = sign * border[labels[small]]
+    return told[used], np.hypot(sigma, told[used] - height)
+
+
+def _together(outliers: int, pixels: int) -> int:
+    """Return how many outliers come together by chance, where so many of the pixels are outliers and do not know of each other."""
+    share = outliers / max(pixels, 1)
+    return max(size for size, forms in enumerate(ANIMALS, start=1) if size == 1 or pixels * forms * share**size > CHANCE)
 
 
 def _pose(where: str, tile: Tile, maps: DepthMaps) -> np.ndarray:

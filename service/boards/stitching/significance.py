@@ -18,6 +18,7 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import label
 
 from service.boards.stitching.grid import BEND_NOISE, BLOCK_PX, BoardGrid, HeightMap, bends, blocks_of, robust_sigma, shift_error
@@ -28,6 +29,8 @@ ENOUGH_WINDOWS = 100
 """The least number of windows whose spread says what their errors are."""
 LEAST_MEASURED = 0.5
 """The least part of a window that must be measured."""
+LEAST_CARRIED, LEAST_PART = 3, 0.25
+"""The least side of windows whose pixels are looked at one by one, and the part of the mean that two thirds of them must exceed."""
 DOUBLINGS = 5
 """Sizes of windows, each twice the one before."""
 POWER = NormalDist().inv_cdf(0.95)
@@ -121,6 +124,8 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
             middle, spread[side] = _scatter(value / sigma, usable & (own > sigma / 2), usable)
             wide = np.where(usable, np.hypot(spread[side] * own, both), np.nan)  # what neighbours share is no noise, and scatters no more
             beyond = np.where(usable, np.minimum((np.abs(value) - allowed) / sigma, np.abs(value - middle * own) / wide), 0)
+        if side == sides[0] and side >= LEAST_CARRIED:
+            beyond[_carried_by_few(clipped, known & (found == 0), value, beyond >= limit)] = 0
         if usable.any():
             detectable[side] = float(np.median(allowed[usable] + (limit + POWER) * wide[usable]))
         if side == sides[0]:
@@ -130,6 +135,21 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
         for sign in (1, -1):
             found[_covered((beyond >= limit) & (sign * value > 0), side, shape) & (found == 0)] = sign * side
     return Scan(found != 0, found, mean_sigma, findable, score, sides, tests, limit, spread, detectable)
+
+
+def _carried_by_few(heights: np.ndarray, known: np.ndarray, mean: np.ndarray, windows: np.ndarray) -> np.ndarray:
+    """Return which of some windows, [rows, cols] bool by their first pixels, deviate by outliers alone: a third of their pixels lies below a
+    part of their mean, where a defect of their size that lies between pixels has half of its depth."""
+    side = heights.shape[0] - windows.shape[0] + 1
+    out = np.zeros_like(windows)
+    places = np.argwhere(windows)
+    for part in np.array_split(places, len(places) // 100_000 + 1):
+        rows, cols = part.T
+        sign = np.sign(mean[rows, cols])[:, None]
+        inside = [sliding_window_view(values, (side, side))[rows, cols].reshape(len(part), side * side) for values in (heights, known)]
+        own = np.sort(np.where(inside[1], sign * inside[0], np.inf), axis=1)[:, side * side // 3 - 1]
+        out[rows, cols] = own < LEAST_PART * np.abs(mean[rows, cols])
+    return out
 
 
 def _scatter(values: np.ndarray, quiet: np.ndarray, usable: np.ndarray) -> tuple[float, float]:
