@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 
 from kernels import device as devices
 from service.boards.findings import FINDINGS_FILE, Defect, entries, find_areas, find_defects, findings_csv
 from service.boards.height_files import BOARD_FILE, Match, Nominal, check_size, match, read_design, read_golden, write_board
 from service.boards.inspection_picture import PICTURE_FILE, write_picture
+from service.boards.stitching.form import bow_and_twist, fit_form, fit_spline
 from service.boards.stitching.grid import HeightMap
 from service.boards.stitching.overlap import Evidence
 from service.boards.stitching.regions import RegionResult, Verdict, check_regions, tolerances_over
-from service.boards.stitching.significance import Form, Scan, bow_and_twist, compare, fit_form, scan_windows
+from service.boards.stitching.significance import Scan, compare, scan_windows
 from service.boards.stitching.stitching import Stitched, blend, stitch
 from service.boards.tiles import BoardTiles, read_tiles
 from service.depth.base.solution import statistics
@@ -34,6 +36,10 @@ DEVIATION_FILE = "deviation.exr"
 METHOD = "board inspection"
 REGISTER_STEPS = 100
 """Steps of the progress of the registration."""
+LEAST_STIFF = 8
+"""The least distance of the knots of a spline, in sides of the smallest defect: of a defect half as wide it takes less than 1 %."""
+LEAST_OF_REGIONS = 0.9
+"""The least part of a region, and of a board with regions, that must be inspected, where neither it nor the request says it."""
 SMALLEST_PX = 3
 """Side of the smallest defect in pixels, where the request names none."""
 
@@ -64,7 +70,7 @@ class _Judged(NamedTuple):
     match: Match
     deviation: HeightMap
     bow_m: float
-    wanted: np.ndarray  # [rows, cols] bool: pixels with a nominal height
+    wanted: np.ndarray  # [rows, cols] bool: pixels with a nominal height, but for a frame that is narrower than a defect
     inspected: np.ndarray  # [rows, cols] bool
     scan: Scan
     defects: list[Defect]
@@ -150,25 +156,43 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
     deviation = compare(heights, nominal.heights, shift_sigma_m=found.shift_sigma_m)
     plane = fit_form(grid, deviation.height, quadratic=False)
     curved = fit_form(grid, deviation.height, quadratic=True)
-    removed: Form = curved if request.remove is BoardForm.QUADRATIC else plane
-    over = removed.over(grid)
-    deviation = deviation._replace(height=deviation.height - over)
-    heights = heights._replace(height=heights.height - plane.over(grid))
     smallest = SMALLEST_PX if request.smallest_defect_m is None else max(1, round(request.smallest_defect_m / grid.pixel_m))
+    stiffness = max(grid.size_m) / 4 if request.stiffness_m is None else request.stiffness_m
+    if request.remove is BoardForm.SPLINE:
+        if stiffness < LEAST_STIFF * smallest * grid.pixel_m:
+            raise BoardError(f"{nominal.path}: --stiffness-m {stiffness:.3g} is less than {LEAST_STIFF} smallest defects, which the spline "
+                             "would take away: give a larger one, or a smaller --smallest-defect-m")
+        spline = fit_spline(grid, deviation.height, knots_m=stiffness)
+        deviation = deviation._replace(height=deviation.height - spline.over(grid),
+                                       systematic=np.hypot(deviation.systematic, spline.sigma))
+    else:
+        deviation = deviation._replace(height=deviation.height - (curved if request.remove is BoardForm.QUADRATIC else plane).over(grid))
+    heights = heights._replace(height=heights.height - plane.over(grid))
     if smallest > min(grid.rows, grid.cols):
         raise BoardError(f"{nominal.path}: --smallest-defect-m {request.smallest_defect_m:g} is larger than the board")
     tolerance = tolerances_over(grid, nominal.regions, elsewhere_m=request.tolerance_m)
     scan = scan_windows(deviation, tolerance_m=tolerance, false_alarm=request.false_alarm / 2, smallest_px=smallest)
-    wanted = nominal.heights.measured
-    inspected = wanted & deviation.measured & np.isfinite(scan.mean_sigma)
+    wanted = _asked(nominal.heights.measured, smallest)
+    inspected = wanted & np.isfinite(scan.mean_sigma)  # a hole with enough measured pixels around it hides no defect
     if request.must_find_m is not None:
         inspected &= np.nan_to_num(scan.findable, nan=np.inf) <= request.must_find_m
     defects, significant = find_defects(deviation, scan, tolerance)
     scan = scan._replace(significant=significant)
     inspected |= wanted & significant & deviation.measured
-    regions, k = check_regions(deviation, nominal.regions, false_alarm=request.false_alarm / 2)
+    regions, k = check_regions(deviation, nominal.regions, false_alarm=request.false_alarm / 2,
+                               least_inspected=LEAST_OF_REGIONS if request.least_inspected is None else request.least_inspected)
     return heights, _Judged(nominal, found, deviation, bow_and_twist(curved, grid), wanted, inspected, scan, defects, regions, k,
                             _verdict(defects, regions, inspected, wanted, request))
+
+
+def _asked(nominal: np.ndarray, smallest_px: int) -> np.ndarray:
+    """Return the pixels, [rows, cols] bool, that must be inspected: those with a nominal height but for the frame around all that is
+    narrower than the smallest defect, which no board that is placed anew covers."""
+    solid = binary_fill_holes(binary_closing(np.pad(nominal, smallest_px), iterations=smallest_px))
+    inner = binary_erosion(solid, iterations=smallest_px - 1) if smallest_px > 1 else solid
+    cut = slice(smallest_px, -smallest_px)
+    asked = nominal & inner[cut, cut]
+    return asked if asked.any() else nominal
 
 
 def _verdict(defects: list[Defect], regions: list[RegionResult], inspected: np.ndarray, wanted: np.ndarray,
@@ -177,7 +201,8 @@ def _verdict(defects: list[Defect], regions: list[RegionResult], inspected: np.n
     verdicts = {result.verdict for result in regions}
     if defects or Verdict.FAIL in verdicts:
         return Verdict.FAIL
-    if Verdict.NOT_INSPECTED in verdicts or inspected.sum() < request.least_inspected * wanted.sum():
+    least = (LEAST_OF_REGIONS if regions else 1.0) if request.least_inspected is None else request.least_inspected
+    if Verdict.NOT_INSPECTED in verdicts or inspected.sum() < least * wanted.sum():
         return Verdict.NOT_INSPECTED
     return Verdict.UNDECIDED if Verdict.UNDECIDED in verdicts else Verdict.PASS
 

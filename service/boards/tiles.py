@@ -20,7 +20,7 @@ from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
 SPIKE = 6.0
 """σ beyond its neighbours from which on a point is an outlier."""
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
-ANIMALS = (1, 4, 20, 110)
+ANIMALS = (1, 4, 20, 110, 638)
 """The forms that so many pixels side by side, or corner to corner, have."""
 CHANCE = 0.001
 """The expected number of groups of a size in a tile from which on that size comes together by chance."""
@@ -103,12 +103,12 @@ def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> t
     single = np.zeros(used.shape, dtype=bool)
     groups = []
     for sign in (1, -1):
-        up = np.where(used, sign * image, -np.inf)
+        up = np.where(used, sign * image, -np.inf).astype(np.float32)
         second, fourth = (rank_filter(up, -1 - others, footprint=RING, mode="constant", cval=-np.inf) for others in (1, 3))
-        spike = used & (up - second > limit) & np.isfinite(second)
+        spike = used & np.isfinite(second) & (up > second + limit)
         single |= spike
         told[spike] = sign * second[spike]
-        marked = used & (up - fourth > limit) & np.isfinite(fourth)
+        marked = used & np.isfinite(fourth) & (up > fourth + limit)
         labels, count = label(marked, structure=np.ones((3, 3)))
         numbers = np.arange(1, count + 1)
         around = grey_dilation(np.where(marked, -np.inf, up), footprint=RING, mode="constant", cval=-np.inf)

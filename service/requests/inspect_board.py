@@ -14,6 +14,7 @@ class BoardForm(Choice):
 
     PLANE = "plane", "offset and tilt of the board"
     QUADRATIC = "quadratic", "offset, tilt, bow and twist of the board"
+    SPLINE = "spline", "a bending surface, as stiff as stiffness_m says; it takes broad defects with it"
 
 
 class InspectBoardOptions(Options):
@@ -26,6 +27,9 @@ class InspectBoardOptions(Options):
     """Standard deviation of the place of a board in its fixture along x and y, metres. None: 5 pixels."""
     remove: BoardForm = BoardForm.QUADRATIC
     """The form of the board that is removed from the deviations before they are judged."""
+    stiffness_m: Positive | None = None
+    """Distance of the knots of the spline that is removed, metres: waves of three such distances and more go, defects of half of one stay.
+    None: a quarter of the longer side of the board."""
     tolerance_m: NotNegative = 0.0
     """Deviation in metres up to which a place is no defect; in a region of the design, the wider of its limits counts if it is larger."""
     smallest_defect_m: Positive | None = None
@@ -36,8 +40,16 @@ class InspectBoardOptions(Options):
     false_alarm: Annotated[float, Field(gt=0, lt=0.5)] = 0.01
     """Largest probability of any false alarm on a board without defects; the windows of the map, and the regions of a design, each
     have half."""
-    least_inspected: Fraction = 1.0
-    """Least part of the nominal pixels that must be inspected for a board to pass."""
+    least_inspected: Fraction | None = None
+    """Least part that must be inspected for a board to pass: of the pixels of each region that does not say it, and of all nominal pixels;
+    a missing pixel is inspected if no defect of the smallest size hides there. None: 0.9 where there are regions, else 1."""
+
+
+    @model_validator(mode="after")
+    def _stiff(self) -> Self:
+        if self.stiffness_m is not None and self.remove is not BoardForm.SPLINE:
+            raise ValueError(f"stiffness_m: is that of a spline, but remove is {self.remove}: give --remove spline with it")
+        return self
 
 
 class InspectBoardRequest(InspectBoardOptions, DeviceRequest):

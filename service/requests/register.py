@@ -34,6 +34,12 @@ class Markers(Choice):
     APRILTAG16H5, APRILTAG25H9, APRILTAG36H11 = "apriltag16h5", "apriltag25h9", "apriltag36h11"
 
 
+class Accepted(Choice):
+    """Poses that are taken although the evidence is open."""
+
+    LOOK_ALIKE = "look-alike", "of scans that fit as well when they are turned, the pose that matches most, with a σ up to the turned one"
+
+
 class RegisterOptions(Options):
     """Options for registering scans."""
 
@@ -46,6 +52,8 @@ class RegisterOptions(Options):
     scans."""
     least_overlap: Annotated[Fraction, Field(gt=0)] = 0.1
     """Least part of the smaller of two scans that must lie on the surface of the other."""
+    accept: Accepted | None = None
+    """Poses that are taken although the evidence is open. None: they are refused."""
     reference: Line | None = None
     """Name of the scan whose pose stays. None: the first with a pose, or the first."""
     markers: Markers | None = None

@@ -12,7 +12,7 @@ import numpy as np
 from service.errors import RequestError
 from service.reporting.progress import Progress, Timings
 from service.reporting.provenance import REPORT_FILE, report, versions
-from service.requests.register import GivenPoses, RegisterRequest, TableUse
+from service.requests.register import Accepted, GivenPoses, RegisterRequest, TableUse
 from service.scans.duplicates import Distinct, distinct
 from service.scans.kept_scans import KeptScans, ScanFacts, facts_of
 from service.scans.pieces import FolderPieces, SharedPieces, stamps
@@ -164,7 +164,8 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
     known = kept.facts(request, timings.advance)
     missed = _missed(request, known)
     timings.stage("register", 100)
-    options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference, threads=threads)
+    options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
+                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, threads=threads)
     said += missed + _without_viewpoint(listed, known)
     try:
         found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known),

@@ -66,8 +66,8 @@ class Region(Strict):
     """Width and height; of a circle the diameter, twice."""
     tolerance_m: tuple[Finite, Finite]
     """The least and the largest deviation of the mean height, metres."""
-    least_inspected: Fraction = 0.9
-    """The least part of its pixels that must be measured; below, the region is not inspected."""
+    least_inspected: Fraction | None = None
+    """The least part of its pixels that must be measured; below, the region is not inspected. None: as `--least-inspected` says."""
     datum: Literal["board", "surround"] = "board"
     """Against what heights count: the plane of the whole board, or the mean of the ring of half the region's size around it."""
 

@@ -1,5 +1,5 @@
 """Boards with printed solder paste, whose good ones differ as prints do: an S-shaped warp, paste with a texture, pads a little thick or
-displaced, and a sensor whose noise neighbours share, with outliers, one or two together, and missing pixels, behind walls more than elsewhere.
+displaced, and a sensor whose noise neighbours share, with outliers, one or two together, and missing pixels, most behind walls.
 
 It has nothing in common with tests/scenes/board.py but the files that it writes.
 """
@@ -54,7 +54,7 @@ def surface(what: Print, rng: np.random.Generator | None = None) -> np.ndarray:
             continue
         thick = THICK * (1 if what.volume is None or what.volume[0] != number else what.volume[1])
         if rng is not None:
-            thick *= 1 + what.spread * rng.standard_normal()
+            thick *= 1 if what.volume is not None and what.volume[0] == number else 1 + what.spread * rng.standard_normal()
             px, py = px + 1e-4 * what.spread * rng.standard_normal(), py + 1e-4 * what.spread * rng.standard_normal()
         if what.shift is not None and what.shift[0] == number:
             px += what.shift[1]

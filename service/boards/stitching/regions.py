@@ -62,8 +62,9 @@ def tolerances_over(grid: BoardGrid, regions: Sequence[Region], *, elsewhere_m: 
     return out
 
 
-def check_regions(deviation: HeightMap, regions: Sequence[Region], *, false_alarm: float) -> tuple[list[RegionResult], float]:
-    """Decide about every region.
+def check_regions(deviation: HeightMap, regions: Sequence[Region], *, false_alarm: float, least_inspected: float
+                  ) -> tuple[list[RegionResult], float]:
+    """Decide about every region; `least_inspected`: the least part of the pixels of those that do not say it.
 
     With k the threshold of as many one-sided tests as there are limits, a region fails if its mean deviation is more than k σ outside of
     a limit, and passes if it is more than k σ inside of both. So the probability that any region of a good board fails, and the
@@ -74,21 +75,22 @@ def check_regions(deviation: HeightMap, regions: Sequence[Region], *, false_alar
     for region in regions:
         where, inside = pixels_of(region, deviation.grid)
         taken[where] |= inside
-    return [_decide(deviation, region, taken, k) for region in regions], k
+    return [_decide(deviation, region, taken, k, least_inspected if region.least_inspected is None else region.least_inspected)
+            for region in regions], k
 
 
-def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float) -> RegionResult:
+def _decide(deviation: HeightMap, region: Region, taken: np.ndarray, k: float, least: float) -> RegionResult:
     where, inside = pixels_of(region, deviation.grid)
     part = deviation.cut(where)
     mean, count = mean_of(part, inside), int(inside.sum())
-    if mean is None or mean.pixels < region.least_inspected * expected_pixels(region, deviation.grid):
+    if mean is None or mean.pixels < least * expected_pixels(region, deviation.grid):
         return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, 0 if mean is None else mean.pixels)
     value, sigma = mean.value, mean.sigma
     if region.datum == "surround":
         around, ring = pixels_of(region, deviation.grid, grow=1.0)
         whole = deviation.cut(around)
         datum = mean_of(whole, ring & ~taken[around])
-        if datum is None or datum.pixels < region.least_inspected * max(int((ring & ~taken[around]).sum()), 1):
+        if datum is None or datum.pixels < least * max(int((ring & ~taken[around]).sum()), 1):
             return RegionResult(region, Verdict.NOT_INSPECTED, None, None, count, mean.pixels)
         value, sigma = value - datum.value, float(np.hypot(sigma, datum.sigma))
     low, high = region.tolerance_m

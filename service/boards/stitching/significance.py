@@ -12,7 +12,6 @@ size is tested against the spread and middle that its own windows have (the empi
 hypothesis testing", JASA 2004).
 """
 
-import warnings
 from collections.abc import Sequence
 from statistics import NormalDist
 from typing import NamedTuple
@@ -21,8 +20,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import label
 
-from service.boards.stitching.grid import BEND_NOISE, BLOCK_PX, BoardGrid, HeightMap, bends, blocks_of, robust_sigma, shift_error
-from service.boards.stitching.overlap import TUKEY
+from service.boards.stitching.grid import BEND_NOISE, HeightMap, bends, robust_sigma, shift_error
 
 CLIP = 6.0
 ENOUGH_WINDOWS = 100
@@ -42,7 +40,6 @@ CLEAR_BEND = 4.0
 """A second difference counts where it is this many times its noise."""
 MATCH_PX = 0.05
 """The least standard deviation of the shift between two maps, pixels: optics and sampling differ from map to map."""
-ROUNDS = 12
 
 
 class Mean(NamedTuple):
@@ -60,7 +57,8 @@ class Scan(NamedTuple):
 
     significant: np.ndarray  # [rows, cols] bool: pixels of significant windows
     side: np.ndarray  # [rows, cols] int: side of the smallest significant window over a pixel, negative where its mean is; 0 without one
-    mean_sigma: np.ndarray  # [rows, cols] σ of the mean of the smallest window around each pixel, metres; NaN with too few measured
+    mean_sigma: np.ndarray  # [rows, cols] σ of the mean of the smallest window around each pixel, at the border of that which ends there,
+    #                         metres; NaN with too few measured
     findable: np.ndarray  # [rows, cols] deviation that is found in that window with a probability of 95 %, metres
     score: np.ndarray  # [rows, cols] the largest |mean| less tolerance over σ of the windows around a pixel
     sides_px: tuple[int, ...]
@@ -129,8 +127,8 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
         if usable.any():
             detectable[side] = float(np.median(allowed[usable] + (limit + POWER) * wide[usable]))
         if side == sides[0]:
-            mean_sigma = _centred(sigma, side, shape)
-            findable = _centred(allowed + (limit + POWER) * wide, side, shape)
+            mean_sigma = _nearest(sigma, side)
+            findable = _nearest(allowed + (limit + POWER) * wide, side)
         score = np.fmax(score, _centred(beyond, side, shape))
         for sign in (1, -1):
             found[_covered((beyond >= limit) & (sign * value > 0), side, shape) & (found == 0)] = sign * side
@@ -138,8 +136,8 @@ def scan_windows(deviation: HeightMap, *, tolerance_m: float | np.ndarray, false
 
 
 def _carried_by_few(heights: np.ndarray, known: np.ndarray, mean: np.ndarray, windows: np.ndarray) -> np.ndarray:
-    """Return which of some windows, [rows, cols] bool by their first pixels, deviate by outliers alone: a third of their pixels lies below a
-    part of their mean, where a defect of their size that lies between pixels has half of its depth."""
+    """Return which of some windows, [rows, cols] bool by their first pixels, deviate by outliers alone: a third of their pixels lies
+    below a part of their mean, where a defect of their size that lies between pixels has half of its depth."""
     side = heights.shape[0] - windows.shape[0] + 1
     out = np.zeros_like(windows)
     places = np.argwhere(windows)
@@ -215,6 +213,12 @@ def _centred(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray
     return out
 
 
+def _nearest(windows: np.ndarray, side: int) -> np.ndarray:
+    """Return values of windows at their middle pixels, and of the outermost windows from there to the border, [rows, cols]."""
+    first = (side - 1) // 2
+    return np.pad(windows, ((first, side - 1 - first),) * 2, mode="edge")
+
+
 def _covered(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray:
     """Return the pixels that any of the marked windows covers, [rows, cols] bool."""
     if not windows.any():
@@ -222,16 +226,6 @@ def _covered(windows: np.ndarray, side: int, shape: Sequence[int]) -> np.ndarray
     padded = np.zeros((shape[0] + side - 1, shape[1] + side - 1))
     padded[side - 1 : side - 1 + windows.shape[0], side - 1 : side - 1 + windows.shape[1]] = windows
     return _sums(padded, side)[: shape[0], : shape[1]] > 0.5
-
-
-class Form(NamedTuple):
-    """A plane or a quadratic surface: coefficients of 1, x, y and, for the latter, x², x·y, y²; x and y run from -1 to 1 over a board."""
-
-    coefficients: np.ndarray
-
-    def over(self, grid: BoardGrid) -> np.ndarray:
-        """Return its heights on a grid, [rows, cols] metres."""
-        return np.asarray(np.tensordot(self.coefficients, _basis(*_unit(grid), count=len(self.coefficients)), axes=1))
 
 
 def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[float, float]) -> HeightMap:
@@ -253,46 +247,3 @@ def compare(measured: HeightMap, nominal: HeightMap, *, shift_sigma_m: tuple[flo
     edges += shift_error((whole + seen) / 2, (right, up), noise) ** 2
     systematic = np.sqrt(measured.systematic**2 + nominal.systematic**2 + edges)
     return HeightMap(measured.grid, deviation, variance, np.where(known, systematic, np.nan))
-
-
-def fit_form(grid: BoardGrid, height: np.ndarray, *, quadratic: bool) -> Form:
-    """Fit a plane, or a quadratic surface with bow and twist, to the medians of blocks of heights by Tukey's weights, so that defects do
-    not move it; heights are NaN where missing."""
-    side = max(1, min(BLOCK_PX, *(length // 6 for length in height.shape)))
-    x, y = _unit(grid)
-    blocks = blocks_of(height, side)
-    count = np.isfinite(blocks).sum(axis=(2, 3))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of blocks without any height, whose count is 0
-        middle = np.nanmedian(blocks, axis=(2, 3))
-    used = count >= max(1, side * side // 4)
-    places = [blocks_of(np.broadcast_to(values, height.shape), side).mean(axis=(2, 3))[used] for values in (x, y)]
-    values, basis = middle[used], _basis(places[0], places[1], count=6 if quadratic else 3)
-    weight = np.ones_like(values)
-    coefficients = np.zeros(len(basis))
-    for _ in range(ROUNDS):
-        root = np.sqrt(weight)
-        coefficients = np.linalg.lstsq((basis * root).T, values * root, rcond=None)[0]
-        left = values - coefficients @ basis
-        scale = max(robust_sigma(left), 1e-12)
-        weight = np.square(np.clip(1 - np.square(left / (TUKEY * scale)), 0, None))
-    return Form(coefficients)
-
-
-def bow_and_twist(form: Form, grid: BoardGrid) -> float:
-    """Return the largest distance of a quadratic form from the plane nearest to it, metres."""
-    height = form.over(grid)
-    x, y = _unit(grid)
-    plane = _basis(np.broadcast_to(x, height.shape).ravel(), np.broadcast_to(y, height.shape).ravel(), count=3)
-    return float(np.abs(height.ravel() - np.linalg.lstsq(plane.T, height.ravel(), rcond=None)[0] @ plane).max())
-
-
-def _unit(grid: BoardGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Return x [1, cols] and y [rows, 1] of pixel centres from -1 to 1."""
-    return ((np.arange(grid.cols) + 0.5) / grid.cols * 2 - 1)[None], (1 - (np.arange(grid.rows) + 0.5) / grid.rows * 2)[:, None]
-
-
-def _basis(x: np.ndarray, y: np.ndarray, *, count: int) -> np.ndarray:
-    """Return the first terms of a quadratic surface, [count, …]."""
-    one = np.ones(np.broadcast_shapes(x.shape, y.shape))
-    return np.stack([one, x * one, y * one, x * x * one, x * y * one, y * y * one][:count])

@@ -1,26 +1,19 @@
-"""Find why a scan could not be joined: it fits mirrored or in another unit; find scans whose scale is not that of the others,
-and scans that look much the same when they are turned about an axis, so that little tells one pose from another."""
+"""Find why a scan could not be joined: it fits mirrored or in another unit; find scans whose scale is not that of the others."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from service.scans.points.rigid import screwed
 from service.scans.points.scan import Scan
-from service.scans.registration.coarse import is_near
-from service.scans.registration.fine import fit
-from service.scans.registration.pair_tasks import overlap_of
 from service.scans.registration.pairs import (
     SCALE_LEAST,
     SCALE_SIGMAS,
     Pair,
     PairState,
     Prepared,
-    fits_roughly,
     prepare,
     search,
-    step_units,
 )
 
 FACTORS = {0.001: "as if it were in millimetres", 0.01: "as if it were in centimetres", 0.0254: "as if it were in inches",
@@ -32,11 +25,6 @@ FACTOR_SPAN = 4.0
 """Factor by which the extent of a scan in the right unit may differ from that of the others."""
 MOST_TRIED = 24
 """The most scans that a scan is tried against."""
-TURNS_DEG = (-90.0, -60.0, 60.0, 90.0)
-"""Turns from which a scan is fitted to itself. A body that its parts tell apart comes back to where it was, or fits badly."""
-LEAST_ALIKE = 0.25
-"""The least part of a scan that lies on itself after such a turn: half of what is seen leaves the sight of the camera. Of a vase it is .43
-and more, of the statue of tests/scenes .28 to .48."""
 
 
 def odd_scans(extents: Sequence[float]) -> set[int]:
@@ -97,21 +85,3 @@ def odd_scales(pairs: Iterable[Pair], numbers: Sequence[int]) -> dict[int, float
     found -= np.median(found)
     return {number: 1 + float(found[k]) for number, k in place.items()
             if abs(found[k]) > max(SCALE_SIGMAS * float(spread[k]), SCALE_LEAST)}
-
-
-def looks_alike_turned(scan: Prepared, cell_m: float) -> bool:
-    """Return whether a good part of a scan lies on itself after a turn about the axis about which its pose is determined least."""
-    here = fit(scan.rough, scan.rough, np.eye(4), [2 * cell_m])
-    if here is None:
-        return False
-    units = step_units(scan)
-    _, axes = np.linalg.eigh(here.normal * np.outer(units, units))
-    twist = units * next(axis for axis in axes.T if np.linalg.norm(axis[:3]) > 0.5)
-    for turn in np.radians(TURNS_DEG):
-        start = screwed(turn * twist / np.linalg.norm(twist[:3]), here.pivot, np.eye(4))
-        found = fit(scan.rough, scan.rough, start, [4 * cell_m, 2 * cell_m])
-        if found is None or is_near(found.pose, np.eye(4), scan.rough.middle, cell_m) or not fits_roughly(found, scan, scan, cell_m):
-            continue
-        if overlap_of(scan, scan, found.pose, cell_m) >= LEAST_ALIKE:
-            return True
-    return False

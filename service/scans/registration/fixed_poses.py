@@ -10,8 +10,8 @@ import numpy as np
 from service.scans.points.rigid import inverse, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.extent import CELLS_ACROSS, extent_of
-from service.scans.registration.pair_tasks import NOT_THERE, START_CELLS, overlap_of
-from service.scans.registration.pairs import Pair, PairState, prepare, refine
+from service.scans.registration.pair_tasks import NOT_THERE, START_CELLS
+from service.scans.registration.pairs import Pair, PairState, overlap_of, prepare, refine
 
 WRONG_SIGMAS, WRONG_PART = 5.0, 1e-4
 """A pair contradicts the poses if it differs by so many standard deviations and by this part of the extent of the scans, also as a turn."""

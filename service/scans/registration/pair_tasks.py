@@ -8,7 +8,18 @@ import numpy as np
 from service.scans.points.cloud import Thinned, cloud_of, thin
 from service.scans.points.rigid import applied, inverse
 from service.scans.registration.coarse import fpfh
-from service.scans.registration.pairs import FEATURE_CELLS, FINE_POINTS, ROUGH_POINTS, Pair, PairState, Prepared, refine, search
+from service.scans.registration.look_alikes import told_from_turned
+from service.scans.registration.pairs import (
+    FEATURE_CELLS,
+    FINE_POINTS,
+    ROUGH_POINTS,
+    Pair,
+    PairState,
+    Prepared,
+    overlap_of,
+    refine,
+    search,
+)
 
 START_CELLS, NEAR_CELLS = 2.0, 1.0
 """Points of two scans overlap, at starts or at poses that were found, if they are at most this many cells apart."""
@@ -31,6 +42,8 @@ class PairTask(NamedTuple):
     """Points overlap at the start if they are at most this many cells apart."""
     may_search: bool
     """True if the pose is searched if the start does not lead to one."""
+    accept_alike: bool = False
+    """True if a pose that was searched is taken although the scans fit as well when they are turned."""
 
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:
@@ -53,15 +66,8 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
         pair = refine(a, b, task.start, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
         if not task.may_search or pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
             return pair
-    return search(a, b, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
-
-
-def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
-    """Return which part of the smaller of two scans lies within a distance of the other at a pose a_from_b, facing the same way."""
-    placed = applied(pose, b.rough.points)
-    index, distance = a.rough.tree.nearest(placed)
-    facing = np.einsum("ni,ni->n", b.rough.normals @ pose[:3, :3].T, a.rough.normals[index[:, 0]]) > 0.5
-    return float(((distance[:, 0] < near_m) & facing).sum() / min(len(a.rough.points), len(b.rough.points)))
+    return told_from_turned(a, b, search(a, b, numbers=numbers, cell_m=cell, least_overlap=least_overlap), cell_m=cell,
+                            least_overlap=least_overlap, accept=task.accept_alike)
 
 
 def _part_around(large: Prepared, small: Prepared, start: np.ndarray, cell_m: float) -> tuple[Prepared, float]:

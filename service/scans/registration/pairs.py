@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
-from service.scans.points.rigid import inverse, moved, step_between
+from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
 from service.scans.registration.fine import TUKEY, Fit, fit
@@ -92,7 +92,7 @@ class Pair(NamedTuple):
     """Part of the smaller scan's surface that is matched; by targets, the part of the common ones that keep their distances."""
     contradicted: float
     reason: str
-    """The reason why the pair was refused, in words; empty for a joined pair."""
+    """The reason why the pair was refused, in words, or what was accepted; empty for other joined pairs."""
     by: Evidence = Evidence.SURFACES
 
 
@@ -172,9 +172,9 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     """Return the best pair of poses that are tried; `from_start`: of the one that is given, so that others far from it are none."""
     found: list[Pair] = []
     for pose in poses:
-        settled = _fitted(a, b, pose, cell_m)
-        pair = None if settled is None else _judged(a, b, settled, numbers, least_overlap)
-        if pair is not None and not any(_same(pair, other, b, cell_m) for other in found):
+        settled = fitted(a, b, pose, cell_m)
+        pair = None if settled is None else judged(a, b, settled, numbers, least_overlap)
+        if pair is not None and not any(same(pair, other, b, cell_m) for other in found):
             found.append(pair)
     if not found:
         return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "no pose brings enough of the two surfaces together")
@@ -191,13 +191,13 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     return tried
 
 
-def _fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
+def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
     """Return the fit of so many points at the fine scale from a start; None if there is none."""
     spacing = max(a.spacing, b.spacing)
     return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most)
 
 
-def _judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
+def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
     """Return the pair at the pose of a fit at the fine scale."""
     spacing = max(a.spacing, b.spacing)
     area = found.matches / len(b.fine.sample) * b.area
@@ -220,7 +220,12 @@ def _judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], leas
 def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
     """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
     other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
-    doubt = np.zeros(6) if other is None else step_between(other.pose @ inverse(found.pose), found.pivot)
+    return found if other is None else doubted(found, other.pose)
+
+
+def doubted(found: Fit, pose: np.ndarray) -> Fit:
+    """Return a fit whose σ holds the motion to another pose, as a doubt beside the noise."""
+    doubt = step_between(pose @ inverse(found.pose), found.pivot)
     pull = found.information @ doubt
     return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
 
@@ -256,10 +261,18 @@ def _left_behind(a: Prepared, b: Prepared, best: Pair, steps: list[np.ndarray], 
     left: list[np.ndarray] = []
     for shift in shifts:
         start = moved(shift * np.sum(steps, axis=0), best.fit.pivot, best.fit.pose)
-        found = _fitted(a, b, start, reach, TRIED_POINTS)
+        found = fitted(a, b, start, reach, TRIED_POINTS)
         if found is not None:
             left += [step for step in steps if _kept(found, best.fit, step) / shift > KEPT and not any(step is other for other in left)]
     return left
+
+
+def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
+    """Return which part of the smaller of two scans lies within a distance of the other at a pose a_from_b, facing the same way."""
+    placed = applied(pose, b.rough.points)
+    index, distance = a.rough.tree.nearest(placed)
+    facing = np.einsum("ni,ni->n", b.rough.normals @ pose[:3, :3].T, a.rough.normals[index[:, 0]]) > 0.5
+    return float(((distance[:, 0] < near_m) & facing).sum() / min(len(a.rough.points), len(b.rough.points)))
 
 
 def step_units(scan: Prepared) -> np.ndarray:
@@ -274,11 +287,11 @@ def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: floa
     for shift in SHIFTS:
         start, found = moved(shift * step, best.fit.pivot, best.fit.pose), None
         for most in (TRIED_POINTS, None):
-            found = _fitted(a, b, start, cell_m, most)
+            found = fitted(a, b, start, cell_m, most)
             if found is None or _kept(found, best.fit, step) / shift <= KEPT:
                 break
         else:
-            if found is not None and _as_good(_judged(a, b, found, (best.a, best.b), least_overlap), best):
+            if found is not None and _as_good(judged(a, b, found, (best.a, best.b), least_overlap), best):
                 return True
     return False
 
@@ -294,6 +307,7 @@ def _as_good(pair: Pair, best: Pair) -> bool:
             and pair.contradicted <= best.contradicted + MORE_CONTRADICTED)
 
 
-def _same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:
+def same(pair: Pair, other: Pair, b: Prepared, cell_m: float) -> bool:
+    """Return whether the poses of two pairs put scan b in about the same place."""
     assert pair.fit is not None and other.fit is not None
     return is_near(pair.fit.pose, other.fit.pose, b.rough.middle, cell_m)

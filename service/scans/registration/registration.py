@@ -17,9 +17,10 @@ from service.scans.points.rigid import inverse
 from service.scans.points.scan import Scan, Target
 from service.scans.registration.candidates import ALL_PAIRS, PARTNERS, Outline, Overlaps, likeness, most_alike, outline_of, overlapping
 from service.scans.registration.covariance import covariances, rows_of
-from service.scans.registration.diagnosis import looks_alike_turned, odd_scales, why_alone
+from service.scans.registration.diagnosis import odd_scales, why_alone
 from service.scans.registration.extent import CELLS_ACROSS, cells_of, extent_of, usual_extent
 from service.scans.registration.fine import Rows
+from service.scans.registration.look_alikes import looks_alike_turned
 from service.scans.registration.pair_tasks import NEAR_CELLS, NOT_THERE, START_CELLS, PairTask, register_pair
 from service.scans.registration.pairs import Evidence, Pair, PairState, Prepared, prepare
 from service.scans.registration.pose_graph import REFUSED, Edge, Solved, joined_groups, solve, tree_poses
@@ -42,6 +43,8 @@ class RegistrationOptions:
     """The least part of the smaller of two scans that must be matched."""
     reference: int | None = None
     """The scan whose pose is fixed; None: the first with a start, or the first."""
+    accept_alike: bool = False
+    """Whether a pose is taken although turned ones pass all tests as well."""
     threads: int = 1
     """Pairs that are registered at one time."""
 
@@ -158,7 +161,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
             break
         for pair in further:
             del unlike[pair]
-        pairs |= registered([PairTask(a, b, None, 0.0, True) for a, b in further], 0.75, 0.9)
+        pairs |= registered([PairTask(a, b, None, 0.0, True, options.accept_alike) for a, b in further], 0.75, 0.9)
         solved, kept = solve_all()
     advance(0.9)
     joined = solved.poses if solved is not None else {}
@@ -168,8 +171,9 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
     alone = {}
     for number in sorted(set(range(count)) - set(joined or basis)):
         others = [partial(work.ready, other) for other in sorted(basis, key=lambda other: abs(other - number))]
-        words = why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
-                          least_overlap=options.least_overlap)
+        open_ = any(pair.state is PairState.AMBIGUOUS and number in (pair.a, pair.b) for pair in pairs.values())
+        words = None if open_ else why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
+                                             least_overlap=options.least_overlap)  # what looks alike turned does so mirrored
         alone[number] = (words or _refusal(number, names, pairs.values())) + _refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:
@@ -233,12 +237,12 @@ def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | Non
     for a, b in combinations(sorted(outlines), 2):
         first, second = known.get(a), known.get(b)
         if (a, b) in targeted and (fit := targeted[a, b].fit) is not None:
-            tasks.append(PairTask(a, b, fit.pose, START_CELLS, True))
+            tasks.append(PairTask(a, b, fit.pose, START_CELLS, True, options.accept_alike))
         elif first is None or second is None:
             if count <= ALL_PAIRS:
-                tasks.append(PairTask(a, b, None, 0.0, True))
+                tasks.append(PairTask(a, b, None, 0.0, True, options.accept_alike))
         elif (a, b) in near:
-            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS))
+            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS, options.accept_alike))
         elif count <= ALL_PAIRS:
             pairs[a, b] = Pair(a, b, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
     pairs |= registered(tasks, 0.15, 0.75)

@@ -10,8 +10,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from service.boards.findings import find_defects
+from service.boards.stitching.form import fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
-from service.boards.stitching.significance import compare, fit_form, scan_windows
+from service.boards.stitching.significance import compare, scan_windows
 from service.boards.tiles import without_spikes
 from stage.formats import exr
 from tests.scenes.board import PIXEL, SIGMA, domes, scan, write_scan
@@ -279,3 +280,22 @@ def test_a_narrow_chip_is_found_though_each_of_its_pixels_is_near_a_wall():
     golden.height[...] += gaussian_filter(chip, 0.7)
     found, _ = defects(board_of(41, shared=0.5, warp=1e-5), golden, shift_sigma_m=4e-5)
     assert found[0].deviation_m == pytest.approx(-1.2e-3, rel=0.1) and found[0].area.pixels == pytest.approx(150, abs=35)
+
+
+def test_outliers_side_by_side_are_none_and_lines_and_squares_stay():
+    """A hundredth of the pixels are outliers, so that two and three come together; a line and a square of three are something."""
+    rng = np.random.default_rng(50)
+    truth = np.zeros((120, 140))
+    truth[30:33, 40:43], truth[80, 20:60] = 20 * NOISE, 20 * NOISE
+    seen = truth + NOISE * rng.standard_normal(truth.shape)
+    wild = (rng.random(truth.shape) < 0.01) & (truth == 0)
+    wild[60, 70:73] = wild[10:12, 100] = wild[100:102, 90:92] = True
+    seen[wild] -= 15 * NOISE
+    used = (rng.random(truth.shape) > 0.002) | (truth > 0)
+    told, sigma = without_spikes(seen[used].astype(np.float32), np.full(used.sum(), NOISE), used)
+    image, wide = np.full(truth.shape, np.nan), np.full(truth.shape, np.nan)
+    image[used], wide[used] = told, sigma
+    groups = np.zeros(truth.shape, dtype=bool)
+    groups[60, 70:73] = groups[10:12, 100] = groups[100:102, 90:92] = True
+    assert np.nanmax(np.abs(image[groups])) < 5 * NOISE and np.nanmin(wide[groups]) > 8 * NOISE
+    assert image[30:33, 40:43].min() > 15 * NOISE and image[80, 22:58].min() > 15 * NOISE

@@ -162,10 +162,12 @@ def test_a_vase_is_refused_and_placed_by_a_fixed_turntable(relit, tmp_path):
 
 def test_a_body_that_looks_alike_when_it_is_turned_is_named(relit, tmp_path):
     seen = views(urn, 0, 90)
-    outcome = relit("register", write(tmp_path / "set", seen), "--out", tmp_path / "out")
+    assert "fits as well when it is turned" in relit.refused("register", write(tmp_path / "set", seen), "--out", tmp_path / "none")
+    outcome = relit("register", tmp_path / "set", "--out", tmp_path / "out", "--accept", "look-alike")
     assert outcome.code == 0, outcome.err
     assert "s0, s1: look much the same when they are turned about an" in outcome.out + outcome.err
     assert json.loads((tmp_path / "out" / "report.json").read_text())["alike_turned"] == ["s0", "s1"]
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["scans"][1]["pose_sigma_degrees"] > 45
 
 
 @pytest.mark.parametrize(("change", "sentence"), [

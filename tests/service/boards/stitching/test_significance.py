@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from service.boards.stitching.form import bow_and_twist, fit_form
 from service.boards.stitching.grid import BoardGrid, HeightMap
 from service.boards.stitching.regions import Verdict, check_regions
-from service.boards.stitching.significance import bow_and_twist, compare, fit_form, mean_of, scan_windows, threshold
+from service.boards.stitching.significance import compare, mean_of, scan_windows, threshold
 from stage.sets.board import Region
 
 GRID = BoardGrid(1e-5, 0.0, 1e-3, 100, 120)
@@ -66,7 +67,8 @@ def region(**changes) -> Region:
 def test_a_region_passes_or_fails_by_more_than_its_uncertainty(offset, shared, verdict):
     """The mean of 100 pixels has 0.1 σ of noise, k is 2.8: ± 0.28 µm around ± 2 µm; a shared error of 1 µm leaves nothing decided."""
     deviation = noise(6, shared=shared * SIGMA)
-    results, k = check_regions(deviation._replace(height=deviation.height + offset * SIGMA), [region()], false_alarm=0.005)
+    moved = deviation._replace(height=deviation.height + offset * SIGMA)
+    results, k = check_regions(moved, [region()], false_alarm=0.005, least_inspected=0.9)
     assert results[0].verdict is verdict
     assert k == pytest.approx(threshold(0.005, 2, sides=1))
 
@@ -74,22 +76,22 @@ def test_a_region_passes_or_fails_by_more_than_its_uncertainty(offset, shared, v
 def test_a_region_that_is_not_measured_never_passes():
     deviation = noise(7)
     deviation.height[45:55, 55:60] = np.nan
-    assert check_regions(deviation, [region()], false_alarm=0.005)[0][0].verdict is Verdict.NOT_INSPECTED
+    assert check_regions(deviation, [region()], false_alarm=0.005, least_inspected=0.9)[0][0].verdict is Verdict.NOT_INSPECTED
     deviation.height[:] = np.nan
-    assert check_regions(deviation, [region()], false_alarm=0.005)[0][0].verdict is Verdict.NOT_INSPECTED
+    assert check_regions(deviation, [region()], false_alarm=0.005, least_inspected=0.9)[0][0].verdict is Verdict.NOT_INSPECTED
 
 
 def test_a_region_may_count_from_what_surrounds_it():
     """A board that is 5 µm high there passes with the datum around it, and fails with that of the whole board."""
     deviation = noise(8)
     deviation.height[30:70, 40:80] += 5e-6
-    assert check_regions(deviation, [region()], false_alarm=0.005)[0][0].verdict is Verdict.FAIL
-    assert check_regions(deviation, [region(datum="surround")], false_alarm=0.005)[0][0].verdict is Verdict.PASS
+    assert check_regions(deviation, [region()], false_alarm=0.005, least_inspected=0.9)[0][0].verdict is Verdict.FAIL
+    assert check_regions(deviation, [region(datum="surround")], false_alarm=0.005, least_inspected=0.9)[0][0].verdict is Verdict.PASS
 
 
 def test_circles_hold_the_pixels_of_a_circle():
     """A disc of 40 pixels across has π/4 · 1600 pixels; their count is exact to the pixels that its outline cuts."""
-    results, _ = check_regions(noise(9), [region(shape="circle", size_m=(4e-4, 4e-4))], false_alarm=0.005)
+    results, _ = check_regions(noise(9), [region(shape="circle", size_m=(4e-4, 4e-4))], false_alarm=0.005, least_inspected=0.9)
     assert results[0].pixels == pytest.approx(np.pi * 400, rel=0.02)
 
 
