@@ -164,7 +164,7 @@ def _judge(board: BoardTiles, stitched: Stitched, nominal: Nominal, request: Ins
                              "would take away: give a larger one, or a smaller --smallest-defect-m")
         spline = fit_spline(grid, deviation.height, knots_m=stiffness)
         deviation = deviation._replace(height=deviation.height - spline.over(grid),
-                                       systematic=np.hypot(deviation.systematic, spline.sigma))
+                                       systematic=np.hypot(deviation.systematic, spline.sigma(grid)))
     else:
         deviation = deviation._replace(height=deviation.height - (curved if request.remove is BoardForm.QUADRATIC else plane).over(grid))
     heights = heights._replace(height=heights.height - plane.over(grid))
