@@ -11,7 +11,19 @@ import numpy as np
 from service.scans.points.rigid import inverse, screwed
 from service.scans.registration.coarse import is_near
 from service.scans.registration.fine import fit
-from service.scans.registration.pairs import Pair, PairState, Prepared, doubted, fits_roughly, fitted, judged, overlap_of, same, step_units
+from service.scans.registration.pairs import (
+    AS_GOOD,
+    Pair,
+    PairState,
+    Prepared,
+    doubted,
+    fits_roughly,
+    fitted,
+    judged,
+    overlap_of,
+    same,
+    step_units,
+)
 
 TURNS_DEG = (-90.0, -60.0, 60.0, 90.0)
 """Turns from which a scan is fitted to itself. A body that its parts tell apart comes back to where it was, or fits badly."""
@@ -42,7 +54,7 @@ def told_from_turned(a: Prepared, b: Prepared, best: Pair, *, cell_m: float, lea
         if found is None:
             continue
         rival = judged(a, b, found, (best.a, best.b), least_overlap)
-        if rival.state is not PairState.JOINED or same(rival, best, b, cell_m):
+        if rival.state is not PairState.JOINED or found.ratio > AS_GOOD * best.fit.ratio or same(rival, best, b, cell_m):
             continue
         cosine = (np.trace(found.pose[:3, :3] @ best.fit.pose[:3, :3].T) - 1) / 2
         words = (f"it fits as well when it is turned by {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.0f}°, with {rival.overlap:.0%} of "
