@@ -54,7 +54,8 @@ def told_from_turned(a: Prepared, b: Prepared, best: Pair, *, cell_m: float, lea
         if found is None:
             continue
         rival = judged(a, b, found, (best.a, best.b), least_overlap)
-        if rival.state is not PairState.JOINED or found.ratio > AS_GOOD * best.fit.ratio or same(rival, best, b, cell_m):
+        worse = a.image is None and b.image is None and found.ratio > AS_GOOD * best.fit.ratio  # points alone know no free space
+        if rival.state is not PairState.JOINED or worse or same(rival, best, b, cell_m):
             continue
         cosine = (np.trace(found.pose[:3, :3] @ best.fit.pose[:3, :3].T) - 1) / 2
         words = (f"it fits as well when it is turned by {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.0f}°, with {rival.overlap:.0%} of "
