@@ -17,7 +17,7 @@ from service.acquisition.acquire import acquire, refuse_to_ask
 from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
 from service.errors import RequestError
-from service.play.addresses import driven_universes
+from service.play.show import driven_universes
 from service.requests.acquire import AcquireRequest
 from service.twin.listener import Listener
 from stage.capture.capture import Capture
