@@ -246,6 +246,7 @@ class Acquisition:
             self._accept(shot, picture, faults)
             self._own.append(released - began - self.plan.settle_s + time.perf_counter() - came)
             return
+        self._await(shot, owed, stopping)
 
     def _refuse_darkness(self, shot: Shot, picture: Picture, faults: list[Fault], attempt: int) -> None:
         """Raise RequestError where two lamps did not light, at every attempt, and none has yet."""
@@ -274,6 +275,9 @@ class Acquisition:
         return self._request.color_space or color_space_of(path), self._request.saturation or FULL_SCALE
 
     def _accept(self, shot: Shot, picture: Picture, faults: list[Fault]) -> None:
+        if (wrong := self._files.wrong_size(picture.path)) is not None:
+            self.journal.picture(shot.key, "rejected", {**self._files.reject(shot, picture.path, 0), **said(faults)})
+            raise RequestError(wrong)
         self.judge.accept(shot, picture.pixels, *self._encoding(picture.path), faults)
         self.faults[shot.key] = faults
         self.journal.picture(shot.key, "taken", {**self._files.keep(shot, picture.path), **said(faults)})

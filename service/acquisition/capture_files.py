@@ -54,6 +54,15 @@ class CaptureFiles:
                 target.write(part)
         return {"file": path.relative_to(self._folder).as_posix(), "source": picture.name, "sha256": digest.hexdigest()}
 
+    def wrong_size(self, picture: Path) -> str | None:
+        """Return a sentence if the camera of the rig has another resolution than a picture."""
+        camera, (columns, rows) = self._rig.camera, image_resolution(picture)
+        if camera is None or camera.resolution == (columns, rows):
+            return None
+        width, height = camera.resolution
+        return (f"camera.resolution of the rig {self._rig.name} is {width}x{height}, the picture {picture.name} has {columns}x{rows}: "
+                "set the camera to the size for which it was calibrated")
+
     def reject(self, shot: Shot, picture: Path, attempt: int) -> dict[str, Any]:
         """Keep the file of a picture that is taken again among the rejected ones, and return what the journal says of it."""
         path = self._folder / REJECTED / f"{shot.key.replace('/', '_')}.{attempt}{picture.suffix.lower()}"
@@ -92,16 +101,12 @@ class CaptureFiles:
             return
         place = self._folder / folder
         first = place / names[0]
-        resolution = image_resolution(first)
-        camera = self._rig.camera
-        if camera is not None and camera.resolution != resolution:
-            (width, height), (columns, rows) = camera.resolution, resolution
-            raise RequestError(f"camera.resolution of the rig {self._rig.name} is {width}x{height}, the picture {first.name} has "
-                               f"{columns}x{rows}: set the camera to the size for which it was calibrated")
+        if (wrong := self.wrong_size(first)) is not None:
+            raise RequestError(wrong)
         space = self._color_space or color_space_of(first)
         manifest = Manifest.model_validate({
             "schema": SCHEMA, "name": folder or self._folder.resolve().name, "color_space": space,
-            "camera": camera or View().entry(resolution), "flat": flat, "saturation": self._saturation, "mask": mask,
+            "camera": self._rig.camera or View().entry(image_resolution(first)), "flat": flat, "saturation": self._saturation, "mask": mask,
             "assumed": (*assumed, *assumed_encoding(space, self._color_space)), "irradiance_scale": "relative", "frames": tuple(frames)})
         write_manifest(manifest, place / FILE_NAME)
 

@@ -12,7 +12,8 @@ from scipy import ndimage
 from service.acquisition.cameras.camera import Camera, NoPictureError, Setup, open_camera
 from service.acquisition.capture_files import JOURNAL_FILE
 from service.acquisition.checks.judge import FULL_SCALE
-from service.acquisition.checks.picture_sample import TILE_PX, bands_of, place_of_tile
+from service.acquisition.checks.motion import bands_of
+from service.acquisition.checks.picture_sample import TILE_PX, place_of_tile
 from service.acquisition.lights.lights import Ask, Lights
 from service.acquisition.plans.plan import read_plan
 from service.acquisition.plans.shots import Shot, shots_of
@@ -225,7 +226,7 @@ def zebra(pixels: np.ndarray, space: str, full: float, review: Review = AS_EVER)
 
 def focus_of(tile: np.ndarray) -> float:
     """Return the contrast of the finest details of a tile, [rows, cols] linear, over that of coarser ones."""
-    fine, coarse = (float(band.std()) for band in bands_of(tile))
+    fine, coarse, _ = (float(band.std()) for band in bands_of(tile))
     return fine / max(coarse, 1e-12)
 
 

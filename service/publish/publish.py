@@ -15,10 +15,11 @@ from service.publish.iiif import MANIFEST_FILE, write_iiif
 from service.publish.planes import INFO_FILE, write_planes
 from service.publish.web import PAGE_FILE, write_page
 from service.reporting.progress import Progress, Timings
-from service.reporting.provenance import other_inputs
+from service.reporting.provenance import REPORT_FILE, other_inputs
 from service.requests.publish import PublishedAs, PublishRequest
 from service.viewing.result_layers import ResultLayers
 from service.viewing.view_files import result_file
+from stage.capture.manifest import FILE_NAME
 from stage.errors import ManifestError, storage
 from stage.files import replacing_folder, write_text
 
@@ -50,7 +51,7 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
         RequestError: the folder holds something else, or an option does not fit the capture.
         StageError: capture, maps or annotations cannot be used.
     """
-    request = request.model_copy(update={"out": request.out.resolve()})
+    request = _with_capture(request.model_copy(update={"out": request.out.resolve()}))
     _check(request.out)
     timings = Timings(progress)
     device = devices.resolve(request.device)
@@ -84,6 +85,21 @@ def publish(request: PublishRequest, progress: Progress | None = None) -> Publis
     first = {PublishedAs.IIIF: MANIFEST_FILE, PublishedAs.OPENLIME: INFO_FILE, PublishedAs.WEB: PAGE_FILE}[request.kind]
     return PublishResult(request.out / first, len(sizes), sum(sizes), source.near, source.stack.light_count - len(front),
                          loss, () if doubt is None else (doubt,))
+
+
+def _with_capture(request: PublishRequest) -> PublishRequest:
+    """Return the request for the capture of results, whose maps are shown too where pages have them, if it is for a folder of results."""
+    folder = request.capture
+    if (folder / FILE_NAME).exists() or not (folder / REPORT_FILE).is_file():
+        return request
+    try:
+        named = str(json.loads((folder / REPORT_FILE).read_bytes())["inputs"]["capture"])
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise RequestError(f"{folder / REPORT_FILE}: names no capture: give the folder of the capture") from error
+    if not (Path(named) / FILE_NAME).is_file():
+        raise RequestError(f"{folder}: holds results of the capture {named}, which is not there: give the folder of the capture")
+    shown = request.kind is PublishedAs.IIIF and request.maps is None
+    return request.model_copy(update={"capture": Path(named), "maps": folder if shown else request.maps})
 
 
 def _check(out: Path) -> None:

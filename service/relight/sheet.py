@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
+from service.reporting.provenance import colour_configuration
 from stage.colour.colour import pixels_of, through_view
 from stage.colour.colour_spaces import Review
 from stage.colour.configuration import current
@@ -49,14 +50,15 @@ def display_frame(path: Path, frame: Path, review: Review) -> None:
     shown = np.rint(255 * np.clip(through_view(pixels, space, review), 0, 1)).astype(np.uint8)
     view = current().view(review.view)
     with replacing(path) as temporary:
-        write_png(temporary, shown, srgb=view is None or "srgb" in view[0].lower())  # other displays have no name in the file
+        write_png(temporary, shown, srgb=view is None or "srgb" in view[0].lower(),  # other displays have no name in the file
+                  texts=colour_configuration())
 
 
 def write_sheet(path: Path, rows: Sequence[Sequence[tuple[str, np.ndarray]]], *, height: int = TILE) -> None:
     """Write (title, [rows, cols, 3] display values 0…1) of pictures, each scaled to a height in pixels, row by row as one PNG."""
     sheet = _sheet([[(title, fit(image, height)) for title, image in row] for row in rows], height)
     with replacing(path) as temporary:
-        write_png(temporary, np.asarray(sheet.get_pixels(oiio.UINT8)), srgb=True)
+        write_png(temporary, np.asarray(sheet.get_pixels(oiio.UINT8)), srgb=True, texts=colour_configuration())
 
 
 def read_frame(path: Path) -> tuple[np.ndarray, str]:

@@ -47,6 +47,11 @@ def reported_versions() -> dict[str, str]:
     return versions() | {CACHE_ID: current().cache_id}
 
 
+def colour_configuration() -> dict[str, str]:
+    """Return the name and the cache id of the colour configuration, as string attributes of result files."""
+    return {"relit:ocio": current().label, "relit:ocio_cache_id": current().cache_id}
+
+
 def metadata(request: Options, *, capture: str, inputs: str, method: str | None = None, near_lights: int = 0,
              contents: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return string attributes for result files. They are equal for two runs on the same inputs, wherever those are
@@ -63,8 +68,7 @@ def metadata(request: Options, *, capture: str, inputs: str, method: str | None 
         options["method"] = str(method)
     options.update(contents or {})
     found = {"relit:version": __version__, "relit:capture": capture, "relit:inputs": inputs,
-             "relit:options": json.dumps(options, sort_keys=True), "relit:ocio": current().label,
-             "relit:ocio_cache_id": current().cache_id}
+             "relit:options": json.dumps(options, sort_keys=True), **colour_configuration()}
     if near_lights:
         found["relit:lights"] = f"{near_lights} near lights taken as distant, as the object's centre sees them"
     return found

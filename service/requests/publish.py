@@ -28,7 +28,7 @@ class PublishRequest(StackOptions, Request):
     """Publish a capture as a folder of static files, which any web server serves."""
 
     capture: Annotated[Path, Role.INPUT, CAPTURE]
-    """Folder with a capture.json."""
+    """Folder with a capture.json, or with what `relit solve` has made of one: with --as iiif its albedo and normals are shown too."""
     out: Annotated[Path, Role.OUTPUT, Spelling(flag="--to", metavar="DIR")]
     """Folder that is made, or one that this command has made before, which is replaced."""
     kind: Annotated[PublishedAs, Spelling(flag="--as")]

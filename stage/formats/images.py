@@ -1,6 +1,6 @@
 """Reading of images (EXR, PNG, TIFF, HDR, JPEG, JPEG XL, AVIF, DPX, TGA, BMP, PPM, raw), the header first, then pixels; writing of PNG."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -184,14 +184,16 @@ PNG_FILTER_NONE = 8
 difference of noise is more noise; only images of 8 bits are filtered."""
 
 
-def write_png(path: Path, codes: np.ndarray, *, srgb: bool) -> None:
+def write_png(path: Path, codes: np.ndarray, *, srgb: bool, texts: Mapping[str, str] | None = None) -> None:
     """Write a PNG file; `replacing` makes it appear whole or not at all.
     `codes`: [rows, cols] or [rows, cols, 3] uint8 or uint16. `srgb`: True for colours that are encoded in sRGB, False for data that no
-    reader should convert. Raises OSError if the file cannot be written."""
+    reader should convert. `texts`: text chunks by their keywords. Raises OSError if the file cannot be written."""
     pixels = np.ascontiguousarray(codes[..., None] if codes.ndim == 2 else codes)  # two dimensions would be transposed
     rows, cols, channels = pixels.shape
     spec = oiio.ImageSpec(cols, rows, channels, str(codes.dtype))
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if srgb else "data")  # without it the file would claim to be sRGB
+    for keyword, text in (texts or {}).items():
+        spec.attribute(keyword, text)
     if codes.dtype == np.uint16:
         spec.attribute("png:compressionLevel", PNG16_LEVEL)
         spec.attribute("png:filter", PNG_FILTER_NONE)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.acquisition.checks.picture_sample import Bands, Sample
+from service.acquisition.checks.motion import Bands
+from service.acquisition.checks.picture_sample import Sample
 from service.acquisition.plans.shots import Shot
 from service.requests.base.base import Choice
 
@@ -31,6 +32,11 @@ MOST_GAIN = 2.0
 """The largest sum of the sizes of weights: beyond it the direction lies outside of those of the lamps, an extrapolation."""
 FAR_DEGREES = 45.0
 """The largest angle to the fourth nearest lamp at which the lamps on one side say roughly what a picture should be."""
+EXPECTED_GAIN = 0.02
+"""The weight, over that of the picture, with which the part of the prediction is held at 1: under lamps near the camera the
+prediction is like the usual picture, and the two parts could stand for one another."""
+SHADE_PART = 0.1
+"""The reading, as a part of the mean one, below which errors of the prediction count no less."""
 
 
 class FaultKind(Choice):
@@ -38,6 +44,7 @@ class FaultKind(Choice):
 
     CLIPPED = "clipped", "too many readings of the object are at full scale"
     DARK = "too_dark", "the brightest readings are near the noise"
+    BRIGHT = "too_bright", "the picture has far more light than those of the lamps around it"
     UNLIT = "did_not_light", "the light did not come on"
     WRONG_LIGHT = "wrong_light", "another light shone than the plan says"
     DOUBLED = "doubled", "the picture is one that was taken before"
@@ -116,9 +123,20 @@ def expected_blocks(used: list[tuple[np.float32, Seen]]) -> np.ndarray:
 
 def expected_bands(used: list[tuple[np.float32, Seen]]) -> Bands:
     """Return the expected details."""
+    bands = range(len(Bands._fields))
     if used[0][1].shot.lamp is None:
-        return Bands(*(np.median([each.bands[band] for _, each in used], axis=0) for band in (0, 1)))
-    return Bands(*(np.sum([weight * each.bands[band] for weight, each in used], axis=0) for band in (0, 1)))
+        return Bands(*(np.median([each.bands[band] for _, each in used], axis=0) for band in bands))
+    return Bands(*(np.sum([weight * each.bands[band] for weight, each in used], axis=0) for band in bands))
+
+
+def added_part(blocks: np.ndarray, expected: np.ndarray, usual: np.ndarray) -> float:
+    """Return the part b of the usual picture in a picture that is fitted as g expected + b usual, relative errors alike and g near 1."""
+    weight = 1 / (expected + SHADE_PART * usual.mean())
+    seen = usual > 2 * SHADE_PART * usual.mean()
+    columns, found = np.column_stack([expected * weight, usual * weight])[seen], (blocks * weight)[seen]
+    normal, right = columns.T @ columns, columns.T @ found
+    held = EXPECTED_GAIN * normal[0, 0]
+    return float(np.linalg.solve(normal + np.diag([held, 1e-9 * normal[1, 1]]), right + np.array([held, 0]))[1])
 
 
 def lower_quartile(weighted: list[tuple[np.float32, float]]) -> float:

@@ -11,10 +11,12 @@ import numpy as np
 from service.acquisition.checks.expectation import (
     LEAST_LAMPS,
     LEAST_MISFIT,
+    SHADE_PART,
     Expectation,
     Fault,
     FaultKind,
     Seen,
+    added_part,
     comparable,
     expected_bands,
     expected_blocks,
@@ -22,7 +24,8 @@ from service.acquisition.checks.expectation import (
     same_kind,
     unit_root,
 )
-from service.acquisition.checks.picture_sample import Motion, bands_of, motion_between, place_of_tile, sample_of
+from service.acquisition.checks.motion import Bands, bands_of, motion_between, shift_between
+from service.acquisition.checks.picture_sample import place_of_tile, sample_of
 from service.acquisition.checks.unreached import glows, unreached_faults
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig
@@ -43,8 +46,10 @@ AGREEMENT_WEIGHT = 4.0
 """A correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
 NEAR_COSINE = 0.3
 """Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
-MOVED_PX, MOVED_GAIN, MOVED_CORRELATION = 1.5, 1.6, 0.35
-"""A picture has moved if it fits better by this factor, and as well as this, at a shift of more pixels."""
+BRIGHT_GAIN = 2.0
+"""A picture is too bright if it has more than this factor of the light of its prediction and of every picture that this rests on."""
+LEAST_BRIGHT_WEIGHT, BRIGHT_CLIPPED_SHARE = 0.05, 0.001
+"""The weight from which it rests on one, and the share of the lit pixels from which a picture that is too bright is called clipped."""
 COMPARED = 5
 """The most pictures whose details are looked at before it is said that one has moved."""
 BLURRED_CONTRAST, BLURRED_MATCH = 0.75, 0.5
@@ -57,12 +62,8 @@ AMBIENT_GAIN = 1.1
 """Pictures of equal levels may have this factor of the light of the others."""
 SHADE_QUANTILE, DARK_PART = 0.1, 0.1
 """What a dark picture may read above the darkest tenth of the readings under lamps, as a part of their mean."""
-EXPECTED_GAIN = 0.02
-"""The weight, over that of the picture, with which the part of the prediction is held at 1: under lamps near the camera the
-prediction is like the usual picture, and the two parts could stand for one another."""
-SHADE_PART = 0.1
-"""The reading, as a part of the mean one, below which errors of the prediction count no less."""
-
+PREDICTED = (FaultKind.MOVED, FaultKind.UNSHARP, FaultKind.AMBIENT, FaultKind.BRIGHT)
+"""What only a good prediction shows: while pictures come, it is named where lamps all around have theirs."""
 CERTAIN = (FaultKind.DOUBLED, FaultKind.CLIPPED, FaultKind.DARK)
 """What a picture shows by itself."""
 
@@ -95,6 +96,8 @@ class Judge:
         found = [*found, *self._faults(seen, self._others(seen, self._sound()))][:1]
         if found and found[0].kind is FaultKind.UNLIT and glows(seen, self._dark(shot)):
             return []  # as behind the object: all pictures together tell such a lamp from one that failed
+        if found and found[0].kind in PREDICTED and shot.lamp is not None and not self._surrounded(seen, self._others(seen, self._sound())):
+            return []
         return found
 
     def accept(self, shot: Shot, pixels: np.ndarray, space: str, full_scale: float, faults: Sequence[Fault] = ()) -> None:
@@ -116,7 +119,7 @@ class Judge:
     def compare(self, shot: Shot, earlier: np.ndarray, pixels: np.ndarray, space: str, full_scale: float) -> Fault | None:
         """Return what moved between two pictures of one shot, or None."""
         before, after = (self._look(shot, picture, space, full_scale) for picture in (earlier, pixels))
-        return _moved(shot, motion_between(after.bands, before.bands))
+        return _moved(after, before.bands, float(before.sample.blocks.mean()))
 
     def review(self) -> list[Fault]:
         """Return the faults that all pictures together show, one for a picture, the worst first.
@@ -173,7 +176,7 @@ class Judge:
 
     def _exposure_faults(self, seen: Seen) -> Iterator[Fault]:
         shot, sample = seen.shot, seen.sample
-        if sample.clipped > CLIPPED_SHARE:
+        if sample.clipped > CLIPPED_SHARE and not shot.may_clip:
             yield Fault(shot.key, FaultKind.CLIPPED, f"{100 * sample.clipped:.2g} % of the lit pixels are clipped")
         if shot.lamp is None and shot.levels.any() and sample.bright < LEAST_BRIGHT:
             dark = [each.sample.bright for each in self._seen.values() if _is_dark(each.shot)]
@@ -217,13 +220,16 @@ class Judge:
         held = shot.lamp in self._held  # by a person, so that it stands about where the rig says: shading tells no more than that it is on
         if shot.lamp is not None and not held and (twin := self._twin(seen, others)) is not None:
             return [Fault(shot.key, FaultKind.WRONG_LIGHT, f"is lit as {twin} is")]
+        if shot.lamp is not None and (bright := self._bright_fault(seen, used, usual, dark, max(should, least))) is not None:
+            return [bright]
+        moved = None if held or light < least else _moved(seen, expected_bands(used), float(usual.mean()))
+        if moved is not None and self._details_stay(used, others):
+            return [moved]
         if faint:
             return [] if held else self._ambient_faults(seen, others, used, BORDER_AMBIENT_PART)
         if light < least:
             return []
-        motion = motion_between(seen.bands, expected_bands(used))
-        if not held and (moved := _moved(shot, motion)) is not None and self._details_stay(used, others):
-            return [moved]
+        motion = motion_between(seen.bands, expected_bands(used), float(usual.mean()))
         if motion is not None and motion.contrast < BLURRED_CONTRAST and motion.match < BLURRED_MATCH:
             return [Fault(shot.key, FaultKind.UNSHARP, f"details have {100 * motion.contrast:.0f} % of the contrast that they should have")]
         if shot.lamp is not None:
@@ -234,10 +240,26 @@ class Judge:
         """Return the fault of a picture under one lamp that more than a part of the usual picture is added to what is expected of it."""
         if len(others) < LEAST_LAMPS:  # a mean of so few may be darker everywhere than the lamp between them
             return []
-        more = _added(seen.sample.blocks, expected_blocks(used), np.mean([each.sample.blocks for each in others], axis=0))
-        if sum(abs(float(weight)) for weight, _ in used) >= INSIDE_GAIN or not self._expectation.interpolated(seen, others):
+        more = added_part(seen.sample.blocks, expected_blocks(used), np.mean([each.sample.blocks for each in others], axis=0))
+        if not self._surrounded(seen, others):
             part = BORDER_AMBIENT_PART
         return [_ambient(seen.shot, more)] if more > part else []
+
+    def _surrounded(self, seen: Seen, others: list[Seen]) -> bool:
+        """Return whether lamps all around that of a picture say what it should be."""
+        used = self._expectation.weights(seen, others)
+        return (used is not None and sum(abs(float(weight)) for weight, _ in used) < INSIDE_GAIN
+                and self._expectation.interpolated(seen, others))
+
+    def _bright_fault(self, seen: Seen, used: list[tuple[np.float32, Seen]], usual: np.ndarray, dark: np.ndarray | float, should: float
+                      ) -> Fault | None:
+        """Return the fault of a picture of far more light than it should have, shaded as under its lamp and not as usual."""
+        most = max(should, *(float((each.sample.blocks - dark).mean()) for weight, each in used if abs(weight) > LEAST_BRIGHT_WEIGHT))
+        gain = float((seen.sample.blocks - dark).mean()) / max(most, 1e-30)
+        if gain < BRIGHT_GAIN or seen.root @ unit_root(expected_blocks(used)) < seen.root @ unit_root(usual):
+            return None
+        kind = FaultKind.CLIPPED if seen.sample.clipped > BRIGHT_CLIPPED_SHARE else FaultKind.BRIGHT
+        return Fault(seen.shot.key, kind, f"has {gain:.2g} times the light of the others, {100 * seen.sample.clipped:.2g} % of it clipped")
 
     def _few_faults(self, seen: Seen, others: list[Seen], dark: np.ndarray | float) -> list[Fault]:
         """Return the fault of a picture under one of a few lamps, of which none is predicted."""
@@ -252,12 +274,12 @@ class Judge:
 
         Where most do not, details move with the lamps, as the highlight of a glossy object without texture does.
         """
-        shifted = []
+        stay, usual = [], float(np.mean([each.sample.blocks.mean() for each in others]))
         for _, each in sorted(used, key=lambda one: -abs(one[0]))[:COMPARED]:
             weights = self._expectation.weights(each, [other for other in others if other is not each])
-            if weights is not None and (motion := motion_between(each.bands, expected_bands(weights))) is not None:
-                shifted.append(np.hypot(*motion.shift_px) >= MOVED_PX)
-        return 2 * sum(shifted) <= len(shifted)
+            if weights is not None:
+                stay.append(_moved(each, expected_bands(weights), usual) is None)
+        return 2 * sum(stay) >= len(stay)
 
     def _twin(self, seen: Seen, others: list[Seen]) -> str | None:
         """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.
@@ -318,17 +340,6 @@ def _ambient(shot: Shot, more: float) -> Fault:
     return Fault(shot.key, FaultKind.AMBIENT, f"has {100 * more:.2g} % of the light of a usual picture more than it should")
 
 
-def _moved(shot: Shot, motion: Motion | None) -> Fault | None:
-    if motion is None or np.hypot(*motion.shift_px) < MOVED_PX or motion.gain < MOVED_GAIN or motion.correlation < MOVED_CORRELATION:
-        return None
-    return Fault(shot.key, FaultKind.MOVED, "everything is shifted by {:.0f}, {:.0f} pixels".format(*motion.shift_px))
-
-
-def _added(blocks: np.ndarray, expected: np.ndarray, usual: np.ndarray) -> float:
-    """Return the part b of the usual picture in a picture that is fitted as g expected + b usual, relative errors alike and g near 1."""
-    weight = 1 / (expected + SHADE_PART * usual.mean())
-    seen = usual > 2 * SHADE_PART * usual.mean()
-    columns, found = np.column_stack([expected * weight, usual * weight])[seen], (blocks * weight)[seen]
-    normal, right = columns.T @ columns, columns.T @ found
-    held = EXPECTED_GAIN * normal[0, 0]
-    return float(np.linalg.solve(normal + np.diag([held, 1e-9 * normal[1, 1]]), right + np.array([held, 0]))[1])
+def _moved(seen: Seen, expected: Bands, usual: float) -> Fault | None:
+    shift = shift_between(seen.bands, expected, usual)
+    return None if shift is None else Fault(seen.shot.key, FaultKind.MOVED, "everything is shifted by {:.0f}, {:.0f} pixels".format(*shift))

@@ -56,6 +56,8 @@ class Shot(NamedTuple):
     """The level, 0 to 1 of full, that the projector shows everywhere; of no frame. None: none."""
     exposure_s: float | None = None
     """The exposure time; None: the one that the camera has."""
+    may_clip: bool = False
+    """Whether a shorter exposure of the same light shows what this one clips."""
     prompt: str | None = None
     """What a person does before it; None: nothing."""
 
@@ -90,7 +92,8 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
                 if since % plan.tracking_every == 0:
                     found.append(_tracking(rig, sequence))
                 since += 1
-            found += [shot._replace(exposure_s=time) for time in sequence.exposures_s or (None,)]
+            times = sequence.exposures_s or (None,)
+            found += [shot._replace(exposure_s=time, may_clip=time is not None and time > min(filter(None, times))) for time in times]
         if len(found) > before:
             found[before] = found[before]._replace(prompt=sequence.prompt)
     if since:

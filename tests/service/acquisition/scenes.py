@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 import service
-from service.acquisition.checks.expectation import FaultKind
+from service.acquisition.checks.expectation import Fault, FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
 from service.acquisition.plans.shots import Shot, shots_of
@@ -130,7 +130,8 @@ class NoisyCamera:
 
 
 def named(scene: Scene, seed: int, kinds: tuple[FaultKind, ...]) -> tuple[dict[str, FaultKind], dict[str, FaultKind]]:
-    """Return the faults that were made, at random frames, and those that the judge names at the end."""
+    """Return the faults that were made, at random frames, and those that the judge names at the end; where none was made, also those that
+    it names at once."""
     rig = rig_of(scene)
     shots, random, judge = shots_on(rig), np.random.default_rng(seed), Judge(rig)
     light = scene.radiance.mean(axis=(1, 2, 3))
@@ -143,10 +144,14 @@ def named(scene: Scene, seed: int, kinds: tuple[FaultKind, ...]) -> tuple[dict[s
                 and (kind is not FaultKind.AMBIENT or light[shots[index].lamp] < BRIGHT * light.mean())]
         made[int(random.choice(free))] = kind
     camera = NoisyCamera(scene, seed)
+    at_once: list[Fault] = []
     for index, shot in enumerate(shots):
         pixels = camera.take(shot, made.get(index))
-        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE))
-    return {shots[index].key: kind for index, kind in made.items()}, {fault.shot: fault.kind for fault in judge.review()}
+        faults = judge.judge(shot, pixels, "lin_rec709_scene", FULL_SCALE)
+        judge.accept(shot, pixels, "lin_rec709_scene", FULL_SCALE, faults)
+        at_once += faults
+    found = [*judge.review(), *(at_once if not made else ())]
+    return {shots[index].key: kind for index, kind in made.items()}, {fault.shot: fault.kind for fault in found}
 
 
 @contextmanager

@@ -27,6 +27,7 @@ from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
 from stage.errors import StageError
+from stage.importers.camera_options import View
 from tests.scenes.captures import make_scene, rgb, write_exr
 from tests.service.answering import Asked, answering
 from tests.service.full_disk import files_of_at_most
@@ -243,6 +244,18 @@ def test_where_no_lamp_lights_the_capture_ends_after_the_second_and_goes_on_when
     assert stage.released == 1 + 2 * 3  # a dark picture, and three attempts each
     assert acquire(given.model_copy(update={"retake": ("0002_light_001",)}), ask).faults == ()
     check(tmp_path / "capture", stage, taken_twice=1)
+
+
+def test_a_picture_of_another_size_than_the_rigs_camera_is_refused_and_the_capture_goes_on_with_the_right_one(tmp_path, stage):
+    rig, ask = by_hand(tmp_path, stage)
+    right = json.loads(rig.read_text())
+    rig.write_text(json.dumps({**right, "camera": View().entry((30, 24))}))
+    with pytest.raises(RequestError, match=r"is 30x24, the picture IMG_0001\.exr has 24x24"):
+        acquire(request(tmp_path, stage, rig), ask)
+    assert not list((tmp_path / "capture").glob("*.exr")) and not (tmp_path / "capture" / "capture.json").exists()
+    stage.scene = stage.scene._replace(images=np.pad(stage.scene.images, ((0, 0), (0, 0), (3, 3), (0, 0))))
+    assert acquire(request(tmp_path, stage, rig), ask).there == LAMPS + 1
+    check(tmp_path / "capture", stage)
 
 
 def test_ctrl_c_ends_the_wait_for_a_person(tmp_path, stage):

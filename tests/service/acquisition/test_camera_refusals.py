@@ -2,7 +2,9 @@
 
 import os
 import re
+import shutil
 import tty
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import ClassVar
 
@@ -16,7 +18,7 @@ from service.acquisition.cameras.aravis_camera import AravisError
 from service.acquisition.cameras.camera import Setup, open_camera
 from service.errors import RequestError
 from tests.scenes.dng import write_dng
-from tests.service.acquisition.test_acquire import Stage, request, write_rig
+from tests.service.acquisition.test_acquire import LAMPS, Stage, by_hand, check, request, write_rig
 
 
 @pytest.fixture
@@ -238,3 +240,33 @@ def test_a_serial_board_that_never_answers(tmp_path):
         acquire(request(tmp_path, stage, rig), refuse_to_ask)
     os.close(host)
     os.close(board)
+
+
+def test_a_camera_at_usb_that_is_lost_while_it_takes_pictures_goes_on_when_it_is_there_again(tmp_path, reflex):
+    """Its cable is pulled at the fourth release; then the same command takes what is missing, and one picture for comparison."""
+    stage, package = Stage(tmp_path / "watch"), reflex.package
+
+    def capture(camera, kind):
+        if stage.released == 3 and reflex.error is None:
+            reflex.error = package.GP_ERROR_IO
+        if reflex.error is not None:
+            raise package.GPhoto2Error(reflex.error)
+        stage.release()
+        return SimpleNamespace(folder=str(stage.folder), name=f"IMG_{stage.released:04d}.exr")
+
+    def silence(camera, wait_ms):
+        return package.GP_EVENT_TIMEOUT, None
+    reflex.capture, reflex.wait_for_event = capture, silence
+    reflex.file_get = lambda camera, folder, name, kind: SimpleNamespace(save=lambda path: shutil.copyfile(Path(folder) / name, path))
+    rig, ask = by_hand(tmp_path, stage)
+    given = request(tmp_path, stage, rig, camera="gphoto2")
+    with pytest.raises(RequestError, match="the camera does not answer: check the cable"):
+        acquire(given, ask)
+    with pytest.raises(RequestError, match="the camera does not answer: check the cable"):
+        acquire(given, ask)
+    reflex.error, reflex.capture = None, lambda camera, kind: (stage.release(), SimpleNamespace(
+        folder=str(stage.folder), name=f"IMG_{stage.released:04d}.exr"))[1]
+    result = acquire(given, ask)
+    assert (result.taken, result.there, result.faults) == (LAMPS + 1 - 3, LAMPS + 1, ())
+    assert stage.released == LAMPS + 1 + 1
+    check(tmp_path / "capture", stage)

@@ -8,6 +8,7 @@ from service.acquisition.checks.judge import FULL_SCALE, Judge
 from service.acquisition.plans.plan import Plan
 from service.acquisition.plans.shots import TRACKING, shots_of
 from service.errors import RequestError
+from service.twin.camera import OVEREXPOSED
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render
 from tests.service.acquisition.scenes import KINDS, Scene, named, owl, relief, rig_of, shots_on
@@ -96,6 +97,25 @@ def test_a_capture_of_small_values_without_a_dark_picture_has_no_fault(gain):
     shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
     shape = scene.radiance[0].shape
     assert reviewed(scene, shots, lambda shot: gain * (scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape))) == (set(), {})
+
+
+def test_no_picture_of_the_owl_is_suspected_while_its_neighbours_are_not_there():
+    """Lamps spiral round the owl, so that those taken so far stand on one side of the next, and grazing light predicts little."""
+    scene, random = owl(), np.random.default_rng(1)
+    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
+    shape = scene.radiance[0].shape
+    assert reviewed(scene, shots, lambda shot: scene.radiance[shot.lamp] + 0.002 * random.standard_normal(shape)) == (set(), {})
+
+
+@pytest.mark.parametrize(("exposure", "kind"), [(0.1, FaultKind.BRIGHT), (0.4, FaultKind.CLIPPED)])
+def test_a_picture_at_sixteen_times_the_exposure_is_named(exposure, kind):
+    """Under the weakest lamp, where less of it is at full scale than highlights are."""
+    scene = relief(1)
+    weak = int(scene.radiance.mean(axis=(1, 2, 3)).argmin())
+    shots = [shot for shot in shots_on(rig_of(scene)) if shot.lamp is not None]
+    _, found = reviewed(scene, shots, lambda shot: np.minimum((OVEREXPOSED if shot.lamp == weak else 1) * exposure
+                                                              * scene.radiance[shot.lamp], 1))
+    assert found == {shot.key: kind for shot in shots if shot.lamp == weak}
 
 
 def test_a_flat_card_under_a_ring_of_lamps_looks_alike_and_has_no_fault():

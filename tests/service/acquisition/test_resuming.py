@@ -22,8 +22,8 @@ from stage.formats import images
 from stage.results.maps import SurfaceMaps
 from stage.stack.early import EarlyStack
 from stage.stack.ingest import Ingest
-from tests.scenes.captures import make_scene, render, write_capture, write_image
-from tests.service.acquisition.test_acquire import LAMPS, Stage, check, controller, request
+from tests.scenes.captures import angles_degrees, make_scene, render, write_capture, write_image
+from tests.service.acquisition.test_acquire import LAMPS, Stage, by_hand, check, controller, request
 from tests.service.full_disk import files_of_at_most
 
 EIGHT_BITS_DEGREES = 0.6
@@ -266,3 +266,30 @@ def test_the_stack_is_there_when_the_last_picture_is(tmp_path, stage, relit, mon
     lights = [frame.image for frame in Capture.open(tmp_path / "capture").sources()]
     assert decoded == lights and set(left) == {(len(lights), len(lights))}  # the preview finds it too
     assert not list((tmp_path / "capture" / ".relit").glob(".early*"))
+
+
+@pytest.mark.long
+def test_brackets_are_taken_merged_and_solved(tmp_path, monkeypatch, relit):
+    """The longer exposure clips what is lit most, which is no fault, and has an eighth of the noise of the shorter one elsewhere."""
+    stage, solved = Stage(tmp_path / "watch"), {}
+    random, noise = np.random.default_rng(3), {"both": 0.004, "short": 0.004, "clean": 0.0}
+
+    def release(camera, exposure_s):
+        stage.released += 1
+        light = sum((stage.scene.images[lamp] for lamp in stage.on), np.zeros_like(stage.scene.images[0]))
+        exposed = exposure_s * 40 * light / stage.scene.images.max()
+        noisy = np.clip(exposed + noise[name] * random.standard_normal(light.shape), 0, 1)
+        write_image(stage.folder / f"{stage.released:04d}.tif", np.round(65535 * noisy).astype(np.uint16))
+    monkeypatch.setattr(WatchedFolder, "_release", release)
+    rig, ask = by_hand(tmp_path, stage)
+    for name, exposures in (("both", [0.004, 0.03]), ("short", [0.004]), ("clean", [0.02])):
+        plan = {"schema": "relit.plan/1", "settle_s": 0, "sequences": [{"take": "olat", "exposures_s": exposures}]}
+        (tmp_path / "plan.json").write_text(json.dumps(plan))
+        result = acquire(request(tmp_path, stage, rig, out=tmp_path / name, color_space="lin_rec709_scene",
+                                 trigger="shoot {exposure_s}"), ask)
+        assert (result.faults, result.retaken, result.there) == ((), (), LAMPS * len(exposures))
+        relit("solve", tmp_path / name, "--method", "lambert", "--out", tmp_path / name / "maps")
+        solved[name] = SurfaceMaps.read(tmp_path / name / "maps" / "maps.exr")
+    inside = stage.scene.mask & np.all([maps.mask for maps in solved.values()], axis=0)
+    apart = {name: angles_degrees(maps.normal, solved["clean"].normal)[inside].mean() for name, maps in solved.items()}
+    assert inside.sum() > 100 and apart["both"] < 0.5 * apart["short"], apart

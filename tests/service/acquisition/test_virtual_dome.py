@@ -4,6 +4,7 @@ The card is full after 26 pictures, so the capture goes on several times.
 """
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,16 +13,25 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from service.acquisition.acquire import acquire, refuse_to_ask
+from service.acquisition.cameras.watched_folder import WatchedFolder
 from service.acquisition.checks.expectation import FaultKind
+from service.errors import RequestError
+from service.play.show import driven_universes
+from service.requests.acquire import AcquireRequest
+from service.twin.listener import Listener
 from stage.capture.capture import Capture
 from stage.formats import images
+from stage.rig.patch import levels_of_universes
+from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
-from tests.scenes.captures import make_scene, render, write_capture
+from tests.scenes.captures import make_scene, render, write_capture, write_exr
 from tests.scenes.patched_rigs import loopback
 from tests.scenes.rigs import write_rig
 from tests.service.acquisition.scenes import BRIGHT, VISIBLE, owl_on_stage, relief
 from tests.service.acquisition.test_cameras import virtual_camera
 from tests.service.owl import OWL, block_mean
+from tests.service.waiting import until
 
 LAMPS = 96
 FAULTS = {"dead": FaultKind.UNLIT, "wrong": FaultKind.WRONG_LIGHT, "doubled": FaultKind.DOUBLED, "moved": FaultKind.MOVED,
@@ -140,6 +150,38 @@ def test_faults_on_the_card_are_named_with_their_pictures_and_none_else(tmp_path
     words = [f"{fault}@{lamp + 1}" for lamp, fault in made.items()]
     wanted = {f"{lamp + 2:04d}_light_{lamp + 1:03d}": FAULTS[fault] for lamp, fault in made.items()}  # a dark picture is the first
     assert photographed(tmp_path, host, *words) == [0, wanted]
+
+
+@pytest.mark.parametrize("protocol", ["sacn", "artnet"])
+@pytest.mark.parametrize("ends", ["error", "ctrl-c"])
+def test_lamps_over_dmx_are_dark_after_an_error_and_after_ctrl_c(tmp_path, monkeypatch, protocol, ends):
+    scene, path, watched, host = make_scene(size=24, lights=6), tmp_path / "rig.json", tmp_path / "watched", loopback()
+    write_rig(path, scene.directions, {"white": (1.0, 1.0, 1.0)}, host=host, protocol=protocol)
+    watched.mkdir()
+    rig, seen = read_rig(path), []
+
+    def lit() -> np.ndarray:
+        return levels_of_universes(rig, dict(listener.last.values)).nonzero()[0]
+
+    def release(camera, exposure_s):
+        lamp = len(seen)
+        until(lambda: list(lit()) == [lamp], "the lamp was not heard of")
+        seen.append(lamp)
+        if lamp == 2 and ends == "error":
+            raise RequestError("the camera is gone")
+        write_exr(watched / f"{lamp}.exr", scene.images[lamp])
+        if lamp == 2:
+            signal.raise_signal(signal.SIGINT)
+    monkeypatch.setattr(WatchedFolder, "_release", release)
+    given = AcquireRequest(plan="olat", rig=path, camera=f"watch:{watched}", out=tmp_path / "capture")
+    with Listener(driven_universes(path, rig), host, keep=False) as listener:
+        if ends == "error":
+            with pytest.raises(RequestError, match="camera is gone"):
+                acquire(given, refuse_to_ask)
+        else:
+            assert acquire(given, refuse_to_ask).there == 3
+        until(lambda: not lit().size, "a lamp stays lit")
+    assert seen == [0, 1, 2]
 
 
 def test_a_card_cannot_lose_a_picture(tmp_path, relit):

@@ -100,3 +100,13 @@ def test_a_title_is_text_and_no_markup(relit, tmp_path, cap):
     page = (tmp_path / "out" / "index.html").read_text()
     assert page.count("<script") == 1 and "<i>us" not in page
     assert "&lt;script&gt;alert(&quot;1&quot;)&lt;/script&gt; $title &amp; more" in page
+
+
+def test_a_folder_of_results_stands_for_its_capture_and_shows_its_maps(relit, tmp_path, cap):
+    relit.done("solve", cap, "--method", "lambert", "--out", tmp_path / "maps")
+    for name, given in (("results", [tmp_path / "maps"]), ("both", [cap, "--maps", tmp_path / "maps"])):
+        relit.done("publish", *given, "--to", tmp_path / name, *IIIF)
+    assert files_in(tmp_path / "results") == files_in(tmp_path / "both")
+    relit.done("publish", tmp_path / "maps", "--to", tmp_path / "page", "--as", "web")
+    cap.rename(tmp_path / "elsewhere")
+    relit("publish", tmp_path / "maps", "--to", tmp_path / "none", *IIIF).refused("which is not there")

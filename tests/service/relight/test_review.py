@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import OpenImageIO as oiio
 import PyOpenColorIO
 import pytest
 
@@ -14,7 +15,7 @@ from service.requests.play import TwinRequest
 from service.twin.camera import TwinPicture
 from stage.capture.capture import Capture
 from stage.colour.colour_spaces import Review
-from stage.formats import images
+from stage.formats import exr, images
 from stage.rig.rig import read_rig
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, rgb, write_capture, write_exr
@@ -122,6 +123,9 @@ def test_display_frames_are_the_frames_through_the_view_and_the_look(relit, capt
             PyOpenColorIO.Config.CreateFromFile(place).getProcessor(view).getDefaultCPUProcessor().applyRGB(wanted)
         np.testing.assert_allclose(images.read_pixels(shown), np.clip(wanted, 0, 1), atol=0.51 / 255 + 1e-4)  # 8 bits; OpenColorIO's powers
         assert linear.max() > 0.1
+        written, texts = exr.read(frame)[1], oiio.ImageBuf(str(shown)).spec()
+        for name in ("relit:ocio", "relit:ocio_cache_id"):
+            assert texts.getattribute(name) == written[name] != ""
 
 
 @pytest.mark.parametrize(("command", "options", "words"), [
