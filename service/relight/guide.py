@@ -34,10 +34,9 @@ from kernels.relight.model.sources import Sources
 from service.relight.clipping import Clipping, clipped_channels
 from service.relight.combine import frames_on_device
 from service.relight.far_light import captured_lights
-from service.relight.light_on_device import LightOnDevice
 from service.relight.model_light import ModelLight, NearLights
 from service.relight.model_range import LitBeyond, LitModel, ModelRange, Portion, correction
-from service.relight.range_light import RangeLight
+from service.relight.range_light import LightOnDevice, RangeLight
 from service.relight.surface_model import KEPT_BYTES, ModelBatch, SurfaceModel
 from service.relight.weights.triangulation import left_out, triangles_between
 from service.reporting.progress import Timings
