@@ -3,8 +3,8 @@
 Small bright places, a sun or a disc, are a few samples a frame, with shadows and highlights of their own. All other light is spread over
 the directions of the grid (kernels.relight.directions.direction_grid).
 
-On a CUDA device the energy of the frames of a chunk is uploaded once for all pixels, and the frames are corrected there; what a frame gets is
-that of service.relight.model_range on the CPU.
+On a CUDA device the energy of the frames of a chunk is uploaded once for all pixels, and the frames are corrected there; what a frame
+gets is that of service.relight.model_range on the CPU.
 """
 
 from collections.abc import Sequence
