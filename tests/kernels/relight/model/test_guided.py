@@ -44,7 +44,7 @@ def test_frames_are_corrected_as_in_float64(has_added, has_beyond, wanted, devic
         return RNG.uniform(0.05, 1, (*shape, padded)).astype(np.float32)
 
     def there(values):
-        return wp.array(values, dtype=wp.float32, device=device)
+        return wp.array(values, dtype=wp.float32, device=device) if len(values) else wp.empty(values.shape, wp.float32, device=device)
 
     values, small = planes(24), planes(FRAMES - FIRST, 6)
     sums = {name: planes(FRAMES, 6 if name == "beyond_small" else 3) for name in FrameSums._fields}
