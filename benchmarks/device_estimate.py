@@ -1,23 +1,27 @@
 """An estimate for a GPU that is not at hand, from what products ask of a device and from published speeds: a section of docs/figures.md.
 
-    python -m benchmarks.device_estimate svbrdf 48 1 counted   # what one small scene asks, as JSON; or timed
+    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed
 
 What is asked of the device is counted on an emulated one (tests/emulated_device.py). Small scenes stand for 12 megapixels: all limits of
 memory are made small in the same ratio, so that bands, batches and chunks of frames, and so launches and waits, are as many. Bytes, and the
 processor seconds of a run on the CPU of this machine, are a + b · pixels, and with frames (a + b · pixels) + frames · (c + d · pixels),
-from two sizes and two counts of frames.
+from two sizes and two counts of frames. What is bounded by a number of patches or blocks of pixels is the same for both sizes; bytes for
+each patch of bounced light come from a third run with more of them.
 """
 
 import json
 import math
+import os
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import NamedTuple
 from unittest.mock import patch
 
@@ -25,12 +29,23 @@ import numpy as np
 
 from kernels import device as devices
 from service.requests.solve import Method
+from service.solve.height import interreflection
+from service.solve.methods import settling
 from tests import device_ways, emulated_device
 
 PIXELS = 12_000_000
 LEAST_BYTES, LEAST_PIXELS = 16 << 20, 1 << 15
 """Constants of the product below these are no limits of memory."""
-COUNTED_SIDES, TIMED_SIDES = (24, 48), (96, 288)
+TIMED_SIDES = 96, 192
+FEW_PATCHES, MORE_PATCHES = 256, 1024
+"""Patches of bounced light, and blocks whose middles settle it, in the small scenes: exactly as many, because the sides of their images are
+multiples of the roots of these numbers."""
+HOST_CORES = 16
+"""Cores of a host of one GPU."""
+ON_DEVICE = "service.relight.model_range._summed", "service.relight.guide.Guide._add"
+"""Functions of the host, on the CPU, whose work kernels do on CUDA."""
+ALONE = "service.relight.model_range.ModelRange._facing",
+"""Functions that threads of the CPU call side by side, and one thread on CUDA."""
 PRODUCT_SIDE = 2048
 """Side of the matrices by whose product the speed of a core is measured."""
 
@@ -64,13 +79,15 @@ class Work(NamedTuple):
     """None: there are no frames."""
     tried: tuple[int, ...]
     """Counts of frames of the small runs."""
+    sides: tuple[int, int]
+    """Sides of the small scenes whose asking is counted: batches of pixels, or patches, are cut into as many parts in both."""
     bar_s: float
 
 
 WORKS = {
-    "svbrdf": Work("`svbrdf`, 12 megapixels × 96 lights", lambda _: device_ways.solving(Method.SVBRDF), None, (1,), 60.0),
+    "svbrdf": Work("`svbrdf`, 12 megapixels × 96 lights", lambda _: device_ways.solving(Method.SVBRDF), None, (1,), (64, 128), 60.0),
     "guided": Work("240 guided frames of 12 megapixels, 96 lights", lambda frames: device_ways.relighting(guided=True, frames=frames), 240,
-                   (2, 4), 150.0),
+                   (2, 4), (54, 108), 150.0),
 }
 
 
@@ -84,22 +101,61 @@ def shrink_limits(ratio: float) -> None:
                 setattr(module, name, max(1, int(value * ratio)))
 
 
+class Taken:
+    """Processor seconds of kernels, and of functions that stand for them, by thread."""
+
+    def __init__(self) -> None:
+        self.kernels, self.of_main, self.alone = 0.0, 0.0, 0.0
+        self._lock, self._inside = threading.Lock(), threading.local()
+
+    def timed(self, plain: Callable[..., object], *, alone: bool = False) -> Callable[..., object]:
+        """Return a function that also notes the seconds that its thread takes, unless a noted function calls it."""
+        def run(*args: object, **options: object) -> object:
+            if getattr(self._inside, "now", False):
+                return plain(*args, **options)
+            self._inside.now, began = True, time.thread_time()
+            try:
+                return plain(*args, **options)
+            finally:
+                self._inside.now, seconds = False, time.thread_time() - began
+                with self._lock:
+                    if alone:
+                        self.alone += seconds
+                    else:
+                        self.kernels += seconds
+                        self.of_main += seconds if threading.current_thread() is threading.main_thread() else 0
+        return run
+
+
 @contextmanager
-def timed_launches() -> Iterator[list[float]]:
-    """Yield the processor seconds that launches on the CPU take from here on, which then run one after another."""
-    taken = [0.0]
+def timed_launches() -> Iterator[Taken]:
+    """Yield the processor seconds that kernels take on the CPU from here on, where launches then run one after another."""
+    taken = Taken()
 
     def run(recorded: devices.Recorded) -> None:
-        began = time.thread_time()
         for command in recorded._commands:
             command.launch()
-        taken[0] += time.thread_time() - began
 
-    with patch.object(devices.Recorded, "run", run):
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(devices.Recorded, "run", taken.timed(run)))
+        for name in (*ON_DEVICE, *ALONE):
+            stack.enter_context(patch(name, taken.timed(resolve_name(name), alone=name in ALONE)))
         yield taken
 
 
-def measure(work: Work, side: int, frames: int, *, counted: bool) -> dict[str, float]:
+def count_graphs_once() -> None:
+    """Count the launches of a graph as one, for the rest of the process; the emulated device has no graphs."""
+    plain = devices.Repeated.run
+
+    def run(repeated: devices.Repeated) -> None:
+        before = emulated_device.counts["launches"]
+        plain(repeated)
+        emulated_device.counts["launches"] = before + 1
+
+    patch.object(devices.Repeated, "run", run).start()
+
+
+def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int = FEW_PATCHES) -> dict[str, float]:
     """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU."""
     devices.names()
     with tempfile.TemporaryDirectory() as place:
@@ -108,27 +164,27 @@ def measure(work: Work, side: int, frames: int, *, counted: bool) -> dict[str, f
         run = work.run(frames)
         if counted:
             emulated_device.install()
-        else:
-            run(folder, folder / "warm", "cpu", device_ways.Counting())  # compiles what is not cached
-            shutil.rmtree(folder / "capture" / ".relit")  # decoding is part of the work
-        if counted:
+            count_graphs_once()
             shrink_limits(side * side / PIXELS)
-            before = emulated_device.counts.copy()
-            run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
+            with patch.object(interreflection, "PATCHES", patches), patch.object(settling, "BLOCKS", FEW_PATCHES):
+                before = emulated_device.counts.copy()
+                run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
             return {name: emulated_device.counts[name] - before[name] for name in emulated_device.COUNTED}
+        run(folder, folder / "warm", "cpu", device_ways.Counting())  # compiles what is not cached
+        shutil.rmtree(folder / "capture" / ".relit")  # decoding is part of the work
         with timed_launches() as taken:
-            began = time.process_time()
+            whole, main = time.process_time(), time.thread_time()
             run(folder, folder / "out", "cpu", device_ways.Counting())
-            return {"kernels": taken[0], "host": time.process_time() - began - taken[0]}
+            whole, main = time.process_time() - whole, time.thread_time() - main
+        alone = main - taken.of_main + taken.alone
+        return {"kernels": taken.kernels, "host": alone, "threads": whole - taken.kernels - alone}
 
 
 def at_full_size(name: str) -> dict[str, float]:
     """Return the quantities of a work at its full size, each fitted to small runs in processes of their own."""
     work, found = WORKS[name], {}
-    for counted, sides in ((True, COUNTED_SIDES), (False, TIMED_SIDES)):
-        runs = {(side, frames): json.loads(subprocess.run(
-            [sys.executable, "-m", __name__, name, str(side), str(frames), "counted" if counted else "timed"], check=True,
-            capture_output=True, text=True).stdout) for side in sides for frames in work.tried}
+    for counted, sides in ((True, work.sides), (False, TIMED_SIDES)):
+        runs = {(side, frames): _run(name, side, frames, counted=counted) for side in sides for frames in work.tried}
         for quantity in next(iter(runs.values())):
             known = {of: run[quantity] for of, run in runs.items()}
             if quantity in ("launches", "waits"):
@@ -136,7 +192,20 @@ def at_full_size(name: str) -> dict[str, float]:
             else:
                 pixels = [_line([side * side for side in sides], [known[side, frames] for side in sides], PIXELS) for frames in work.tried]
             found[quantity] = pixels[0] if work.frames is None else _line(work.tried, pixels, work.frames)
+        if counted and work.frames is None:
+            few, more = runs[sides[0], work.tried[0]], _run(name, sides[0], work.tried[0], counted=True, patches=MORE_PATCHES)
+            for quantity in ("up", "down", "touched"):
+                found[quantity] += (more[quantity] - few[quantity]) / (MORE_PATCHES - FEW_PATCHES) * (interreflection.PATCHES - FEW_PATCHES)
     return found
+
+
+def _run(name: str, side: int, frames: int, *, counted: bool, patches: int = FEW_PATCHES) -> dict[str, float]:
+    """Return what `measure` does in a process of its own, with one thread of BLAS as the program has it: more would wait for each other,
+    which takes processor time."""
+    command = [sys.executable, "-m", "benchmarks.device_estimate", name, str(side), str(frames), "counted" if counted else "timed",
+               str(patches)]
+    return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True,
+                                          env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}).stdout))
 
 
 def _line(at: Sequence[int], values: Sequence[float], wanted: int) -> float:
@@ -156,6 +225,7 @@ def core_speed() -> float:
 def estimate_rows(device: Published = H200) -> list[str]:
     """Return the section as lines of Markdown."""
     speed = core_speed()
+    counted = " and ".join(f"{small} and {large} (`{name}`)" for name, work in WORKS.items() for small, large in [work.sides])
     columns = [_column(work, at_full_size(name), speed, device) for name, work in WORKS.items()]
     return [f"Not measured: an estimate for one {device.name}. Nothing is taken to overlap. Its terms:", "",
             "- copies: bytes between host and device over the speed of the link",
@@ -164,32 +234,35 @@ def estimate_rows(device: Published = H200) -> list[str]:
             "- arithmetic: processor seconds of the kernels on the CPU of this machine, times the float32 operations of a core of it "
             f"({speed / 1e9:.0f} · 10⁹/s in a matrix product) over those of the device: both are taken to reach the same part of their "
             "best",
-            "- host: processor seconds of everything else on this machine, as if one core did it: decoding, files, and the mathematics "
-            "that is not on the device", "",
-            f"{SOURCES} Counts are those of scenes of {' and '.join(map(str, COUNTED_SIDES))} pixels squared on the emulated device, "
+            "- host: processor seconds of everything else on this machine: decoding, files, and the mathematics that is not on the device. "
+            f"What one thread does counts whole; what several do side by side (decoding, writing) is divided among {HOST_CORES} cores", "",
+            f"{SOURCES} Counts are those of scenes of {counted} pixels squared on the emulated device, "
             f"seconds of {' and '.join(map(str, TIMED_SIDES))} pixels squared, continued in a line to the full size. For the counts all "
-            "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size.", "",
+            "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size; a CUDA graph "
+            "is one launch. Bytes for patches of bounced light, which are 20 000 at most, are counted apart.", "",
             *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
 
 
 ROWS = ("", "---", "to the device, GB", "to the host, GB", "both per captured byte", "launches", "waits", "copies, pinned memory, s",
-        "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, s", "**all**, with pageable copies, s", "bar, s")
+        "copies, pageable memory, s", "launches, s", "memory, s", "arithmetic, s", "host, one thread, s",
+        f"host, in threads, on {HOST_CORES} cores, s",
+        "**all**, with pageable copies, s", "bar, s")
 
 
 def _column(work: Work, asked: dict[str, float], speed: float, device: Published) -> list[str]:
     """Return the cells of a work, in the order of ROWS."""
     moved, captured = asked["up"] + asked["down"], PIXELS * device_ways.LIGHTS * 3 * device_ways.HALF
     terms = [moved / device.pageable_per_s, (asked["launches"] + asked["waits"]) * device.launch_s, asked["touched"] / device.bytes_per_s,
-             asked["kernels"] * speed / device.operations_per_s, asked["host"]]
-    return [work.title, "---", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.0f}",
+             asked["kernels"] * speed / device.operations_per_s, asked["host"], asked["threads"] / HOST_CORES]
+    return [work.title, "---", f"{asked['up'] / 1e9:.0f}", f"{asked['down'] / 1e9:.0f}", f"{moved / captured:.1f}",
             f"{asked['launches']:.0f}", f"{asked['waits']:.0f}", f"{moved / device.pinned_per_s:.1f}", *(f"{term:.1f}" for term in terms),
             f"**{sum(terms):.0f}**", f"{work.bar_s:.0f}"]
 
 
 def main() -> None:
     """Run one small scene, for at_full_size."""
-    name, side, frames, kind = sys.argv[1:]
-    print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted")))
+    name, side, frames, kind, patches = sys.argv[1:]
+    print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted", patches=int(patches))))
 
 
 if __name__ == "__main__":

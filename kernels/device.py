@@ -38,7 +38,8 @@ CPU_BLOCK = 1
 
 CUDA_BLOCK = 128
 """Threads of a CUDA block. A multiprocessor has 65536 registers: three blocks of a kernel with 168 fit, 12 warps. Of 256 threads only one
-would, 8 warps."""
+would, 8 warps. Kernels of more than 128 registers are not held to 128, at which four blocks fit: by launch bounds,
+the five that obey them would spill and reload registers 26 to 176 times, for a third more warps."""
 MAX_THREADS = 2**31 - 1
 """Largest number of threads of one launch: kernels count threads in 32 bits."""
 

@@ -9,14 +9,13 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from threading import Lock
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels import packs
-from kernels.device import once
 from kernels.packs import Band, as_packs, as_pixels, pack_type
 from kernels.staging import staging
 
@@ -118,9 +117,8 @@ class ImagesOnDevice(Generic[Stack]):
         for number in touched:
             with self._lock:  # until the launches are in the stream, no other thread gives the block's memory away
                 block = self._bring(int(number))
-                for each, source, target in zip(rows, (block.values, block.saturated), found, strict=True):
-                    devices.launch(_pick_kernel(target.dtype), each * count, [as_pixels(source), where, self._blocks[number][0]],
-                                   [target], device=self.device)
+                for source, target in zip((block.values, block.saturated), found, strict=True):
+                    packs.take_columns(as_pixels(source), where, self._blocks[number][0], target)
         values, bits = (as_packs(each, self.device) for each in found)
         return Band(values, bits, count, lights, self.device, tuple(found))
 
@@ -166,22 +164,3 @@ def _first(owner: wp.array, pixels: int, pack: int) -> wp.array:
     """Return the beginning of [rows, widest] memory as contiguous [rows, pixels / pack] packs."""
     return wp.array(ptr=owner.ptr, shape=(owner.shape[0], pixels // pack), dtype=pack_type(pack, owner.dtype), device=owner.device,
                     copy=False)
-
-
-@once
-def _pick_kernel(dtype: Any) -> Any:
-    @wp.kernel(enable_backward=False, module="unique")
-    def pick_kernel(first: int,
-                    values: wp.array2d(dtype=dtype),  # [rows, pixels of the block]
-                    pixels: wp.array(dtype=wp.int32),  # [n] positions in the image
-                    start: int,  # of the block
-                    # outputs
-                    picked: wp.array2d(dtype=dtype)):  # [rows, n padded]; columns of pixels outside the block stay as they are
-        thread = first + wp.tid()
-        count = pixels.shape[0]
-        row, k = thread / count, thread % count
-        column = pixels[k] - start
-        if column >= 0 and column < values.shape[1]:
-            picked[row, k] = values[row, column]
-
-    return pick_kernel

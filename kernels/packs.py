@@ -190,6 +190,38 @@ def as_pixels(packs: wp.array) -> wp.array:
                     strides=(packs.strides[0], wp.types.type_size_in_bytes(kind)), device=packs.device, copy=False)
 
 
+def take_columns(values: wp.array, columns: wp.array, start: int, taken: wp.array) -> None:
+    """Copy columns of an array to another on the same device; not synchronised.
+
+    Args:
+        values: [rows, m], whose first column has the number `start`.
+        columns: [n] int32 numbers.
+        start: number of the first column of `values`.
+        taken: [rows, n or more]; columns that `values` does not have stay as they are.
+    """
+    devices.launch(_columns_kernel(values.dtype), values.shape[0] * columns.shape[0], [values, columns, start], [taken],
+                   device=values.device.alias)
+
+
+@once
+def _columns_kernel(dtype: Any) -> Any:
+    @wp.kernel(enable_backward=False, module="unique")
+    def columns_kernel(first: int,
+                       values: wp.array2d(dtype=dtype),  # [rows, m]
+                       columns: wp.array(dtype=wp.int32),  # [n]
+                       start: int,  # number of the first column
+                       # outputs
+                       taken: wp.array2d(dtype=dtype)):  # [rows, n or more]
+        thread = first + wp.tid()
+        count = columns.shape[0]
+        row, k = thread / count, thread % count
+        column = columns[k] - start
+        if column >= 0 and column < values.shape[1]:
+            taken[row, k] = values[row, column]
+
+    return columns_kernel
+
+
 def place(array: np.ndarray, device: str) -> tuple[wp.array, Any]:
     """Return host rows as packs on the device, padded with zeros, and what owns their memory.
 

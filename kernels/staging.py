@@ -25,7 +25,7 @@ class Staging:
         self._device, self._lock, self._turn = device, Lock(), 0
         self._stream = wp.Stream(device)
         self._buffers = [wp.empty(STAGED_BYTES, dtype=wp.uint8, device="cpu", pinned=True) for _ in range(2)]
-        self._copied: list[wp.Event | None] = [None, None]
+        self._copied = [self._stream.record_event() for _ in range(2)]
 
     def upload(self, rows: np.ndarray, target: wp.array, after: wp.Event) -> wp.Event:
         """Begin to copy rows to the device; returns when the host has read them.
@@ -47,8 +47,7 @@ class Staging:
                 part = rows[first : first + step]
                 self._turn = 1 - self._turn
                 buffer, copied = self._buffers[self._turn], self._copied[self._turn]
-                if copied is not None:
-                    wp.synchronize_event(copied)
+                wp.synchronize_event(copied)
                 size = len(part) * row_bytes
                 np.copyto(buffer.numpy()[:size].view(part.dtype).reshape(part.shape), part)
                 wp.copy(whole, buffer, dest_offset=first * row_bytes, count=size, stream=self._stream)

@@ -13,7 +13,9 @@ from tests.device_ways import SIDES, WAYS, Counting, count, read, results
 SMALL, LARGE = SIDES
 ITERATED = "diagnosis", "height", "surface", "start"
 """Stages whose solvers stop at a residual: how many iterations they take depends on the last bits of the processor, and so do all counts
-but the bytes uploaded. The first start of a process waits twice more than later ones."""
+but the bytes uploaded."""
+SLACK = 0.25
+"""Part by which such a count may differ: some iterations more or fewer of the dozens that a solver takes."""
 
 
 @pytest.fixture(autouse=True)
@@ -22,13 +24,14 @@ def only_where_it_is(device):
         pytest.skip("compares another device with the CPU")
 
 
-def rows_of(way, side):
-    return steady(row for row in read() if (row.way, row.side) == (way, side))
-
-
-def steady(rows):
-    uploaded = list(emulated_device.COUNTED).index("up")
-    return [row._replace(counts=row.counts[uploaded:uploaded + 1]) if row.stage in ITERATED else row for row in rows]
+def compare(rows, way, side):
+    """Compare what the stages of a way asked with the table."""
+    known = [row for row in read() if (row.way, row.side) == (way, side)]
+    assert [row._replace(counts=()) for row in rows] == [row._replace(counts=()) for row in known]
+    for row, wanted in zip(rows, known, strict=True):
+        for name, found, expected in zip(emulated_device.COUNTED, row.counts, wanted.counts, strict=True):
+            slack = SLACK * expected if row.stage in ITERATED and name != "up" else 0
+            assert abs(found - expected) <= slack, f"{row.stage}: {name}"
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -43,7 +46,7 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
         off = np.abs(values.astype(float) - found[layer])
         assert np.mean(off > 1e-3 * np.abs(values).max()) <= 0.01, layer
     if device == emulated_device.NAME:
-        assert steady(rows) == rows_of(way, SMALL)
+        compare(rows, way, SMALL)
 
 
 @pytest.mark.long
@@ -51,4 +54,4 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
 def test_what_a_larger_scene_asks_of_the_device(way, device, tmp_path):
     if device != emulated_device.NAME:
         pytest.skip("counted on the emulated device")
-    assert steady(count(way, LARGE, WAYS[way].write(tmp_path, LARGE), tmp_path, tmp_path / "out", device)) == rows_of(way, LARGE)
+    compare(count(way, LARGE, WAYS[way].write(tmp_path, LARGE), tmp_path, tmp_path / "out", device), way, LARGE)

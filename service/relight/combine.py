@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import warp as wp
 
 from kernels.images import ImagesOnDevice
 from kernels.relight.frames.combine import combine, combine_batch
@@ -63,10 +64,7 @@ def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Se
     """
     channels, _, count = images.stack.shape
     begin, end, _ = (pixels or slice(None)).indices(count)
-    placed = weights
-    if places is not None and images.device != "cpu":
-        placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
-        placed[list(places)] = weights
+    placed = weights if places is None or images.device == "cpu" else _placed(weights, places)
     bands = images.spans(4 * channels * CHUNK_FRAMES) if pixels is None else [(begin, end)]
     kept = slice(None) if places is None or len(placed) == len(weights) else list(places)
     frames = None if len(bands) == 1 else np.empty((len(weights), channels, count), dtype=np.float32)
@@ -79,3 +77,23 @@ def linear_frames(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Se
             frames[:, :, start:stop] = found
     assert frames is not None
     return frames[:, :, : min(end, images.stack.pixel_count) - begin]
+
+
+def frames_on_device(images: ImagesOnDevice[Stack], weights: np.ndarray, places: Sequence[int]) -> wp.array:
+    """Return the linear frames of a chunk on a CUDA device, [places, 3, pixels padded] float32, each at its place.
+
+    Arguments are those of `linear_frames`.
+    """
+    channels, _, count = images.stack.shape
+    placed = _placed(weights, places)
+    frames = wp.empty((len(placed), channels, count), dtype=wp.float32, device=images.device)
+    for start, stop in images.spans(0):
+        wp.copy(frames[:, :, start:stop], combine_batch(images.band(start, stop, saturated=False), placed))
+    return frames
+
+
+def _placed(weights: np.ndarray, places: Sequence[int]) -> np.ndarray:
+    """Return weights in which each frame stands at its place, with zeros between."""
+    placed = np.zeros((max(places) + 1, *weights.shape[1:]), dtype=np.float32)
+    placed[list(places)] = weights
+    return placed

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.images import ImagesOnDevice
 from kernels.packs import Band
@@ -25,15 +26,18 @@ from kernels.relight.model.beyond import compare_beyond, followed, inward_pairs,
 from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import sum_shown
 from kernels.relight.model.guide import compare_model, fit_trust, seen_lobes
+from kernels.relight.model.guided import FramesOnDevice, Pixels
 from kernels.relight.model.lobe_profile import MOMENTS, fit_profile, profile_moments
+from kernels.relight.model.responses import Responses
 from kernels.relight.model.shading import shade
 from kernels.relight.model.sources import Sources
 from service.relight.clipping import Clipping, clipped_channels
+from service.relight.combine import frames_on_device
 from service.relight.far_light import captured_lights
 from service.relight.model_light import ModelLight, NearLights
-from service.relight.model_range import LitBeyond, LitModel, ModelRange, correction
-from service.relight.range_light import RangeLight
-from service.relight.surface_model import ModelBatch, SurfaceModel
+from service.relight.model_range import LitBeyond, LitModel, ModelRange, Portion, correction
+from service.relight.range_light import LightOnDevice, RangeLight
+from service.relight.surface_model import KEPT_BYTES, ModelBatch, SurfaceModel
 from service.relight.weights.triangulation import left_out, triangles_between
 from service.reporting.progress import Timings
 from service.reporting.provenance import other_inputs
@@ -44,8 +48,6 @@ from stage.stack.stack import ReplacedStack, Stack
 
 NOTHING = np.zeros((0, 4), dtype=np.float32)
 """An empty list of places to march to."""
-KEPT_BYTES = 1 << 30
-"""Most bytes of the captured lights' visibility that are kept between chunks; for larger pictures it is computed again."""
 
 
 class Guide:
@@ -75,7 +77,7 @@ class Guide:
                               "plane") from error
         self._model, self._lights, self._recorded = SurfaceModel(maps, where, device, by_normal=True), lights, ImagesOnDevice(stack, device)
         self._place = np.concatenate([lights.direction, np.zeros((len(lights.direction), 1))], axis=1)
-        self._keep = len(self._place) * len(self._model.pixels) <= KEPT_BYTES
+        self._keep = len(self._place) * len(self._model.pixels) <= devices.batch_bytes(device, KEPT_BYTES)
         self._seen: dict[int, wp.array] = {}
         if progress is not None:
             progress.stage("guide", len(self._model.pixels))
@@ -178,6 +180,41 @@ class Guide:
             self._range.light(batch, band, self.images.stack.scale, self._visible(batch), chunk, use)
             done += len(batch.pixels)
         return mirrored
+
+    def frames_on_device(self, weights: np.ndarray, lights: Sequence[RangeLight], places: Sequence[int], *,
+                         specular: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return the plain frames of a chunk with what the model says they miss, made on CUDA and downloaded once, and their specular part.
+
+        Args:
+            weights: of the frames, as for combine.linear_frames.
+            lights, places, specular: as for `correct_range`.
+        """
+        device, count = self._model.device, self.images.stack.pixel_count
+        radiance = frames_on_device(self.images, weights, places)
+        mirrored = wp.zeros((radiance.shape[0] if specular else 0, *radiance.shape[1:]), dtype=wp.float32, device=device)
+        light = LightOnDevice(self._range.chunk(lights, places), FramesOnDevice(radiance, mirrored), places)
+        trust = self._trust_on_device
+        beyond = wp.empty(0, dtype=wp.float32, device=device) if light.chunk.beyond is None else self._trust_beyond_on_device
+        done = 0
+        for batch in self._model.batches():
+            def use(portion: Portion, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array, done: int = done) -> None:
+                part = slice(done + portion.pixels.start, done + portion.pixels.stop)
+                pixels = Pixels(portion.surface.values, self._model.positions[part], trust[part], beyond[part] if len(beyond) else beyond)
+                light.correct(portion, pixels, facing, grid, captured, shown)
+
+            self._range.light_on_device(batch, self.images.pick(batch.pixels), self.images.stack.scale, self._visible(batch), light.chunk,
+                                        use)
+            done += len(batch.pixels)
+        frames, mirror = (each.numpy()[list(places) if len(each) else [], :, :count] for each in (radiance, mirrored))
+        return frames, mirror if specular else None
+
+    @cached_property
+    def _trust_on_device(self) -> wp.array:
+        return wp.array(self.trust, dtype=wp.float32, device=self._model.device)
+
+    @cached_property
+    def _trust_beyond_on_device(self) -> wp.array:
+        return wp.array(self.trust_beyond, dtype=wp.float32, device=self._model.device)
 
     def _add(self, frames: np.ndarray, mirrored: np.ndarray | None, pixels: np.ndarray, part: slice, lit: LitModel) -> None:
         """Add the correction of some pixels to frames [frames, 3, pixels], and keep its specular part."""

@@ -30,10 +30,8 @@ from stage.capture.point_lights import DistantLights
 RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 256 << 20
 """Most bytes of responses that a thread of the CPU and a CUDA device keep at one time, on a device with much memory more; they choose how
 many pixels a portion has."""
-CUDA_THREADS = 8
-"""Portions in work at one time on CUDA: while it computes one, threads of the host finish others."""
-HOST_BYTES = 8 << 20
-"""Most bytes of one kind of sums over the frames, in float32, that a thread beside a CUDA device keeps; it keeps some ten kinds."""
+CUDA_PORTIONS = 8
+"""Least number of portions of a batch on CUDA: pixels of all normals have no directions behind them."""
 HORIZON_FRAMES = 32
 """Number of neighbouring frames for whose small lights horizons are found together: they are told apart as finely as these lights need."""
 ROUNDING = 1e-4
@@ -129,8 +127,7 @@ class Portion(NamedTuple):
     visible: wp.array  # [lights, P] of the captured lights
     horizons: tuple[Horizons | None, ...]
     """Horizons for each group of small lights; None where it has none."""
-    normal: np.ndarray  # [n, 3]
-    albedo: np.ndarray  # [3, n]
+    position: np.ndarray  # [n] row-major positions in the image
 
 
 class ModelRange:
@@ -143,6 +140,8 @@ class ModelRange:
         self._model, self._lights = model, lights
         self._grid = hidden_as_captured(grid, lights.direction)
         self._captured = upload_sources(captured_lights(lights.direction, lights.irradiance), model.device)
+        self._ahead: dict[tuple[int, int], tuple[wp.array, SourcesOnDevice]] = {}
+        """On CUDA the directions of the grid that light each portion."""
 
     def chunk(self, lights: Sequence[RangeLight], places: Sequence[int]) -> ChunkLight:
         """Put the light of frames on the device; `places` are the positions of the frames in the full chunk."""
@@ -171,38 +170,67 @@ class ModelRange:
 
     def light(self, batch: ModelBatch, band: Band, scale: np.ndarray, visible: wp.array, light: ChunkLight,
               use: Callable[[slice, LitModel], None]) -> None:
-        """Light the model for frames, portion by portion of a batch; on the CPU every thread lights portions of its own.
+        """Light the model for frames on the CPU, portion by portion of a batch; every thread lights portions of its own.
 
         Args:
             visible: [lights, P] of the captured lights.
             use: called, by several threads, with the pixels of the batch that a portion has, and the model there.
         """
         device = self._model.device
-        threads = devices.worker_count() if device == "cpu" else CUDA_THREADS
-        packs = self._portion_packs(batch.surface.packs, len(light.broad.places))
+        packs = self._portion_packs(batch.surface.packs)
         memory: SimpleQueue[tuple[Responses, Responses]] = SimpleQueue()
-        for _ in range(threads):
-            memory.put((empty_responses(self._grid.count, packs, device), empty_responses(len(self._captured.place), packs, device)))
+        for _ in range(devices.worker_count()):
+            memory.put(self._room(packs))
 
         def work(portion: Portion) -> None:
             room = memory.get()
             try:
-                use(portion.pixels, self._lit(portion, *room, scale, light))
+                facing = self._facing(portion)
+                sources = upload_sources(self._grid.taken(facing), device)
+                grid, captured, shown = self._responses(portion, sources, *room, scale)
+                use(portion.pixels, _summed(portion, self._model.albedo(portion.position), grid, facing, captured, shown, light))
             finally:
                 memory.put(room)
 
-        with ThreadPoolExecutor(threads, thread_name_prefix="relit-model") as pool:
+        with ThreadPoolExecutor(devices.worker_count(), thread_name_prefix="relit-model") as pool:
             list(pool.map(work, self._portions(batch, band, visible, light.small, packs)))
 
-    def _portion_packs(self, packs: int, frames: int) -> int:
+    def light_on_device(self, batch: ModelBatch, band: Band, scale: np.ndarray, visible: wp.array, light: ChunkLight,
+                        use: Callable[[Portion, wp.array, Responses, Responses, wp.array], None]) -> None:
+        """Light the model on CUDA, portion by portion of a batch; not synchronised.
+
+        Args:
+            visible: [lights, P] of the captured lights.
+            use: called with a portion, the numbers of the directions of the grid that light it, its responses to these and to the captured
+                lights, and the gloss that the images show under the latter (responses.shown_gloss).
+        """
+        packs = self._portion_packs(batch.surface.packs)
+        room = self._room(packs)
+        for portion in self._portions(batch, band, visible, light.small, packs):
+            key = int(portion.position[0]), len(portion.position)
+            if key not in self._ahead:
+                facing = self._facing(portion)
+                self._ahead[key] = (wp.array(facing, dtype=wp.int32, device=self._model.device),
+                                    upload_sources(self._grid.taken(facing), self._model.device))
+            numbers, sources = self._ahead[key]
+            use(portion, numbers, *self._responses(portion, sources, *room, scale))
+
+    def _room(self, packs: int) -> tuple[Responses, Responses]:
+        """Return memory for the responses of a portion to the grid and to the captured lights."""
+        device = self._model.device
+        return empty_responses(self._grid.count, packs, device), empty_responses(len(self._captured.place), packs, device)
+
+    def _facing(self, portion: Portion) -> np.ndarray:
+        """Return the numbers of the directions of the grid that light any pixel of a portion; the responses to all others are 0."""
+        return np.flatnonzero((self._towards @ self._model.normals(portion.position).T).max(axis=1) > -ROUNDING)
+
+    def _portion_packs(self, packs: int) -> int:
         """Return how many packs a portion of a batch has, at most."""
         device = self._model.device
-        pack = devices.pack_width(device)
-        pack_bytes = 4 * 4 * pack * self._grid.count
+        pack_bytes = 4 * 4 * devices.pack_width(device) * self._grid.count
         if device == "cpu":
             return max(1, RESPONSE_BYTES // pack_bytes)
-        limit = devices.batch_bytes(device, CUDA_RESPONSE_BYTES) // CUDA_THREADS // pack_bytes
-        return max(1, min(limit, HOST_BYTES // (4 * 3 * pack * frames), -(-packs // CUDA_THREADS)))
+        return max(1, min(devices.batch_bytes(device, CUDA_RESPONSE_BYTES) // pack_bytes, -(-packs // CUDA_PORTIONS)))
 
     def _portions(self, batch: ModelBatch, band: Band, visible: wp.array, small: Sequence[SmallLights], step: int) -> Iterator[Portion]:
         """Cut a batch into portions of `step` packs."""
@@ -216,18 +244,18 @@ class ModelRange:
             images = band._replace(values=band.values[:, packs], saturated=band.saturated[:, packs], pixel_count=size)
             yield Portion(pixels, surface, images, visible[:, packs],
                           tuple(None if each is None else each._replace(tangent=each.tangent[:, packs]) for each in horizons),
-                          self._model.normals(batch.pixels[pixels]), self._model.albedo(batch.pixels[pixels]))
+                          batch.pixels[pixels])
 
-    def _lit(self, portion: Portion, grid_room: Responses, captured_room: Responses, scale: np.ndarray, light: ChunkLight) -> LitModel:
-        """Return the model of a portion under the light of frames, with memory for its responses to the grid and to the captured lights."""
-        facing = np.flatnonzero((self._towards @ portion.normal.T).max(axis=1) > -ROUNDING)  # the responses to all others are 0
-        grid = grid_room.room(len(facing), portion.surface.packs)
+    def _responses(self, portion: Portion, sources: SourcesOnDevice, grid_room: Responses, captured_room: Responses,
+                   scale: np.ndarray) -> tuple[Responses, Responses, wp.array]:
+        """Return the responses of a portion to directions of the grid and to the captured lights, in memory that is given, and the gloss
+        that the images show under these."""
+        grid = grid_room.room(len(sources.place), portion.surface.packs)
         captured = captured_room.room(len(self._captured.place), portion.surface.packs)
-        respond(portion.surface, upload_sources(self._grid.taken(facing), self._model.device), portion.visible, grid)
+        respond(portion.surface, sources, portion.visible, grid)
         respond(portion.surface, self._captured, portion.visible, captured)
         images = Captured.of(portion.band, portion.surface, portion.visible, self._lights.direction, self._lights.irradiance, scale)
-        shown = shown_gloss(images, captured)
-        return _summed(portion, grid, facing, captured, shown, light)
+        return grid, captured, shown_gloss(images, captured)
 
 
 def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyond: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -251,9 +279,10 @@ def correction(model: LitModel, plain: np.ndarray, trust: np.ndarray, trust_beyo
     return change, mirror
 
 
-def _summed(portion: Portion, grid: Responses, facing: np.ndarray, captured: Responses, shown: wp.array, light: ChunkLight) -> LitModel:
+def _summed(portion: Portion, albedo: np.ndarray, grid: Responses, facing: np.ndarray, captured: Responses, shown: wp.array,
+            light: ChunkLight) -> LitModel:
     """Return the model of a portion under the light of frames, from its responses to the directions of the grid that are `facing`."""
-    albedo, count = portion.albedo, portion.albedo.shape[1]
+    count = albedo.shape[1]
     energy, broad = light.captured, light.broad.at(facing)
     matt, gloss = broad.matt(grid, albedo), broad.gloss(grid.gloss, count)
     for lights, horizons in zip(light.small, portion.horizons, strict=True):

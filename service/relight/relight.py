@@ -187,12 +187,13 @@ def _relight_capture(opened: OpenedCapture, todo: list[tuple[PlannedFrame, str]]
         if in_rows:
             _write_rows(files, form, weights, images, places, groups, writer, timings)
             continue
-        with timings.part("product"):
-            frames = linear_frames(images, weights, places)
         colours: dict[str, np.ndarray] = {}
-        if guide is not None:
+        if guide is None:
+            with timings.part("product"):
+                frames = linear_frames(images, weights, places)
+        else:
             with timings.part("guide"):
-                specular = _guide(guide, frames, light, places, specular=bool(form.parts))
+                frames, specular = _guided(guide, light, places, specular=bool(form.parts))
             if specular is not None:
                 colours[Layer.SPECULAR] = specular
         if groups:
@@ -215,13 +216,17 @@ def _write_rows(files: Sequence[FrameFile], form: FrameFormat, weights: np.ndarr
                 put(block.first, block.last, frames, colours)
 
 
-def _guide(guide: Guide, frames: np.ndarray, lights: Sequence[FrameLight], places: Sequence[int] | None, *,
-           specular: bool) -> np.ndarray | None:
-    """Add to plain frames what the model says they miss, and return its specular part where it is wanted."""
+def _guided(guide: Guide, lights: Sequence[FrameLight], places: Sequence[int] | None, *,
+            specular: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return frames with what the model says that plain ones miss, and their specular part where it is wanted."""
+    weights = np.stack([each.weights for each in lights])
     of_range = [each.spread for each in lights if each.spread is not None]
+    if of_range and places is not None and guide.images.device != "cpu":
+        return guide.frames_on_device(weights, of_range, places, specular=specular)
+    frames = linear_frames(guide.images, weights, places)
     if of_range and places is not None:
-        return guide.correct_range(frames, of_range, places, specular=specular)
-    return guide.correct(frames, [each.model for each in lights if each.model is not None], specular=specular)
+        return frames, guide.correct_range(frames, of_range, places, specular=specular)
+    return frames, guide.correct(frames, [each.model for each in lights if each.model is not None], specular=specular)
 
 
 def _lights_alone(groups: Mapping[str, Sequence[FrameLight]], frames: np.ndarray, images: ImagesOnDevice[Stack],
@@ -231,9 +236,10 @@ def _lights_alone(groups: Mapping[str, Sequence[FrameLight]], frames: np.ndarray
         return {name: frames.copy() for name in groups}
     found = {}
     for name, light in groups.items():
-        found[name] = linear_frames(images, np.stack([each.weights for each in light]), places, pixels=pixels)
-        if guide is not None:
-            _guide(guide, found[name], light, places, specular=False)
+        if guide is None:
+            found[name] = linear_frames(images, np.stack([each.weights for each in light]), places, pixels=pixels)
+        else:
+            found[name], _ = _guided(guide, light, places, specular=False)
     if guide is not None and found:
         add_up(list(found.values()), frames)
     return found

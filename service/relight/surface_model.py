@@ -3,7 +3,7 @@
 The surface reflects by Relit's BRDF, Lambert and the GGX lobes of one material or two (kernels.relight.model.shading cites its equations).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from kernels.relight.model.shading import SecondLobe, Surface, upload_surface
+from kernels import device as devices
+from kernels.relight.model.shading import PLANES, SecondLobe, Surface, upload_surface
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.shadows.occlusion import see_lights
 from kernels.surface.shadows import extent_of
@@ -22,6 +23,9 @@ from stage.results.maps import LOBES, SurfaceMaps
 
 BATCH_PIXELS = 1 << 17
 """Number of pixels that are lit at one time: 8 MB of maps, and a byte for each pixel and light whose visibility is kept."""
+KEPT_BYTES = 1 << 30
+"""Most bytes, on a device with much memory more, of what is kept between chunks of frames: the surface on CUDA, and the visibility of the
+captured lights. For larger pictures they are made again."""
 NORMAL_CELLS = 32
 """Number of cells, a power of two, along each side of the square of normals that face the viewer: a cell is some 5° wide."""
 
@@ -70,9 +74,23 @@ class SurfaceModel:
         self._extent = extent_of(np.where(inside, maps.height, 0), inside)
         self.profile: np.ndarray | None = None
         """[n, 3] Profile of the specular part at the solved pixels (kernels.relight.model.lobe_profile); None: that of the BRDF."""
+        self._keep = device != "cpu" and 4 * PLANES * len(self.pixels) <= devices.batch_bytes(device, KEPT_BYTES)
+        self._kept: tuple[np.ndarray | None, list[ModelBatch]] | None = None
 
-    def batches(self) -> Iterator[ModelBatch]:
-        """Yield the solved pixels in batches."""
+    def batches(self) -> Iterable[ModelBatch]:
+        """Return the solved pixels in batches, which a CUDA device keeps until the profile is another."""
+        if not self._keep:
+            return self._made()
+        if self._kept is None or self._kept[0] is not self.profile:
+            self._kept = self.profile, list(self._made())
+        return self._kept[1]
+
+    @cached_property
+    def positions(self) -> wp.array:
+        """Return `pixels` on the device, int32."""
+        return wp.array(self.pixels, dtype=wp.int32, device=self.device)
+
+    def _made(self) -> Iterator[ModelBatch]:
         maps = self.maps
         assert maps.normal is not None and maps.diffuse_albedo is not None
         for start in range(0, len(self.pixels), BATCH_PIXELS):

@@ -8,6 +8,8 @@ import struct
 from pathlib import Path
 from typing import NamedTuple
 
+from kernels.device import CUDA_BLOCK
+
 REGISTERS, FRAME = 0x2F, 0x11
 """Attributes of a kernel: registers of a thread, and bytes of its stack."""
 VALUED = 4
@@ -26,6 +28,12 @@ class Resources(NamedTuple):
     spills: int  # loads and stores of local memory
     narrow: int  # loads from global memory of less than 32 bits
     wide: int  # of 64 bits and more
+
+    @property
+    def warps(self) -> int:
+        """Return how many warps of 32 threads a multiprocessor of 65536 registers holds at one time: whole blocks, 64 warps at most."""
+        per_block = -(-self.registers // 8) * 8 * CUDA_BLOCK
+        return min(65536 // per_block * CUDA_BLOCK, 2048) // 32
 
 
 def resources(path: Path) -> Resources:

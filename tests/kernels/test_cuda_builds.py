@@ -61,7 +61,7 @@ def values_of(name: str, parameter: inspect.Parameter) -> list[Any]:
     elif get_origin(kind) is Literal:
         values = list(get_args(kind))
     elif name == "dtype":
-        values = [wp.float16, wp.uint8]
+        values = [wp.float16, wp.uint8, wp.float32]
     elif kind is int:
         values = [A_COUNT]
     elif kind in (Lobes, Reflectance):
@@ -106,7 +106,7 @@ def discovered() -> dict[str, Any]:
 KERNELS = discovered()
 TABLE = Path(__file__).with_name("cuda_resources.txt")
 TITLE, *LINES = TABLE.read_text(encoding="utf-8").splitlines()
-HOT = {name: Resources(*map(int, numbers)) for name, *numbers in (line.rsplit(maxsplit=len(Resources._fields)) for line in LINES)}
+HOT = {name: Resources(*map(int, numbers)) for name, *numbers, _ in (line.rsplit(maxsplit=len(Resources._fields) + 1) for line in LINES)}
 H100 = 90
 
 
@@ -146,7 +146,8 @@ def measured(name: str, folder: Path) -> Resources:
 def write_table() -> None:
     """Write the table of the kernels that it names anew."""
     with tempfile.TemporaryDirectory() as folder:
-        lines = [f"{name:55s} {' '.join(f'{number:4d}' for number in measured(name, Path(tempfile.mkdtemp(dir=folder))))}" for name in HOT]
+        taken = {name: measured(name, Path(tempfile.mkdtemp(dir=folder))) for name in HOT}
+    lines = [f"{name:55s} {' '.join(f'{number:4d}' for number in (*found, found.warps))}" for name, found in taken.items()]
     TABLE.write_text("\n".join([TITLE, *lines, ""]), encoding="utf-8")
 
 

@@ -75,7 +75,7 @@ def combine_batch(band: Band, weights: np.ndarray, *, with_cublas: bool = True) 
     if device != "cpu":
         if with_cublas and (gemm := cublas.product_of(device)) is not None:
             return cublas.combine_by(gemm, band, weights)
-        return _register_sums(band.values, weights, pack, device)
+        return sum_rows(band.values, upload_weights(weights, device))[: len(weights)]
     padded = _padded(weights, REGISTER_FRAMES)
     groups = np.ascontiguousarray(padded.reshape(-1, REGISTER_FRAMES, 3, band.frame_count).transpose(0, 2, 3, 1))
     frames = new_array((len(padded), 3, band.packs * pack), wp.float32, device, cleared=False)
@@ -100,7 +100,7 @@ def combine_rows(rows: wp.array, weights: np.ndarray) -> wp.array:
     device = rows.device.alias
     pack = devices.pack_width(device)
     if device != "cpu":
-        return _register_sums(rows, weights, pack, device)
+        return sum_rows(rows, upload_weights(weights, device))[:count]
     frames = wp.empty((count, channels, rows.shape[1] * pack), dtype=wp.float32, device=device)
     planes, sums = rows.numpy().reshape(channels, terms, -1), frames.numpy()
     padded = _padded(weights, GROUP)
@@ -116,14 +116,21 @@ def _padded(weights: np.ndarray, multiple: int) -> np.ndarray:
     return np.pad(weights, ((0, -len(weights) % multiple), (0, 0), (0, 0)))
 
 
-def _register_sums(values: wp.array, weights: np.ndarray, pack: int, device: str) -> wp.array:
-    """Return the sums of half or float32 rows on CUDA."""
-    padded = _padded(weights, REGISTER_FRAMES)
-    frames = wp.empty((len(padded), weights.shape[1], values.shape[1] * pack), dtype=wp.float32, device=device)
-    kernel = batch_register_kernel(pack, values.dtype._wp_scalar_type_ == wp.float16)
-    devices.launch(kernel, len(padded) // REGISTER_FRAMES * weights.shape[1] * values.shape[1],
-                   [values, wp.array(padded, dtype=wp.float32, device=device)], [as_packs(frames, device)], device=device)
-    return frames[: len(weights)]
+def upload_weights(weights: np.ndarray, device: str) -> wp.array:
+    """Return weights [frames, channels, n] on a CUDA device, as `sum_rows` takes them: zero frames follow until a thread's frames are
+    whole."""
+    return wp.array(_padded(weights, REGISTER_FRAMES), dtype=wp.float32, device=device)
+
+
+def sum_rows(rows: wp.array, weights: wp.array) -> wp.array:
+    """Return [frames, channels, pixels padded] float32 sums of half or float32 rows [channels · n, P] on CUDA; not synchronised."""
+    device = rows.device.alias
+    pack = devices.pack_width(device)
+    count, channels, _ = weights.shape
+    frames = wp.empty((count, channels, rows.shape[1] * pack), dtype=wp.float32, device=device)
+    devices.launch(batch_register_kernel(pack, rows.dtype._wp_scalar_type_ == wp.float16),
+                   count // REGISTER_FRAMES * channels * rows.shape[1], [rows, weights], [as_packs(frames, device)], device=device)
+    return frames
 
 
 def _check_weights(weights: np.ndarray, shape: tuple[int, ...]) -> None:
