@@ -89,7 +89,8 @@ async def machines(request: Request) -> Response:
 async def capture(request: Request, capture: CaptureId) -> Response:
     """Show a capture and its lights, and the forms of the jobs that begin with it."""
     return _page(request, "capture.html", identifier=capture, next_steps=NEXT_STEPS,
-                 forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+                 forms={title: [form_of(kind, CAPTURE_JOBS[kind]) for kind in CAPTURE_JOBS if kind.startswith("calibrate-") is is_calibration]
+                        for title, is_calibration in (("Make something else", False), ("Calibrate", True))})
 
 
 @router.get("/import-form/{layout}")

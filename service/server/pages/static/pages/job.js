@@ -1,10 +1,12 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, load, post, read, Refusal, remove, resultsOf, save } from "../api.js";
-import { byId, bytes, duration, element, show, time, words } from "../element.js";
+import { attempt, listing, load, post, read, resultsOf, save } from "../api.js";
+import { byId, bytes, duration, element, show, time } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
 import { titleOf } from "../jobs_table.js";
+import { removeLater } from "../object/removal.js";
+import { requestRows } from "../object/request.js";
 
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
@@ -41,43 +43,10 @@ function present(job) {
 
 /** Show what was asked for as the form of its kind names it: inputs and what differs from the defaults, and the rest folded away. */
 async function presentRequest(job) {
-  const valueAt = (path) => path.split(".").reduce((value, name) => value?.[name], job.request) ?? "";
-  const given = [[], []]; // chosen, and as it is by default
-  if (job.request.name) given[0].push(["Name", job.request.name]);
-  for (const { paths, label, default: usual } of await formWords(job.request.kind)) {
-    const value = valueAt(paths[0]);
-    if (value === "" || value.length === 0 || (label === "Name" && paths[0] === "name")) continue;
-    const isUsual = valueText(value) === usual || (value === false && usual === "");
-    given[Number(isUsual)].push([label, value]);
-  }
-  const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label), element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each)]))]));
+  const { chosen, usual } = await requestRows(job);
   byId("request").replaceChildren(...chosen);
   byId("usual").replaceChildren(...usual);
   show(byId("usual-part"), usual.length > 0);
-}
-
-/** Return how the form of a kind names its fields; jobs that the service makes on its own have no form, and their fields are named by themselves. */
-async function formWords(kind) {
-  try {
-    return await read(`/forms/${kind}`);
-  } catch (error) {
-    if (!(error instanceof Refusal && error.status === 422)) throw error;
-    return ["capture", "maps", "intake"].map((name) => ({ paths: [name], label: words(name), default: "" }));
-  }
-}
-
-/** Return a value of a request as a person reads it: a document by its name, or by how much it holds. */
-function valueText(value) {
-  if (typeof value === "boolean") return value ? "true" : "";
-  if (typeof value !== "object") return String(value);
-  if (Array.isArray(value)) return value.map(valueText).join(",");
-  return value.name ?? value.schema ?? `${Object.keys(value).length} values`;
-}
-
-function link(value) {
-  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, value);
-  if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
-  return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
 }
 
 async function log() {
@@ -148,9 +117,5 @@ for (const [id, action] of Object.entries({ cancel: "cancel", retry: "retry", re
     if (action !== "cancel") await follow();
   }));
 }
-byId("delete").addEventListener("click", () => attempt(async () => {
-  if (!confirm("Delete this job and its results?")) return;
-  await remove(`/v1/jobs/${identifier}`);
-  location.assign("/jobs");
-}));
+byId("delete").addEventListener("click", () => removeLater(`/v1/jobs/${identifier}`, byId("name").textContent, "/jobs"));
 await load(follow);
