@@ -67,7 +67,7 @@ async function player(place, job) {
   slider.addEventListener("input", () => show(Number(slider.value)));
 
   async function fill(index) {
-    const small = element("canvas", { height: STRIP_PX, width: STRIP_PX });
+    const small = element("canvas", { height: STRIP_PX });
     const button = strip.children[index].firstChild;
     const path = `/v1/jobs/${job}/pictures/${frames[index].name.split("/").map(encodeURIComponent).join("/")}`;
     const picture = await createImageBitmap(await fetched(path, (answer) => answer.blob()));
@@ -81,8 +81,8 @@ async function player(place, job) {
   }
 
   strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",
-    onclick: () => show(index) }))));
-  place.replaceChildren(element("div", { class: "stage framed" }, canvas, element("p", { class: "frames-bar" }, play, slider, told)), tools, strip, files);
+    onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
+  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told)), tools, strip, files);
   const waiting = frames.map((_, index) => index);
   const load = async () => { for (let next = waiting.shift(); next !== undefined && !isOver; next = waiting.shift()) await fill(next); };
   show(0);

@@ -75,6 +75,10 @@ function offer(facts) {
   show(byId("work"), true);
 }
 
+async function fillTable() {
+  for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job);
+}
+
 /** Go where a job that was begun is followed, and what it makes is shown. */
 function toObject() {
   location.assign(`/object/${identifier}`);
@@ -94,6 +98,5 @@ async function look(facts) {
 }
 
 byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, byId("name").textContent, "/captures"));
-await load(open);
-await load(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
+await load(() => Promise.all([open(), fillTable()]));
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

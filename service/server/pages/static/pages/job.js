@@ -7,6 +7,7 @@ import { enableForms } from "../form.js";
 import { titleOf } from "../jobs_table.js";
 import { removeLater } from "../object/removal.js";
 import { requestRows } from "../object/request.js";
+import { reloadWhenBack } from "../repeat.js";
 
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
@@ -98,15 +99,22 @@ function download(event, result) {
 
 async function follow() {
   let job = await read(`/v1/jobs/${identifier}`);
-  attempt(() => presentRequest(job));
+  const request = attempt(() => presentRequest(job));
   present(job);
   const results = attempt(() => presentResults(job)); // the job is followed whether or not they can be had now
+  await request;
   if (ENDED.includes(job.state)) {
     await results;
     return;
   }
-  await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
-  job = await read(`/v1/jobs/${identifier}`);
+  attempt(async () => { // for as long as the job runs, while the page shows how far it is
+    await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
+    await ended();
+  }, { again: reloadWhenBack, onaway: reloadWhenBack });
+}
+
+async function ended() {
+  const job = await read(`/v1/jobs/${identifier}`);
   present(job);
   await presentResults(job);
 }

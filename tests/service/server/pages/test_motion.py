@@ -1,0 +1,89 @@
+"""Pictures while something moves: drawn small and in time where the machine is slow, whole when it is still; and nothing of a page moves by itself."""
+
+import numpy as np
+import pytest
+
+from docs.tools.view_table import FIRST, SIDE, STOPS, view_table
+from service.server.pages.routes import HOME
+from stage.colour.colour import through_view
+from stage.colour.colour_spaces import Review
+from tests.service.server.pages.conftest import new_context
+from tests.service.server.pages.frames import picture
+
+SLOW = """async () => {
+  const { DrawLoop } = await import("/static/view/draw_loop.js");
+  const [rows, cols, speed] = [1000, 1000, 500]; // pixels per ms: a whole picture takes two seconds
+  const drawn = [];
+  const renderer = { relight: { rows, cols }, draw: (each) => drawn.push(each), isPast: (time) => performance.now() >= time,
+    fence: () => { const { stride = 1, band = null } = drawn.at(-1); return performance.now() + (band ? (band[1] - band[0]) * cols : rows * cols / stride ** 2) / speed; } };
+  const shown = [];
+  const loop = new DrawLoop(renderer, (stride) => shown.push([stride, drawn.at(-1).at]));
+  let longest = 0;
+  for (let at = 0; at < 40; at += 1) {
+    const before = performance.now();
+    loop.ask({ at });
+    longest = Math.max(longest, performance.now() - before);
+    await new Promise(requestAnimationFrame);
+  }
+  await loop.settled();
+  return { moving: drawn.filter(({ band = null }) => band === null).map(({ stride }) => stride), bands: drawn.filter(({ band = null }) => band !== null), shown };
+}"""
+SHIFTS = """globalThis.shifts = [];
+new PerformanceObserver((list) => {
+  for (const each of list.getEntries()) if (!each.hadRecentInput) shifts.push([each.value, ...each.sources.map(({ node }) => node?.id || node?.className || node?.nodeName)]);
+}).observe({ type: "layout-shift", buffered: true });"""
+
+
+@pytest.mark.long
+def test_a_slow_machine_draws_less_while_something_moves_and_all_of_it_in_bands_afterwards(page):
+    page.goto("/jobs")
+    found = page.evaluate(SLOW)
+    assert min(found["moving"]) > 1  # of a whole picture nothing is drawn while it moves
+    bands = [each["band"] for each in found["bands"]]
+    assert [band[0] for band in bands] == [0, *(band[1] for band in bands[:-1])] and bands[-1][1] == 1000  # each row once, in order
+    assert len(bands) > 10  # none of them holds a new motion up for long
+    assert [each.get("isSame", False) for each in found["bands"]] == [False, *[True] * (len(bands) - 1)]
+    assert found["shown"][-1] == [1, 39] and all(stride > 1 for stride, _ in found["shown"][:-1])
+
+
+@pytest.mark.long
+def test_light_through_aces_is_what_the_service_shows(page, solved):
+    page.goto(f"{solved.pages['light']}#view=aces&stops=1")
+    solved.wait_for_content(page, "light")
+    shown = picture(page)
+    page.get_by_label("View transform").select_option("srgb")
+    page.wait_for_function("() => !location.hash.includes('view=')")
+    assert np.abs(picture(page) - shown).mean() > 0.02
+    page.get_by_label("Exposure in stops").fill("-1")  # nothing is clipped: what is shown tells the linear light
+    clipped = picture(page)
+    linear = np.where(clipped <= 0.04045, clipped / 12.92, ((clipped + 0.055) / 1.055) ** 2.4)
+    inside = (clipped < 0.95).all(axis=-1) & (clipped > 0.25).all(axis=-1)  # where a step of 1/255 is a small part of the light
+    expected = through_view(np.ascontiguousarray(4 * linear[inside][None]).astype(np.float32), "lin_rec709_scene", Review(None, None))[0]
+    assert inside.sum() > 500
+    assert np.abs(shown[inside] - expected).mean() < 2 / 255  # half a step of each picture, and a quarter of one of the table
+
+
+def test_the_table_of_aces_is_that_of_the_service():
+    stored = np.frombuffer((HOME / "static" / "view" / "aces.bin").read_bytes(), dtype=np.uint8)
+    assert np.abs(stored.astype(int) - np.frombuffer(view_table(), dtype=np.uint8)).max() <= 1  # rounding of another processor
+    script = (HOME / "static" / "view" / "view_transforms.js").read_text()
+    assert f"{{ side: {SIDE}, first: {FIRST:g}, stops: {STOPS:g} }}" in script
+
+
+@pytest.mark.long
+def test_nothing_that_is_seen_moves_by_itself(browser, server, solved, owl):
+    """The browser's own measure, of all pages from their first paint on; none of it follows an input."""
+    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 860})
+    context.add_init_script(SHIFTS)
+    page = context.new_page()
+    found = {}
+    addresses = {"home": "/", "captures": "/captures", "jobs": "/jobs", "machines": "/machines", **solved.pages}
+    for name, address in addresses.items():
+        page.goto("about:blank")
+        page.goto(address)
+        solved.wait_for_content(page, name)
+        page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        found[name] = page.evaluate("shifts")
+    context.close()
+    assert {name: shifts for name, shifts in found.items() if shifts} == {}
