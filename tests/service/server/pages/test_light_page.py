@@ -56,6 +56,7 @@ def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solve
         view = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"]["kind"] == "view"
                     and job["request"]["capture"] == solved.capture and job["request"].get("maps") is None)  # of the capture alone
         relight = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["relight"]
+    opened.locator(".figures > summary").click()
     said = opened.locator(".figures").inner_text()
     assert f"under {relight['held_out']['key_lights']} lights that the basis was not made from" in said
     assert float(re.search(r": ([\d.e-]+) of 255 levels off", said)[1]) == pytest.approx(relight["held_out"]["mean_levels"], rel=0.05)

@@ -30,7 +30,7 @@ SLOW = """async () => {
 }"""
 SHIFTS = """globalThis.shifts = [];
 new PerformanceObserver((list) => {
-  for (const each of list.getEntries()) if (!each.hadRecentInput) shifts.push([each.value, ...each.sources.map(({ node }) => node?.id || node?.className || node?.nodeName)]);
+  for (const each of list.getEntries()) if (!each.hadRecentInput) shifts.push([each.value, ...each.sources.map(({ node, previousRect: before, currentRect: after }) => `${node?.id || node?.className || node?.nodeName}: ${[before, after].map(({ x, y, width, height }) => [x, y, width, height])}`)]);
 }).observe({ type: "layout-shift", buffered: true });"""
 
 
@@ -71,7 +71,7 @@ def test_the_table_of_aces_is_that_of_the_service():
 
 
 @pytest.mark.long
-def test_nothing_that_is_seen_moves_by_itself(browser, server, solved, owl):
+def test_nothing_that_is_seen_moves_by_itself(browser, server, solved):
     """The browser's own measure, of all pages from their first paint on; none of it follows an input."""
     context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 860})
     context.add_init_script(SHIFTS)

@@ -172,7 +172,9 @@ export class BasisRenderer {
     gl.uniform1f(this.#places.border, (compared === null ? 1 : border) * this.canvas.width);
     gl.uniform1f(this.#places.gain, gain);
     gl.uniform3f(this.#places.backdrop, ...backdrop);
-    this.timer.during(() => gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4));
+    const drawing = () => gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    if (band === null) this.timer.during(drawing);
+    else drawing(); // a part, after the motion
   }
 
   /** Return width and height of a picture of one of so many pixels in a row. */
