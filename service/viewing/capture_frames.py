@@ -131,7 +131,8 @@ def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[lis
         direction, irradiance = centre.get(frame.image, (None, None))
         brightest = None if image is None else image.preview[found.inside].max(axis=-1)
         described.append({
-            "image": frame.image, "kind": kind_of(frame), "label": UNMEASURED if unmeasured and frame.light is not None else label_of(frame),
+            "image": frame.image, "kind": kind_of(frame),
+            "label": UNMEASURED if unmeasured and frame.light is not None else label_of(frame),
             "direction": None if direction is None else numbers(direction),
             "near": isinstance(frame.light, PointLight),
             "irradiance": None if irradiance is None else numbers(irradiance),

@@ -84,8 +84,8 @@ Made = TypeVar("Made")
 SCHEMA = "relit.view/1"
 VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE = "view.json", "view.bin", "thumbnails.jpg"
 
-UNMEASURED = ("nobody has measured where the lights were, so that the capture cannot be relit as it is: a solve with lights that are found from "
-              "the images shows it under these, and a calibration measures them")
+UNMEASURED = ("nobody has measured where the lights were, so that the capture cannot be relit as it is: a solve with lights that are found "
+              "from the images shows it under these, and a calibration measures them")
 """The finding of a capture whose lights are placeholders."""
 MOST_FINDINGS = 100
 """Most sentences of what is wrong with a capture, so that view.json stays small."""

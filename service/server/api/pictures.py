@@ -65,7 +65,8 @@ def _jpeg(path: Path, name: str) -> bytes:
 
     colour = np.stack([reduced(channels[each]) for each in "RGB"], axis=-1)
     cover = np.clip(reduced(channels["A"]), 0, 1) if "A" in channels else np.ones(colour.shape[:2], np.float32)
-    shown = convert(np.clip(colour, 0, 1).astype(np.float32), exr.color_space_of(metadata), "srgb_texture") + BACKDROP * (1 - cover[..., None])
+    shown = convert(np.clip(colour, 0, 1).astype(np.float32), exr.color_space_of(metadata), "srgb_texture")
+    shown = shown + BACKDROP * (1 - cover[..., None])
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "picture.jpg"
         write_jpeg(target, np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8), QUALITY, subsampled=True)

@@ -323,7 +323,7 @@ def test_a_capture_under_lights_that_nobody_has_measured_is_relit_under_those_th
         (folder / file.name).write_bytes(file.read_bytes())
     (folder / "capture.json").write_text(json.dumps(manifest))
     relit("view", folder, "--out", tmp_path / "alone").well()
-    relit("solve", folder, "--lights", "unknown", "--method", "lambert", "--out", tmp_path / "maps")  # all normals are unsure, which is its exit code
+    relit("solve", folder, "--lights", "unknown", "--method", "lambert", "--out", tmp_path / "maps")  # all are unsure
     relit("view", folder, "--maps", tmp_path / "maps", "--out", tmp_path / "solved").well()
     alone, solved = (strict((tmp_path / name / "view.json").read_text()) for name in ("alone", "solved"))
     assert alone["relight"] is None and {frame["direction"] for frame in alone["frames"]} == {None}

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import new_context
 from tests.service.server.pages.frames import picture
 from tests.service.server.pages.photographs import write_photographs
@@ -18,7 +19,7 @@ COUNT = """addEventListener("pointerdown", ({ isTrusted }) => {
 
 @pytest.fixture
 def counting(browser, server):
-    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 900})
+    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 900}, bypass_csp=True)
     context.add_init_script(COUNT)
     yield context.new_page()
     context.close()
@@ -73,6 +74,39 @@ def test_a_folder_becomes_a_picture_and_an_asset_in_at_most_four_clicks(counting
     words = page.locator("#report-part > div").inner_text()
     page.get_by_text("Time taken", exact=True).wait_for()
     assert "{" not in words and "[object" not in words
+
+
+def tab_to(page, name: str) -> None:
+    """Go from control to control by the key Tab, until one has this name."""
+    for _ in range(120):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.textContent.trim()") == name:
+            return
+    pytest.fail(f"Tab does not lead to {name}")
+
+
+def test_the_keyboard_alone_leads_from_a_folder_to_an_asset(counting, tmp_path):
+    page, folder = counting, write_photographs(tmp_path / tmp_path.name)
+    page.goto("/")
+    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    tab_to(page, "Add a folder")
+    with page.expect_file_chooser() as chooser:
+        page.keyboard.press("Enter")
+    chooser.value.set_files(folder)
+    page.locator(".proposal button").wait_for(timeout=WORK_MS)
+    tab_to(page, "Import")
+    assert violations_in_both_schemes(page) == []  # of the open proposal
+    page.keyboard.press("Enter")
+    page.locator("canvas.picture[data-ready]").wait_for(timeout=WORK_MS)
+    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    tab_to(page, "Make an asset")
+    page.keyboard.press("Enter")
+    page.get_by_role("link", name="Save asset.usdz").wait_for(timeout=WORK_MS)
+    page.locator(".skip").focus()
+    tab_to(page, "Save asset.usdz")
+    with page.expect_download():
+        page.keyboard.press("Enter")
+    assert page.evaluate("sessionStorage.presses") is None
 
 
 def test_lights_that_nobody_has_measured_are_found_and_the_page_says_so(counting, server, tmp_path):

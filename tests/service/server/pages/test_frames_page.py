@@ -1,4 +1,4 @@
-"""Relit frames on the page of their object: pictures that the server makes, a player, a video, and the files; and hostile names beside them."""
+"""Relit frames on the page of their object: pictures that the server makes, a player, a video, and the files."""
 
 import io
 
@@ -19,8 +19,8 @@ FRAMES = 4
 @pytest.fixture(scope="module")
 def relit(server, solved, sky) -> str:
     with server.client() as client:
-        return done(server, client, {"kind": "relight", "capture": solved.capture, "environment": sky, "name": "<img src=x onerror=alert(1)>",
-                                     "options": {"frames": f"1-{FRAMES}", "spin_degrees": 90}})
+        return done(server, client, {"kind": "relight", "capture": solved.capture, "environment": sky,
+                                     "name": "<img src=x onerror=alert(1)>", "options": {"frames": f"1-{FRAMES}", "spin_degrees": 90}})
 
 
 def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved, relit, tmp_path):
@@ -43,8 +43,10 @@ def test_frames_are_played_recorded_and_saved(page, solved, relit):
     page.goto(f"{solved.pages['object']}#mode=frames")
     page.locator("[data-shows=frames] canvas[data-ready]").wait_for()
     assert page.locator(".filmstrip li").count() == FRAMES
-    assert page.locator("[data-shows=frames] img").count() == 0 and "<img" in page.get_by_label("Frames of").locator("option").first.inner_text()
-    look = "() => [...document.querySelector('.frames-picture').getContext('2d').getImageData(0, 0, 128, 128).data].reduce((sum, each, at) => sum + each * (at % 97), 0)"
+    assert page.locator("[data-shows=frames] img").count() == 0
+    assert "<img" in page.get_by_label("Frames of").locator("option").first.inner_text()
+    look = """() => document.querySelector('.frames-picture').getContext('2d').getImageData(0, 0, 128, 128).data
+      .reduce((sum, each, at) => sum + each * (at % 97), 0)"""
     first = page.evaluate(look)
     page.get_by_role("button", name="Frame 3").click()
     page.get_by_text(f"frame.0003.exr (3 of {FRAMES})").wait_for()
