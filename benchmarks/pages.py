@@ -126,7 +126,8 @@ def _print_motion(browser: Browser, url: str, capture: str) -> None:
     page.evaluate(MOVE, 2)  # the page learns how fast the machine is
     told = page.evaluate(MOVE, 6)
     print(f"\nmoving: {told['rate']:.1f} pictures a second, one of {told['stride']} pixels in a row; longest task "
-          f"{told['longest']:.0f} ms, longest time between two frames of the page {told['wait']:.0f} ms; whole {told['sharp'] / 1000:.2f} s after the last move\n",
+          f"{told['longest']:.0f} ms, longest time between two frames of the page {told['wait']:.0f} ms; "
+          f"whole {told['sharp'] / 1000:.2f} s after the last move\n",
           flush=True)
     page.close()
 

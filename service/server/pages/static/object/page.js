@@ -91,7 +91,7 @@ async function present(jobs, facts, work) {
   show(byId("files-part"), files.length > 0);
   presentReport(byId("report-part"), files);
   const asset = files.find(({ name }) => name === "asset.usdz");
-  byId("asset").replaceChildren(...(asset === undefined ? [] : [savingLink(asset, "Save asset.usdz", { class: "button" })]));
+  byId("save").replaceChildren(...(asset === undefined ? [] : [savingLink(asset, "Save asset.usdz", { class: "button" })]));
   setPrimary(byId("next"));
 }
 

@@ -5,6 +5,7 @@ import { byId, bytes, duration, element, show, time } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
 import { titleOf } from "../jobs_table.js";
+import { setPrimary } from "../object/next_steps.js";
 import { removeLater } from "../object/removal.js";
 import { requestRows } from "../object/request.js";
 import { reloadWhenBack } from "../repeat.js";
@@ -70,6 +71,7 @@ async function presentResults(job) {
   offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);
+  setPrimary(byId("object").parentElement);
   const forms = [...byId("work").querySelectorAll("form[data-kind]")];
   const fitting = job.state === "succeeded" ? forms.filter((form) => form.closest(".job-form").dataset.begins.split(" ").some((name) => names.includes(name))) : [];
   if (fitting.length > 0 && byId("work").hidden) {
