@@ -1,11 +1,12 @@
 """How soon the pages paint and show what they are opened for, and how long they hold their user up, in headless Chromium on loopback.
 
-python -m benchmarks.pages
+python -m benchmarks.pages [--large 3,11]
 
 Chromium renders WebGL on the processor here (SwiftShader). Times are those of this machine and of what else runs on it: the load average is
 printed beside them. It prints a table of docs/pages.md.
 """
 
+import argparse
 import os
 import statistics
 import sys
@@ -23,8 +24,6 @@ from tests.service.server_process import serving
 
 SAMPLES = Path(__file__).parents[1] / "samples"
 LOADS = 3
-LARGE = 3, 11
-"""How many times the owl stands in a row and a column of the larger captures: 1 and 12 megapixels."""
 SHOWN = {"/": ".card canvas", "captures": "#captures a", "jobs": "#jobs tbody a", "machines": "#audit tbody tr",
          "capture": "#frames canvas", "job": "#stages tbody tr", "light": "canvas.picture[data-stride]",
          "object": "canvas.picture[data-stride]", "maps": "canvas.map",
@@ -56,6 +55,9 @@ MOVE = """async (seconds) => {
 
 
 def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--large", default="3,11", help="how often the owl stands in a row and a column of larger captures: 1 and 12 megapixels")
+    large_captures = [int(each) for each in parser.parse_args().large.split(",")]
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright, serving(
             Path(folder) / "data", "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), folder]),
             min_free_bytes="0") as server, server.client() as client:
@@ -81,7 +83,7 @@ def main() -> int:
         print("|---|---:|---:|---:|---:|---:|")
         for name, path in places.items():
             _print_loads(browser, server.url, name, path)
-        for times in LARGE:
+        for times in large_captures:
             large = Path(folder) / f"owl{times}"
             large.mkdir()
             capture = registered(repeated(large, times))

@@ -22,8 +22,8 @@ def shown(server, material, sky) -> dict[str, str]:
             done(server, client, {"kind": "view", "capture": scanned, **maps})
     page = material.pages["object"]
     return material.pages | {
-        "captures": "/captures", "jobs": "/jobs", "job": f"/jobs/{made}", "maps": f"{page}#mode=maps&layer=normal&with=roughness",
-        "asset": f"{page}#mode=3d", "compare": f"{page}#mode=compare&how=difference", "frames": f"{page}#mode=frames",
+        "captures": "/captures", "jobs": "/jobs", "job": f"/jobs/{made}", "maps": f"{material.pages['maps']}#layer=normal&with=roughness",
+        "asset": f"{page}#mode=3d", "compare": f"{page}#mode=compare&how=beside", "frames": f"{page}#mode=frames",
         "object": f"{page}#mode=photographs", "depth": f"/object/{scanned}#mode=depth", "fault": "/captures/cap_0123456789abcdefghjk",
         "proposal": "/captures"}
 
