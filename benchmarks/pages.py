@@ -56,7 +56,8 @@ MOVE = """async (seconds) => {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--large", default="3,11", help="how often the owl stands in a row and a column of larger captures: 1 and 12 megapixels")
+    parser.add_argument("--large", default="3,11",
+                        help="how often the owl stands in a row and a column of larger captures: 1 and 12 megapixels")
     large_captures = [int(each) for each in parser.parse_args().large.split(",")]
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright, serving(
             Path(folder) / "data", "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), folder]),

@@ -29,7 +29,7 @@ def test_the_modes_of_an_object_are_those_that_exist_and_stand_in_the_address(sm
     page.goto(made.pages["object"])
     made.wait_for_content(page, "object")
     modes = page.locator("#modes button").all_inner_texts()
-    assert [name for name in modes if name != "Frames"] == ["Light", "Maps", "3-D", "Photographs", "Compare"]  # other tests may have relit it
+    assert [name for name in modes if name != "Frames"] == ["Light", "Maps", "3-D", "Photographs", "Compare"]
     page.locator("#files a", has_text="asset.usdz").wait_for()
     assert {"asset.usdz", "maps.exr"} <= set(page.locator("#files a").all_inner_texts())
     mode(page, "Maps", "[data-shows=maps] canvas.map")
