@@ -60,7 +60,7 @@ def main() -> int:
                         help="how often the owl stands in a row and a column of larger captures: 1 and 12 megapixels")
     large_captures = [int(each) for each in parser.parse_args().large.split(",")]
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright, serving(
-            Path(folder) / "data", "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), folder]),
+            Path(folder) / "data", "--anonymous", "--device", "cpu", roots=os.pathsep.join([str(SAMPLES), f"{folder}/captures"]),
             min_free_bytes="0") as server, server.client() as client:
         browser = playwright.chromium.launch(executable_path=installed.browser(), args=ARGUMENTS)
 
@@ -85,8 +85,8 @@ def main() -> int:
         for name, path in places.items():
             _print_loads(browser, server.url, name, path)
         for times in large_captures:
-            large = Path(folder) / f"owl{times}"
-            large.mkdir()
+            large = Path(folder) / "captures" / f"owl{times}"
+            large.mkdir(parents=True)
             capture = registered(repeated(large, times))
             done(kind="view", capture=capture)
             _print_loads(browser, server.url, "light", f"/light/{capture}", f"light, {(320 * times) ** 2 / 1e6:.0f} megapixels")
