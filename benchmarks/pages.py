@@ -138,7 +138,7 @@ def _print_motion(browser: Browser, url: str, capture: str) -> None:
 def _counted(page: Page) -> list[int]:
     """Return a list that gets the size of every answer that is not of the API."""
     sizes: list[int] = []
-    page.on("response", lambda answer: sizes.append(len(answer.body())) if "/v1/" not in answer.url else None)
+    page.on("response", lambda answer: sizes.append(len(answer.body())) if "/v1/" not in answer.url and answer.status == 200 else None)
     return sizes
 
 
