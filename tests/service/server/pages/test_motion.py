@@ -28,6 +28,8 @@ SLOW = """async () => {
   const isBand = ({ band }) => band !== undefined;
   return { moving: drawn.filter((each) => !isBand(each)).map(({ stride }) => stride), bands: drawn.filter(isBand), shown };
 }"""
+LARGEST_SHIFT = 1e-3
+"""Less than a line of text across the page that moves by its own height: 20 × 1248 of 1280 × 860 px, twice, times 20 of 1280 px."""
 SHIFTS = """globalThis.shifts = [];
 new PerformanceObserver((list) => {
   const words = ({ node, previousRect: { x, y }, currentRect: to }) => `${node?.id || node?.className} from ${x},${y} to ${to.x},${to.y}`;
@@ -94,4 +96,4 @@ def test_nothing_that_is_seen_moves_by_itself(browser, server, solved):
         page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         found[name] = page.evaluate("shifts")
     context.close()
-    assert {name: shifts for name, shifts in found.items() if shifts} == {}
+    assert {name: shifts for name, shifts in found.items() if sum(value for value, *_ in shifts) > LARGEST_SHIFT} == {}
