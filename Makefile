@@ -93,6 +93,8 @@ vendor:
 colour-table: $(VENV)/installed
 	$(BIN)/python -m docs.tools.colour_table > service/server/pages/static/view/colour_table.js.new
 	mv service/server/pages/static/view/colour_table.js.new service/server/pages/static/view/colour_table.js
+	$(BIN)/python -m docs.tools.view_table > service/server/pages/static/view/aces.bin.new
+	mv service/server/pages/static/view/aces.bin.new service/server/pages/static/view/aces.bin
 
 clean:
 	rm -rf $(VENV) .clients relit-demo

@@ -35,7 +35,7 @@ DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
   const relight = { rows: side, cols: side, terms: layers, tiles: { side: tile, rows: across, cols: across, count } };
   const renderer = new BasisRenderer(canvas, relight, 'lin_rec709_scene', Uint16Array.from({ length: count }, (_, index) => index));
   const random = Uint16Array.from({ length: 3 * side * side }, () => 0x2800 + Math.floor(0x800 * Math.random())); // halves 0.03 to 0.13
-  for (let term = 0; term < layers; term += 1) renderer.setTerm(term, random);
+  for (let term = 0; term < layers; term += 1) await renderer.setTerm(term, random);
   renderer.setMatte(new Uint8Array(side * side).fill(255));
   const each = 3 * layers * count;
   const captured = Float32Array.from({ length: lights * each }, () => Math.random() / lights / layers);
@@ -59,10 +59,33 @@ DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
     taken.push(picture());
     await new Promise((done) => { setTimeout(done); });
   }
+  const { DrawLoop } = await import('/view/draw_loop.js');
+  const tasks = [0];
+  new PerformanceObserver((list) => tasks.push(...list.getEntries().map(({ duration }) => duration))).observe({ type: 'longtask' });
+  const strides = [];
+  const loop = new DrawLoop(renderer, (stride) => strides.push(stride));
+  const shown = captured.subarray(0, each);
+  const move = async (for_s) => {
+    strides.length = 0;
+    const since = performance.now();
+    while (performance.now() - since < 1000 * for_s) {
+      loop.ask({ shown, compared: null, border: 1, gain: 1, backdrop: [0, 0, 0] });
+      await new Promise(requestAnimationFrame);
+    }
+    return strides.length / for_s;
+  };
+  await move(2); // it learns how fast the machine is
+  const movingRate = await move(seconds);
+  const stride = strides.toSorted((a, b) => a - b)[Math.floor(strides.length / 2)];
+  const still = performance.now();
+  await loop.settled();
+  const sharpMs = performance.now() - still;
+  const longestMs = Math.max(...tasks);
   const median = (at) => taken.map((times) => times[at]).sort((a, b) => a - b)[Math.floor(taken.length / 2)];
   const info = gl.getExtension('WEBGL_debug_renderer_info');
   return { card: info === null ? 'unknown' : gl.getParameter(info.UNMASKED_RENDERER_WEBGL), pictures: taken.length,
-    sumMs: median(0), wholeMs: median(1), gpuMs: renderer.timer.figures().gpuMs, lit: pixel[0] > 0 };
+    movingRate, stride, sharpMs, longestMs, sumMs: median(0), wholeMs: median(1),
+    gpuMs: renderer.timer.figures().gpuMs, lit: pixel[0] > 0 };
 }"""
 
 
@@ -116,7 +139,10 @@ def frame_rate(browser: str | None, *, side: int, layers: int, seconds: float, s
             f"picture        {side} x {side} ({side**2 / 1e6:.2f} megapixels), {layers} coefficient images, {read / 1e6:.0f} MB read",
             f"pictures       {found['pictures']}, median of their times:",
             f"whole picture  {found['wholeMs']:.1f} ms: {rate:.1f} pictures a second, {rate * read / 1e9:.2f} GB/s",
-            f"of it          {found['sumMs']:.1f} ms for the coefficients of {LIGHTS} lights on the processor; graphics card {gpu}"]
+            f"of it          {found['sumMs']:.1f} ms for the coefficients of {LIGHTS} lights on the processor; graphics card {gpu}",
+            f"moving         {found['movingRate']:.1f} pictures a second as the page draws them, one of {found['stride']} pixels in a row; "
+            f"longest task {found['longestMs']:.0f} ms",
+            f"still          the whole picture {found['sharpMs'] / 1000:.2f} s after the last move"]
 
 
 if __name__ == "__main__":

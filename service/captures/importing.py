@@ -214,8 +214,9 @@ _IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
 def propose(folder: Path) -> dict[str, Any]:
     """Return how the files of a folder can be imported, as JSON.
     Returns `summary` and `because`, sentences; `layout`, `file` and `options` as ImportChoices has them; `missing`, the names of options
-    that a person has to choose; `assumed`, sentences; `sure`, whether the files say all that the import needs. Raises ManifestError if the
-    files are of no layout that can be imported; the sentence says what was looked for."""
+    that a person has to choose; `assumed`, sentences; `sure`, whether the files say all that the import needs; `lights`, how far the first
+    solve is to trust the lights of the import. Raises ManifestError if the files are of no layout that can be imported; the sentence says
+    what was looked for."""
     found = guess(folder)
     if found.arguments[0] not in LAYOUTS:
         raise ManifestError(f"{folder}: looks like {found.layout}, which relit import {found.arguments[0]} takes, and the service does not")
@@ -229,7 +230,7 @@ def propose(folder: Path) -> dict[str, Any]:
                for name, value in typed.options.items() if name not in missing}
     return {"summary": found.summary, "because": found.reason, "layout": typed.layout,
             "file": None if typed.source == folder else str(typed.source.relative_to(folder)), "options": options, "missing": missing,
-            "assumed": assumed, "sure": found.sure and not missing}
+            "assumed": assumed, "sure": found.sure and not missing, "lights": "unknown" if found.has_unknown_lights else "declared"}
 
 
 def import_chosen(folder: Path, choices: ImportChoices, assumed: tuple[str, ...], name: str) -> None:

@@ -14,7 +14,7 @@ from service.reporting.progress import Timings
 from service.viewing.reduction import block_sums, plane_means, step_within
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
-from stage.capture.lighting import lights_from_centre
+from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.manifest import LIT_BY, Frame
 from stage.colour.colour import convert, pixels_of
 from stage.errors import ImageError, StageError, storage
@@ -30,6 +30,8 @@ WHITE_PERCENTILE = 99.0
 """The percentile of the object's brightest channel that is shown as white."""
 DARK_SHARE = 0.01
 """A pixel counts as dark where its brightest channel is below this share of white."""
+UNMEASURED = "a light that nobody has measured"
+"""The label of a placeholder."""
 POLARISER = {"none": "", "cross": ", crossed polariser", "parallel": ", parallel polariser"}
 """Words for the polariser of the camera in the label of a light."""
 
@@ -122,14 +124,15 @@ def one_frame(capture: Capture, found: CaptureImages, mask: np.ndarray, side: in
 def describe_frames(capture: Capture, found: CaptureImages, thumbnails: list[list[int] | None],
                     suspects: dict[str, str]) -> list[dict[str, Any]]:
     """Return what view.json says of every frame: its place in the atlas of thumbnails, and a sentence where its light is suspect."""
-    centre = _centre_lights(capture)
+    centre, unmeasured = _centre_lights(capture), has_placeholders(capture)
     white = found.white
     described = []
     for frame, image, place in zip(capture.manifest.frames, found.images, thumbnails, strict=True):
         direction, irradiance = centre.get(frame.image, (None, None))
         brightest = None if image is None else image.preview[found.inside].max(axis=-1)
         described.append({
-            "image": frame.image, "kind": kind_of(frame), "label": label_of(frame),
+            "image": frame.image, "kind": kind_of(frame),
+            "label": UNMEASURED if unmeasured and frame.light is not None else label_of(frame),
             "direction": None if direction is None else numbers(direction),
             "near": isinstance(frame.light, PointLight),
             "irradiance": None if irradiance is None else numbers(irradiance),
@@ -173,7 +176,10 @@ def _angles(direction: np.ndarray) -> str:
 
 
 def _centre_lights(capture: Capture) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return direction and irradiance at the object's centre of every distant or point light by its image."""
+    """Return direction and irradiance at the object's centre of every distant or point light by its image; none where they are
+    placeholders."""
+    if has_placeholders(capture):
+        return {}
     try:
         lights = lights_from_centre(capture)
         return {frame.image: (direction, irradiance)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,7 +27,7 @@ from service.viewing.relighting import LEAST_LIGHTS, write_relighting
 from service.viewing.result_layers import ResultLayers
 from stage.capture.capture import Capture
 from stage.capture.light import DistantLight, PointLight
-from stage.capture.lighting import lights_from_centre
+from stage.capture.lighting import has_placeholders, lights_from_centre
 from stage.capture.point_lights import DistantLights, PlacedLights, place_lights
 from stage.colour.colour import rgb_matrix
 from stage.colour.colour_spaces import NAMES, linear_space
@@ -82,6 +83,10 @@ def open_readings(capture: Capture, request: ViewRequest, timings: Timings) -> R
 Made = TypeVar("Made")
 SCHEMA = "relit.view/1"
 VIEW_FILE, BLOCKS_FILE, THUMBNAILS_FILE = "view.json", "view.bin", "thumbnails.jpg"
+
+UNMEASURED = ("nobody has measured where the lights were, so that the capture cannot be relit as it is: a solve with lights that are found "
+              "from the images shows it under these, and a calibration measures them")
+"""The finding of a capture whose lights are placeholders."""
 MOST_FINDINGS = 100
 """Most sentences of what is wrong with a capture, so that view.json stays small."""
 
@@ -113,9 +118,9 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
     capture = Capture.open(request.capture, request.pixels)
     _check_outputs(request, capture)
     result = None if request.maps is None else ResultLayers(result_file(request.maps), capture)
-    if result is not None and not result.of_depth:
-        capture = capture_as_solved(capture, result.path)
     report = SolveReport([], {}, None) if result is None else read_report(result.path)
+    if result is not None and not result.of_depth:
+        capture = capture_as_solved(report.lit(capture), result.path)
     mask = _mask(capture)
     images = read_images(capture, mask, timings)
     findings = list(dict.fromkeys([*images.faults, *standing_faults(capture)]))
@@ -128,7 +133,10 @@ def view(request: ViewRequest, progress: Progress | None = None) -> ViewResult:
             sections["points"] = write_points(result, file)
         if result is not None:
             sections["layers"] = write_layers(result, file, timings)
-        readings = _attempt(findings, lambda: open_readings(capture, request, timings)) if capture.sources() and images.usable else None
+        if unmeasured := has_placeholders(capture):
+            findings.append(UNMEASURED)
+        readings = (_attempt(findings, lambda: open_readings(capture, request, timings))
+                    if capture.sources() and images.usable and not unmeasured else None)
         if readings is not None:
             sections["relight"] = _attempt(findings, lambda: _relight(readings, request, file, device, timings))
             if result is not None and not result.of_depth:
@@ -223,7 +231,13 @@ class _Estimated(BaseModel):
     factors: list[float] | None = None
 
 
+class _Lights(BaseModel):
+    directions: list[tuple[float, float, float]]
+    irradiance: list[float]
+
+
 class _Found(BaseModel):
+    unknown_lights: _Lights | None = None
     light_intensities: _Estimated = _Estimated()
     light_factors: _Factors | None = None
 
@@ -243,6 +257,19 @@ class SolveReport(NamedTuple):
     """A sentence for each image whose light disagrees with the others."""
     factors: np.ndarray | None
     """[lights] factors on the intensities of the manifest that the maps were solved with; None: all are 1."""
+    lights: DistantLights | None = None
+    """The lights that a solve found from the images; None: they are those of the manifest."""
+
+    def lit(self, capture: Capture) -> Capture:
+        """Return the capture with the lights that the solve found in place of placeholders."""
+        if self.lights is None or not has_placeholders(capture):
+            return capture
+        found = {frame.image: {"direction": (x, y, z), "irradiance": (r, g, b)} for frame, (x, y, z), (r, g, b) in zip(
+            capture.sources(), self.lights.direction.tolist(), self.lights.irradiance.tolist(), strict=True)}
+        frames = [frame.model_copy(update={"light": frame.light.model_copy(update=found[frame.image])})
+                  if frame.light is not None and frame.image in found else frame for frame in capture.manifest.frames]
+        return replace(capture, manifest=capture.manifest.model_copy(update={"frames": tuple(frames)}),
+                       whole=None if capture.whole is None else self.lit(capture.whole))
 
 
 def read_report(maps: Path) -> SolveReport:
@@ -258,7 +285,9 @@ def read_report(maps: Path) -> SolveReport:
         raise ResultError(f"{path}: is not a report of relit: solve again, or take it away") from error
     suspects = {suspect.image: f"disagrees with the other lights by {100 * suspect.misfit:.0f} %: check its direction and irradiance"
                 for suspect in found.suspect_lights}
-    return SolveReport(found.warnings, suspects, _factors(found.found))
+    lights = found.found.unknown_lights
+    return SolveReport(found.warnings, suspects, _factors(found.found), None if lights is None else DistantLights(
+        np.array(lights.directions), np.repeat(np.array(lights.irradiance)[:, None], 3, axis=1)))
 
 
 def _factors(found: _Found) -> np.ndarray | None:

@@ -18,6 +18,10 @@ from stage.importers.opencv_file import read_matrices
 T = TypeVar("T")
 
 
+UNKNOWN_LIGHTS = " --lights unknown"
+"""What ends the command of a solve that finds the lights."""
+
+
 class Guess(NamedTuple):
     """The probable layout of a folder."""
 
@@ -36,6 +40,11 @@ class Guess(NamedTuple):
     """The command that makes the result."""
     summary: str
     """What the folder holds, for a person who has never seen a command: `96 photographs lit from 96 directions (lights.txt)`."""
+
+    @property
+    def has_unknown_lights(self) -> bool:
+        """Return whether nothing says where the lights were, so that they are to be found from the images."""
+        return self.then.endswith(UNKNOWN_LIGHTS)
 
     @property
     def command(self) -> str:

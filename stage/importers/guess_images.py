@@ -9,7 +9,7 @@ import numpy as np
 from stage.errors import ManifestError, storage
 from stage.importers.camera_options import words_of
 from stage.importers.content import SMOOTH, Pictures, Stripes
-from stage.importers.folder import Folder, Guess, arrays_of, encoding, made, spelling
+from stage.importers.folder import UNKNOWN_LIGHTS, Folder, Guess, arrays_of, encoding, made, spelling
 from stage.importers.pattern_order import GrayStack
 from stage.importers.patterns import PROJECTOR_MATRIX, projector_size
 
@@ -185,7 +185,7 @@ def photos(folder: Folder, shown: Pictures) -> Guess | None:
         sure=smooth and len(shown.names) >= SURE_PHOTOS and len({spelling(name) for name in shown.names}) == 1,
         summary=f"{len(shown.names)} photographs under lights of which nothing says where they were", assumed=(
             "each image has one far light of its own, and the camera stood still", *_left_out(shown), *encoding(folder)))
-    return found._replace(then=found.then + " --lights unknown")
+    return found._replace(then=found.then + UNKNOWN_LIGHTS)
 
 
 def _left_out(shown: Pictures) -> tuple[str, ...]:

@@ -133,8 +133,8 @@ def list_results(service: ServiceDep, caller: Reader, job: JobName,
 async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None,
                           wanted: Wanted = None, if_range: IfRange = None) -> Response:
     """Send a file, or a part of it. Under one ETag a file never changes, so that an interrupted download can be continued."""
-    headers = _headers(file)
-    if _unchanged(file, if_match, if_none_match):
+    headers = headers_of(file)
+    if unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
     part = _part(wanted or "", file) if if_range is None or if_range == file.etag else None
     if part is not None:
@@ -148,8 +148,8 @@ async def download_result(file: Annotated[Opened, Depends(opened)], if_match: Ta
              summary="Size and ETag of a result")
 async def head_result(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
     """Send the headers of a download, without the file."""
-    headers = _headers(file)
-    if _unchanged(file, if_match, if_none_match):
+    headers = headers_of(file)
+    if unchanged(file, if_match, if_none_match):
         return Response(status_code=304, headers=headers)
     return Response(headers=headers | {"Content-Length": str(file.size)}, media_type=_media_type(file))
 
@@ -161,7 +161,8 @@ async def download_environment(file: Annotated[Opened, Depends(opened_environmen
     return await download_result(file, if_match, if_none_match, wanted, if_range)
 
 
-def _unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:
+def unchanged(file: Opened, if_match: str | None, if_none_match: str | None) -> bool:
+    """Return whether the asker has a file already; refuse the request where it is for another than the file is now."""
     if if_match is not None and not _names(if_match, file.etag, strong=True):
         raise ApiError("precondition-failed", f"{file.name} is another now: its ETag is {file.etag}", headers={"ETag": file.etag})
     return if_none_match is not None and _names(if_none_match, file.etag, strong=False)
@@ -188,7 +189,8 @@ def _part(header: str, file: Opened) -> range | None:
     return part
 
 
-def _headers(file: Opened) -> dict[str, str]:
+def headers_of(file: Opened) -> dict[str, str]:
+    """Return the headers of an answer with a file."""
     name = PurePosixPath(file.name).name
     plain = f'filename="{name}"' if name.isascii() else f"filename*=UTF-8''{quote(name)}"
     return {"ETag": file.etag, "Last-Modified": formatdate(file.modified_at, usegmt=True), "Accept-Ranges": "bytes",

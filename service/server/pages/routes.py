@@ -20,7 +20,7 @@ from service import __version__
 from service.requests.base.identifiers import CaptureId, JobId
 from service.requests.base.import_choices import Layout
 from service.requests.jobs import JOBS
-from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, form_of, import_fields
+from service.server.pages.forms import CAPTURE_JOBS, FREE_JOBS, MAPS_JOBS, NEXT_STEPS, TITLES, Form, form_of, import_fields
 
 HOME = Path(str(files("service.server.pages")))
 STATIC = "/static"
@@ -88,8 +88,10 @@ async def machines(request: Request) -> Response:
 @router.get("/captures/{capture}")
 async def capture(request: Request, capture: CaptureId) -> Response:
     """Show a capture and its lights, and the forms of the jobs that begin with it."""
-    return _page(request, "capture.html", identifier=capture, next_steps=NEXT_STEPS,
-                 forms=[form_of(kind, model) for kind, model in CAPTURE_JOBS.items()])
+    forms: dict[str, list[Form]] = {"Make something else": [], "Calibrate": []}
+    for kind, model in CAPTURE_JOBS.items():
+        forms["Calibrate" if kind.startswith("calibrate-") else "Make something else"].append(form_of(kind, model))
+    return _page(request, "capture.html", identifier=capture, next_steps=NEXT_STEPS, forms=forms)
 
 
 @router.get("/import-form/{layout}")

@@ -310,3 +310,24 @@ def test_the_sizes_of_the_format_are_those_of_the_code(written):
     facts = written[0]
     assert facts["relight"]["directions"] == [64, 32] and facts["layers"][0]["levels"][0]["tile"] == 256
     assert {code["name"] for code in facts["samples"]["codes"].values()} == {"saturated", "shadowed", "backlit"}
+
+
+def test_a_capture_under_lights_that_nobody_has_measured_is_relit_under_those_that_a_solve_found(relit, tmp_path):
+    """Placeholders all point at the camera: a picture that was relit with them would be another than it says."""
+    sample, folder = ROOT / "samples" / "lambert", tmp_path / "unmeasured"
+    folder.mkdir()
+    manifest = json.loads((sample / "capture.json").read_text())
+    for frame in manifest["frames"]:
+        frame["light"] = {"type": "distant", "direction": [0, 0, 1], "irradiance": [1, 1, 1]}
+    for file in sample.glob("[!.]*"):
+        (folder / file.name).write_bytes(file.read_bytes())
+    (folder / "capture.json").write_text(json.dumps(manifest))
+    relit("view", folder, "--out", tmp_path / "alone").well()
+    relit("solve", folder, "--lights", "unknown", "--method", "lambert", "--out", tmp_path / "maps")  # all are unsure
+    relit("view", folder, "--maps", tmp_path / "maps", "--out", tmp_path / "solved").well()
+    alone, solved = (strict((tmp_path / name / "view.json").read_text()) for name in ("alone", "solved"))
+    assert alone["relight"] is None and {frame["direction"] for frame in alone["frames"]} == {None}
+    assert viewing.UNMEASURED in alone["findings"] and viewing.UNMEASURED not in solved["findings"]
+    found = strict((tmp_path / "maps" / "report.json").read_text())["found"]["unknown_lights"]["directions"]
+    assert np.allclose([frame["direction"] for frame in solved["frames"]], found, atol=1e-5)  # the report has five digits
+    assert solved["relight"]["terms"] > 3 and solved["samples"] is not None

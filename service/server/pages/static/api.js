@@ -8,7 +8,7 @@ const KEY = "relit-key";
 const UNREACHABLE = "The server cannot be reached. Nothing that it has acknowledged is lost.";
 const PASSING = [0, 429, 502, 503, 504]; // statuses of what may succeed soon
 let asking = null;
-let loading = 0; // actions under way
+let loading = 0; // what the page shows at first, and is not here yet
 
 /** A request that the server refused, with its sentence. */
 export class Refusal extends Error {
@@ -168,7 +168,6 @@ export async function* listing(path, field, cursor = "before") {
  * @param {{again?: function(): void, onaway?: function(): void}} [options] What the button does; `onaway` is called where the server is away.
  */
 export async function attempt(action, { again = () => attempt(action), onaway = () => {} } = {}) {
-  loading += 1;
   try {
     return await action();
   } catch (error) {
@@ -179,18 +178,21 @@ export async function attempt(action, { again = () => attempt(action), onaway = 
     else tell(error instanceof Refusal ? error.message : isAway ? UNREACHABLE : `This page failed: ${error.message}`, "fault", passes ? again : null);
     if (isAway) onaway();
     return undefined;
-  } finally {
-    loading -= 1;
-    if (loading === 0) byId("main").removeAttribute("aria-busy");
   }
 }
 
 /**
- * Load what a page shows: where the server is away for long, the page is loaded again when it is back.
+ * Load what a page shows: where the server is away for long, the page is loaded again when it is back. Until all is here, what would move is not shown.
  * @param {function(): Promise<void>} action
  */
-export function load(action) {
-  return attempt(action, { again: reloadWhenBack, onaway: reloadWhenBack });
+export async function load(action) {
+  loading += 1;
+  try {
+    return await attempt(action, { again: reloadWhenBack, onaway: reloadWhenBack });
+  } finally {
+    loading -= 1;
+    if (loading === 0) byId("main").removeAttribute("aria-busy");
+  }
 }
 
 /** Return whether an error says that the capture or job that the page shows does not exist. */

@@ -17,6 +17,7 @@ export function enableForms(root, subject) {
       event.preventDefault();
       attempt(() => submit(form));
     });
+    for (const chooser of form.querySelectorAll("input[data-fills]")) chooser.addEventListener("change", () => attempt(() => fillFrom(form, chooser)));
     for (const button of form.querySelectorAll("button.copy")) {
       button.addEventListener("click", () => attempt(() => copy(form, button)));
     }
@@ -99,6 +100,15 @@ function present(form) {
   form.querySelector("[data-shows=curl]").textContent = curl;
 }
 
+/** Put the content of a chosen file into the text of its field. */
+async function fillFrom(form, chooser) {
+  const [file] = chooser.files;
+  if (file === undefined) return;
+  chooser.closest(".field").querySelector("textarea").value = await file.text();
+  chooser.value = "";
+  present(form);
+}
+
 async function copy(form, button) {
   await navigator.clipboard.writeText(form.querySelector(`[data-shows=${button.dataset.copies}]`).textContent);
   button.textContent = "Copied";
@@ -123,7 +133,7 @@ export function entered(form) {
 }
 
 function valueOf(field) {
-  const control = field.querySelector("input, select, textarea");
+  const control = field.querySelector("input:not([type=file]), select, textarea");
   const label = field.querySelector("label").textContent;
   if (field.dataset.type === "boolean") {
     return control.checked === (field.dataset.default === "true") ? undefined : control.checked;

@@ -3,11 +3,14 @@
 Chromium is Debian's. Without it these tests are skipped, unless RELIT_TEST_PAGES is `required`, as .ci/run sets it.
 """
 
+import io
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks.clients import installed
 from tests.service.server.api.job_calls import admitted, finish, submit
@@ -88,6 +91,15 @@ def count_bytes(page, *left_out: str) -> list[int]:
     left = ("/v1/", *left_out)
     page.on("response", lambda answer: sizes.append(len(answer.body())) if not any(each in answer.url for each in left) else None)
     return sizes
+
+
+def keep(page, name: str, folder: Path) -> None:
+    """Keep what a page shows as a picture of the documentation, or in a folder of the test; of 256 colours, so that it is small."""
+    picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    assert np.asarray(picture).std() > 1  # it is not empty
+    path = (Path(PICTURES) if PICTURES else folder) / f"page_{name}.png"
+    picture.quantize(256, method=Image.Quantize.MEDIANCUT).save(path, optimize=True)
+    assert path.stat().st_size < 150_000
 
 
 class Solved:

@@ -265,3 +265,22 @@ def test_no_violation(asset):
     asset.set_viewport_size({"width": 390, "height": 844})
     asset.wait_for_function("document.documentElement.scrollWidth <= 390")
     assert violations_in_both_schemes(asset) == []
+
+
+def test_a_map_is_shown_without_light_and_a_link_has_the_camera(asset):
+    asset.get_by_label("Surface").select_option("albedo")
+    in_room = shown(asset)
+    asset.get_by_label("Lit by").select_option(index=2)
+    assert np.array_equal(shown(asset), in_room)
+    asset.get_by_label("Surface").select_option("asset")
+    assert not np.array_equal(shown(asset), in_room)
+    asset.get_by_label("Lit by").select_option("room")
+    asset.locator("canvas.scene").press("ArrowLeft")
+    asset.wait_for_function("() => location.hash.includes('camera=')")
+    turned = shown(asset)
+    place = [float(each) for each in asset.url.partition("camera=")[2].partition("&")[0].split(",")]
+    assert len(place) == 6 and abs(place[0]) > 0.05  # five degrees to the side
+    asset.get_by_role("button", name="As it was captured").click()
+    assert not np.array_equal(shown(asset), turned)
+    asset.reload()
+    asset.wait_for_function("() => globalThis.asset !== undefined", timeout=LOADED_MS)

@@ -2,14 +2,10 @@
 
 import shutil
 
-import numpy as np
 import pytest
 
-from stage.capture.capture import Capture
-from stage.formats import images
-from tests.scenes.captures import write_image
 from tests.scenes.foreign import write_four_phases
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.photographs import write_photographs
 
 pytestmark = pytest.mark.long
 
@@ -19,15 +15,7 @@ UPLOAD_MS = 60_000
 
 @pytest.fixture
 def photographs(tmp_path):
-    """The photographs of a sample as a person has them who knows nothing of captures: 16-bit PNG and light_directions.txt."""
-    capture, folder = Capture.open(SAMPLES / "lambert"), tmp_path / tmp_path.name
-    pixels = np.stack([images.read_recorded(SAMPLES / "lambert" / frame.image) for frame in capture.manifest.frames])
-    for number, image in enumerate(np.moveaxis(pixels / pixels.max(), 1, -1) if pixels.shape[1] == 3 else pixels / pixels.max()):
-        write_image(folder / f"photo_{number:02}.png", np.round(image.astype(np.float64) * 60_000).astype(np.uint16))
-    rows = (" ".join(map(str, frame.light.direction)) for frame in capture.manifest.frames)
-    (folder / "light_directions.txt").write_text("\n".join(rows) + "\n")
-    (folder / "making_of.mov").write_bytes(bytes(1 << 20))
-    return folder
+    return write_photographs(tmp_path / tmp_path.name)
 
 
 def captures_named(server, name: str) -> list[dict]:
@@ -42,7 +30,7 @@ def test_photographs_are_a_capture_after_two_clicks_and_dropped_twice_they_are_o
     page.get_by_text(f"{count} photographs lit from {count} directions (light_directions.txt)").first.wait_for(timeout=UPLOAD_MS)
     page.get_by_text("1 file of 1.0 MB that no import needs stays on this machine").wait_for()
     page.get_by_role("button", name="Import", exact=True).click()
-    page.get_by_role("link", name="Look at it").click(timeout=UPLOAD_MS)
+    page.wait_for_url("**/object/cap_*", timeout=UPLOAD_MS)
     page.get_by_role("heading", name=photographs.name, level=1).wait_for()
     sent = []
     page.on("request", lambda request: sent.append(request.url) if request.method == "PATCH" else None)
@@ -57,10 +45,10 @@ def test_another_folder_of_the_same_name_is_another_capture(server, page, photog
     page.goto("/captures")
     page.set_input_files("#folder", photographs)
     page.get_by_role("button", name="Import", exact=True).click(timeout=UPLOAD_MS)
-    page.get_by_role("link", name="Look at it").wait_for(timeout=UPLOAD_MS)
+    page.wait_for_url("**/object/cap_*", timeout=UPLOAD_MS)
     path = photographs / "light_directions.txt"
     path.write_text(path.read_text().replace("0.9", "0.8"))  # as long as before
-    page.reload()
+    page.goto("/captures")
     page.set_input_files("#folder", photographs)
     page.get_by_role("button", name="Import", exact=True).wait_for(timeout=UPLOAD_MS)
     assert sorted(item["state"] for item in captures_named(server, photographs.name)) == ["ready", "receiving"]
@@ -78,7 +66,7 @@ def test_what_files_do_not_say_is_asked_for(server, page, tmp_path):
     page.get_by_role("row", name=folder.name).get_by_role("button", name="Choose and import").click()
     field.fill("60e6")
     page.get_by_role("button", name="Import", exact=True).click()
-    page.get_by_role("link", name="Look at it").wait_for(timeout=UPLOAD_MS)
+    page.wait_for_url("**/object/cap_*", timeout=UPLOAD_MS)
     assert [item["state"] for item in captures_named(server, folder.name)] == ["ready"]
 
 

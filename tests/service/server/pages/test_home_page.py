@@ -3,13 +3,12 @@ wait."""
 
 import json
 import re
-from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, new_context
+from tests.service.server.pages.conftest import keep, new_context
 from tests.service.waiting import until
 
 CAPTURES = 1000
@@ -203,7 +202,5 @@ def test_the_home_page_shows_the_sample(browser, owl, solved, sky, tmp_path, sch
     for name in (owl.capture, solved.capture, sky):
         await_picture(page, name)
     page.evaluate("scrollTo(0, 0)")
-    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_home_{scheme}.png"
-    page.screenshot(path=path)
-    assert path.stat().st_size > 50_000
+    keep(page, f"home_{scheme}", tmp_path)
     page.close()

@@ -62,8 +62,11 @@ def test_a_capture_leads_with_what_it_is_made_for_and_offers_nothing_that_cannot
     page.goto(f"/captures/{capture}")
     page.get_by_role("link", name="Light it").wait_for()
     assert offered(page) == {kind for kind, what in BEGIN_WITH.items() if "light" in what}
+    buttons = page.locator("#next .button:visible, #next button:visible")
+    assert buttons.evaluate_all("all => all.filter((each) => !each.matches('.quiet')).length") == 1  # one that stands out
     page.get_by_role("button", name=TITLES["pipeline"]).click()
-    page.wait_for_url("**/jobs/job_*")
+    page.wait_for_url("**/object/cap_*")
+    page.locator("#work").get_by_role("link", name="Details").click()
     page.locator("#request dd", has_text=capture).wait_for()
     page.locator("#usual-part > summary").click()
     request = page.locator("#request, #usual").all_inner_texts()
@@ -220,8 +223,9 @@ def test_a_job_is_cancelled_and_resumed(server, page, capture, sky):
         page.get_by_role("button", name="Cancel").click()
         page.locator(".state.cancelled").wait_for()
         server.wait(client, f"/v1/jobs/{job}", ("cancelled",))
-        page.on("dialog", lambda dialog: dialog.accept())
+        page.clock.install()
         page.get_by_role("button", name="Delete").click()
+        page.clock.run_for(9_000)  # in which it can be undone
         page.wait_for_url("**/jobs")
         assert client.get(f"/v1/jobs/{job}").status_code == 404
 

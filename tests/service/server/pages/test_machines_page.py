@@ -1,12 +1,11 @@
 """The page for operators: workers, queue, space, errors and the audit log, for those who may see them."""
 
-from pathlib import Path
 
 import pytest
 
 from service.requests.keys import Scope
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+from tests.service.server.pages.conftest import SAMPLES, keep, new_context
 from tests.service.server_process import serving
 
 pytestmark = pytest.mark.long
@@ -34,8 +33,7 @@ def test_the_page_of_machines_shows_the_sample(browser, server, solved, tmp_path
     page.locator("#workers").get_by_text("cpu").first.wait_for()
     page.locator("#audit tbody tr").nth(1).wait_for()
     assert page.get_by_text("Space left").is_visible()
-    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_machines_{scheme}.png"
-    page.screenshot(path=path)
+    keep(page, f"machines_{scheme}", tmp_path)
     if scheme == "light":
         page.set_viewport_size({"width": 390, "height": 844})
         page.wait_for_function("() => document.documentElement.scrollWidth <= 390")

@@ -185,3 +185,30 @@ def test_every_map_of_the_capture_is_shown(opened):
         opened.mouse.move(5, 5)
         pictures.add(opened.locator("canvas.map").screenshot())
     assert len(pictures) == len(names)
+
+
+def test_a_link_shows_the_part_of_a_map_that_its_sender_saw_and_fingers_zoom_it(page, solved):
+    page.goto(solved.pages["maps"])
+    solved.wait_for_content(page, "maps")
+    page.locator("canvas.map").evaluate("""(canvas) => {
+      const { left, top, width, height } = canvas.getBoundingClientRect();
+      canvas.setPointerCapture = () => {};
+      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
+        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
+      send("pointerdown", 11, -20); send("pointerdown", 12, 20);
+      send("pointermove", 11, -40); send("pointermove", 12, 40);
+    }""")
+    page.wait_for_function("() => location.hash.includes('map-zoom=2')")  # fingers twice as far apart
+    page.locator("canvas.map").focus()
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_function("() => location.hash.includes('map-centre=') && !location.hash.includes('map-centre=64')")
+    read = "() => document.querySelector('.value').textContent.split(':')[0]"
+    page.wait_for_function("() => document.querySelector('.value').textContent.startsWith('row')")
+    before = page.evaluate(read)
+    page.reload()
+    solved.wait_for_content(page, "maps")
+    box = page.locator("canvas.map").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.wait_for_function(f"(before) => ({read})() === before", arg=before)
+    page.locator("canvas.map").press("0")
+    page.wait_for_function("() => !location.hash.includes('map-')")

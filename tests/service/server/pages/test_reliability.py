@@ -24,7 +24,8 @@ MOST_TABS = 3
 ACTIONS = ("go", "go", "back", "back", "forward", "reload", "tab", "offline", "hasty")
 CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map",
            "capture": "#frames canvas", "job": "#stages tbody tr",
-           "jobs": "#jobs tbody a", "captures": "#captures tbody a"}
+           "jobs": "#jobs tbody a", "captures": "#captures tbody a", "home": ".card",
+           "machines": "#audit tbody tr", "asset": "canvas.scene", "photographs": "[data-shows=photographs] figure canvas"}
 
 
 class Restartable:
@@ -61,7 +62,10 @@ def own(tmp_path_factory) -> Iterator[tuple[Restartable, dict[str, str]]]:
         solve = done(made.server, client, {"kind": "solve", "capture": capture, "options": {"method": "lambert"}})
         for view in ({}, {"maps": solve}):
             done(made.server, client, {"kind": "view", "capture": capture, **view})
-    yield made, Solved(made.server, capture, solve).pages | {"jobs": "/jobs", "captures": "/captures"}
+        asset = done(made.server, client, {"kind": "export", "maps": solve})
+    yield made, Solved(made.server, capture, solve).pages | {
+        "jobs": "/jobs", "captures": "/captures", "home": "/", "machines": "/machines", "asset": f"/asset/{asset}",
+        "photographs": f"/object/{capture}#mode=photographs"}
     made.close()
 
 

@@ -1,37 +1,63 @@
 """The pages on the shipped sample: live relighting is what the batch makes, and pictures of docs/pages.md and of the README, which
 `make screenshots` writes into docs/."""
 
-from pathlib import Path
-
 import pytest
 
-from tests.service.server.pages.conftest import PICTURES, new_context
+from tests.service.server.api.job_calls import admitted
+from tests.service.server.pages.conftest import SAMPLES, done, keep, new_context
 from tests.service.server.pages.frames import assert_same, picture, rendered
+from tests.service.server.pages.photographs import write_photographs
+
+
+@pytest.fixture(scope="module")
+def shown(server, material, sky) -> dict[str, str]:
+    """The addresses of pages by the names of their pictures, of a capture that is solved twice, exported and relit, and of a depth."""
+    with server.client() as client:
+        made = done(server, client, {"kind": "pipeline", "capture": material.capture, "environment": sky, "solve": {"method": "robust"},
+                                     "relight": {"frames": "1-12", "spin_degrees": 360}})
+        done(server, client, {"kind": "view", "capture": material.capture, "maps": made})
+        scanned = admitted(server, client, SAMPLES / "rig")["id"]
+        measured = done(server, client, {"kind": "depth", "capture": scanned})
+        for maps in ({}, {"maps": measured}):
+            done(server, client, {"kind": "view", "capture": scanned, **maps})
+    page = material.pages["object"]
+    return material.pages | {
+        "captures": "/captures", "jobs": "/jobs", "job": f"/jobs/{made}", "maps": f"{material.pages['maps']}#layer=normal&with=roughness",
+        "asset": f"{page}#mode=3d", "compare": f"{page}#mode=compare&how=beside", "frames": f"{page}#mode=frames",
+        "object": f"{page}#mode=photographs", "depth": f"/object/{scanned}#mode=depth", "fault": "/captures/cap_0123456789abcdefghjk",
+        "proposal": "/captures"}
+
+
+CONTENT = {"captures": "#captures a", "jobs": "#jobs tbody a", "job": "#stages tbody tr", "capture": "#frames canvas",
+           "light": "canvas.picture[data-ready]", "maps": "canvas.map", "asset": "canvas.scene", "compare": "canvas.map",
+           "frames": "canvas[data-ready]", "object": "figure canvas", "depth": "canvas.scene", "fault": ".fault-page",
+           "proposal": ".proposal button"}
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["light", "object", "maps", "capture"])
-def test_a_page_shows_the_sample(browser, owl, material, sky, tmp_path, name):
-    sample = material if name == "maps" else owl
-    page = new_context(browser, base_url=sample.server.url, viewport={"width": 1280, "height": 860}, color_scheme="dark").new_page()
-    page.goto(sample.pages[name])
-    sample.wait_for_content(page, name)
-    if name == "light":
-        page.get_by_label("Environment map").select_option(sky)
-        page.locator("canvas.preview").wait_for(timeout=60_000)
-        page.get_by_label("Brightness of the environment").fill("-3")
-        page.get_by_role("button", name="Expose for this light").click()
-    if name == "maps":
-        page.get_by_label("Compare with", exact=True).first.select_option("roughness")
-    if name == "object":
-        page.get_by_role("button", name="Photographs").click()
-        page.locator("[data-shows=photographs] figure").first.wait_for()
-    page.evaluate("() => scrollTo(0, 0)")
-    page.wait_for_timeout(1500)  # the last tiles, and a frame
-    path = (Path(PICTURES) if PICTURES else tmp_path) / f"page_{name}.png"
-    page.screenshot(path=path)
-    assert path.stat().st_size > 50_000
-    page.close()
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_page_shows_the_sample(browser, server, shown, sky, tmp_path, scheme):
+    context = new_context(browser, base_url=server.url, viewport={"width": 1280, "height": 860}, color_scheme=scheme)
+    page = context.new_page()
+    for name, content in CONTENT.items():
+        page.goto("about:blank")
+        page.goto(shown[name])
+        if name == "proposal":
+            page.set_input_files("#folder", write_photographs(tmp_path / "bronze"))
+        page.locator(content).first.wait_for()
+        if name == "light":
+            page.get_by_label("Environment map").select_option(sky)
+            page.locator("canvas.preview").wait_for(timeout=60_000)
+            page.get_by_label("Brightness of the environment").fill("-3")
+            page.get_by_label("View transform").select_option("aces")
+            page.get_by_role("button", name="Expose for this light").click()
+        if name == "depth":
+            page.locator("canvas.scene").scroll_into_view_if_needed()
+        else:
+            page.evaluate("() => scrollTo(0, 0)")
+        page.wait_for_timeout(1500)  # the last tiles, and a frame
+        keep(page, f"{name}_{scheme}", tmp_path)
+    context.close()
 
 
 @pytest.mark.long

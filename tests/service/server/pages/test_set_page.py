@@ -15,7 +15,7 @@ from stage.capture.capture import Capture
 from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+from tests.service.server.pages.conftest import PICTURES, SAMPLES, keep, new_context
 from tests.service.server_process import serving
 
 ROOT = SAMPLES.parent
@@ -138,7 +138,7 @@ def test_from_the_first_click_to_an_asset(browser, tmp_path):
             assert_turns(page)
             assert_accessible(page)
             page.evaluate("() => scrollTo(0, 0)")
-            page.screenshot(path=Path(PICTURES or tmp_path) / "page_set.png")
+            keep(page, "set", tmp_path)
             if PICTURES:  # to solve the sample takes minutes
                 return
             page.get_by_role("button", name="Make an asset").press("Enter")

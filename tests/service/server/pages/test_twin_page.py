@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import pytest
 from service.play.play import play
 from service.requests.play import PlayRequest
 from tests.scenes.patched_rigs import loopback, write_cues_file, write_rig_file
-from tests.service.server.pages.conftest import PICTURES, SAMPLES, new_context
+from tests.service.server.pages.conftest import SAMPLES, keep, new_context
 
 ROOT = SAMPLES.parent
 
@@ -45,7 +44,7 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         brightest = int(np.argmax(steps.reshape(-1, 3)[:, 0]))
         red, green, blue = (round(value / 2.55, 1) for value in steps.reshape(-1, 3)[brightest])
         page.locator("#dome title", has_text=f"lamp {brightest}: {red:.1f} %, {green:.1f} %, {blue:.1f} %").wait_for(state="attached")
-        page.screenshot(path=Path(PICTURES or tmp_path) / "page_twin.png")
+        keep(page, "twin", tmp_path)
         stop.set()
         player.join()
         page.locator("#dome title", has_text=f"lamp {brightest}: 0.0 %, 0.0 %, 0.0 %").wait_for(state="attached")

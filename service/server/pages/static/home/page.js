@@ -140,7 +140,10 @@ byId("bar").addEventListener("input", () => { most = PAGE; draw(); });
 byId("bar").addEventListener("submit", (event) => event.preventDefault());
 byId("more").addEventListener("click", () => { most += PAGE; draw(); });
 new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !byId("more").hidden) byId("more").click(); }, { rootMargin: "600px" }).observe(byId("more"));
-byId("add").addEventListener("click", () => openDropZone(byId("adding").hidden));
+byId("add").addEventListener("click", () => {
+  openDropZone(byId("adding").hidden);
+  if (!byId("adding").hidden) byId("folder").click(); // what most people want; the panel stays for the rest
+});
 addEventListener("dragenter", () => { openDropZone(true); document.body.classList.add("dragging"); });
 for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
 addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));

@@ -9,14 +9,16 @@ import { mountAnnotations } from "./annotations.js";
 import { mountVideo } from "./video.js";
 
 const FIRST_FRAME = 1;
+const FOUND = "The lights of this picture are those that the solve has found. Frames are rendered of a capture whose lights are measured.";
 
 /**
  * Light a capture.
  * @param {HTMLElement} parent Takes it.
  * @param {string} capture Identifier.
- * @param {import("../view/view_file.js").ViewFile} view Of it, without maps.
+ * @param {import("../view/view_file.js").ViewFile} view Of it.
+ * @param {{canRender?: boolean}} [options] Whether the batch can render it: the lights are those of the capture, and not of a solve alone.
  */
-export async function mountLight(parent, capture, view) {
+export async function mountLight(parent, capture, view, { canRender = true } = {}) {
   const batch = {
     last: element("input", { type: "text", inputmode: "numeric", value: "24", size: 5, autocomplete: "off" }),
     spin: element("input", { type: "text", inputmode: "decimal", value: "360", size: 6, autocomplete: "off" }),
@@ -85,7 +87,7 @@ export async function mountLight(parent, capture, view) {
   if (view.info.relight === null) throw new Error("this capture has too few lights to relight it: four or more are needed");
   const environments = await readyEnvironments();
   const [stage, notes] = [element("div"), element("div")];
-  parent.replaceChildren(stage, notes, batchForm());
+  parent.replaceChildren(stage, notes, canRender ? batchForm() : element("p", { class: "help" }, FOUND));
   const viewer = await mount(stage, view, { environments, load: loadEnvironment, onchange: (now) => { light = now; present(); } });
   if (viewer.over !== null) await mountAnnotations(notes, capture, viewer.over);
   mountVideo(stage.querySelector(".view-tools"), view.info.name, viewer);

@@ -1,22 +1,21 @@
 /** The page of one object: what was captured and what was made of it, as modes of one view. Its address says which is shown, and how. */
 
-import { attempt, listing, load, read, resultsOf, save } from "../api.js";
-import { byId, bytes, element, factText, show, words } from "../element.js";
+import { attempt, listing, load, read } from "../api.js";
+import { byId, element, factText, show, words } from "../element.js";
 import { Address, writeNow } from "../publish/address.js";
 import { ViewFile } from "../view/view_file.js";
 import { chosenStep } from "../time_steps.js";
 import { openView } from "../view_jobs.js";
-import { mountAsset } from "./asset.js";
-import { mountLight } from "./light.js";
-import { litFacts, offerSteps } from "./next_steps.js";
-import { mountPhotographs } from "./photographs.js";
+import { newestFiles, presentFiles, presentReport, savingLink } from "./files.js";
+import { offerFusion } from "./fusion.js";
+import { modesOf } from "./modes.js";
+import { litFacts, offerSteps, setPrimary } from "./next_steps.js";
 import { removeLater } from "./removal.js";
-import { mountResults, PREVIEW, viewOf, warningsOf } from "./results.js";
+import { PREVIEW } from "./results.js";
+import { jobsUnderWay, Work } from "./work.js";
 
 const identifier = byId("main").dataset.identifier;
-const MAPS = ["solve", "pipeline", "join"]; // kinds of jobs that make maps
 const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
-const SAVED = /(^|\/)(asset\.(usdz|usda|usdc|glb)|maps\.exr|depth\.exr|points\.ply|mesh\.ply|report\.json|annotations\.json)$/;
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
 const left = new Map(); // what the address said beside the mode when each was left
@@ -28,44 +27,9 @@ async function jobsOfObject() {
   const all = [];
   for await (const job of listing("/v1/jobs?limit=500&state=succeeded", "jobs")) all.push(job);
   const known = new Set();
-  for (const job of all.toReversed()) if (job.request.capture === identifier || known.has(job.request.maps)) known.add(job.id);
+  const goesOn = ({ maps, depths = [], registered }) => [maps, registered, ...depths].some((each) => known.has(each));
+  for (const job of all.toReversed()) if (job.request.capture === identifier || goesOn(job.request)) known.add(job.id);
   return all.filter((job) => known.has(job.id) && job.request.kind !== "view" && job.request.name !== PREVIEW);
-}
-
-/** Return the modes that this object has: what each is called and how it is mounted. */
-function modesOf(view, step, jobs) {
-  const of = (kinds) => jobs.filter((job) => kinds.includes(job.request.kind));
-  const [solved, measured, exported] = [of(MAPS), of(["depth"]), of(["export", "pipeline"])];
-  const nameOf = (job) => `${job.request.name || job.request.options?.method || job.request.kind} (${new Date(job.created_at).toLocaleString([], { dateStyle: "short", timeStyle: "short" })})`;
-  const modes = {};
-  if (view.info.relight !== null && step === null) modes.light = { title: "Light", mount: (parent) => mountLight(parent, identifier, view) };
-  if (solved.length > 0) modes.maps = { title: "Maps", mount: async (parent) => mountResults(parent, await viewOf(solved[0].id, parent)) };
-  if (exported.length > 0) modes["3d"] = { title: "3-D", mount: (parent) => mountAsset(parent, exported[0]) };
-  if (view.info.frames.length > 0) {
-    modes.photographs = { title: "Photographs", mount: async (parent) => {
-      const [dome, frames] = [element("div", { id: "dome" }), element("div", { class: "thumbnails", tabindex: 0, role: "region", "aria-label": "Thumbnails of the photographs" })];
-      parent.replaceChildren(warningsOf(view), element("div", { class: "columns" }, dome, frames));
-      await mountPhotographs(frames, dome, view);
-    } };
-  }
-  if (measured.length > 0) modes.depth = { title: "Depth", mount: async (parent) => mountResults(parent, await viewOf(measured[0].id, parent)) };
-  if (solved.length > 1) modes.compare = { title: "Compare", mount: (parent) => mountCompared(parent, solved, nameOf) };
-  return modes;
-}
-
-/** Show the maps of two jobs beside each other, which a person chooses; at first the two newest. */
-async function mountCompared(parent, jobs, nameOf) {
-  const choice = (label, index) => element("select", { "aria-label": label }, ...jobs.map((job, at) => element("option", { value: job.id, selected: at === index }, nameOf(job))));
-  const [first, second] = [choice("Maps", 0), choice("Compared with", 1)];
-  const place = element("div");
-  const again = () => attempt(async () => {
-    const [one, other] = await Promise.all([first.value, second.value].map((job) => viewOf(job, place)));
-    if (one.info.rows !== other.info.rows || one.info.cols !== other.info.cols) throw new Error("these maps have different sizes");
-    await mountResults(place, one, [{ name: second.selectedOptions[0].textContent, view: other }]);
-  });
-  for (const each of [first, second]) each.addEventListener("change", again);
-  parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Maps ", first), element("label", {}, "compared with ", second)), place);
-  await again();
 }
 
 /** Show a mode; one that was shown before is as it was left. */
@@ -105,19 +69,30 @@ function follow({ oldURL }) {
   else choose(wanted.mode);
 }
 
-async function presentFiles(jobs) {
-  const seen = new Set();
-  for (const job of jobs) {
-    for await (const result of listing(`/v1/jobs/${job.id}/results`, "results", "after")) {
-      const name = result.name.split("/").at(-1);
-      if (!SAVED.test(result.name) || seen.has(name)) continue; // the newest of each name
-      seen.add(name);
-      if (name === "report.json") byId("report").textContent = JSON.stringify(await resultsOf(job.id).json(result.name), null, 1);
-      else byId("files").append(element("li", {}, element("a", { href: result.url, onclick: (event) => { event.preventDefault(); attempt(() => save(result.url)); } }, name), ` ${bytes(result.size)}`));
-    }
+/** Take the modes of what there is now; one that showed an older job is shown anew when it is chosen. */
+function takeModes(found) {
+  for (const [name, { job }] of Object.entries(found)) {
+    if (name === shown || job === modes[name]?.job) continue;
+    places.get(name)?.remove();
+    places.delete(name);
   }
-  show(byId("report-part"), seen.has("report.json"));
-  show(byId("files-part"), byId("files").children.length > 0);
+  modes = found;
+  byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name,
+    "aria-pressed": String(name === shown), onclick: () => go(name) }, title)));
+}
+
+/** Show what was made, and what can be made next; the newest asset is one click away. */
+async function present(jobs, facts, work) {
+  const done = jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]);
+  offerSteps(byId("next"), facts, identifier, done, (job) => work.follow(job));
+  await offerFusion(byId("fusion"), identifier, jobs, (job) => work.follow(job));
+  const files = await newestFiles(jobs);
+  presentFiles(byId("files"), files);
+  show(byId("files-part"), files.length > 0);
+  presentReport(byId("report-part"), files);
+  const asset = files.find(({ name }) => name === "asset.usdz");
+  byId("save").replaceChildren(...(asset === undefined ? [] : [savingLink(asset, "Save asset.usdz", { class: "button" })]));
+  setPrimary(byId("next"));
 }
 
 await load(async () => {
@@ -132,18 +107,23 @@ await load(async () => {
   }
   const step = await chosenStep(identifier);
   const [view, jobs] = await Promise.all([openView(identifier, null, step, byId("view")).then(({ files }) => ViewFile.open(files)), jobsOfObject()]);
-  modes = modesOf(view, step, jobs);
-  offerSteps(byId("next"), litFacts(capture.facts ?? {}, view), identifier, jobs.flatMap(({ request: { kind } }) => [kind, ...(MADE_BY[kind] ?? [])]));
+  const facts = litFacts(capture.facts ?? {}, view);
+  const work = new Work(byId("work"), async () => {
+    const now = await jobsOfObject();
+    takeModes(modesOf(identifier, view, step, now, facts));
+    await present(now, facts, work);
+  });
+  takeModes(modesOf(identifier, view, step, jobs, facts));
   const wanted = { mode: "" };
   address.read(wanted);
-  byId("modes").replaceChildren(...Object.entries(modes).map(([name, { title }]) => element("button", { type: "button", class: "quiet", "data-mode": name, "aria-pressed": "false",
-    onclick: () => go(name) }, title)));
   const first = wanted.mode in modes ? wanted.mode : Object.keys(modes)[0];
+  const presented = attempt(() => present(jobs, facts, work));
   if (first === undefined) byId("view").replaceChildren(element("p", {}, "There is nothing to show of this capture yet."));
   else {
     address.write({ mode: first });
     addEventListener("hashchange", follow);
     await choose(first);
   }
-  await presentFiles(jobs);
+  await presented;
+  for (const job of await jobsUnderWay(identifier)) work.follow(job);
 });

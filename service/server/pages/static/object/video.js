@@ -1,4 +1,4 @@
-/** A video of the object while its light turns once around, recorded by the browser from what it shows. */
+/** Videos of what a canvas shows, recorded by the browser in what it can encode. */
 
 import { attempt } from "../api.js";
 import { element } from "../element.js";
@@ -9,18 +9,35 @@ const PICTURES_PER_S = 30;
 const BITS_PER_S = 8_000_000;
 
 /**
- * Offer the video where the browser can record one.
+ * Offer a video of the object while its light turns once around.
  * @param {HTMLElement|null} tools Takes the button; null: there is no picture.
  * @param {string} name Of the object.
  * @param {{canvas: HTMLCanvasElement, turn: function(number): void}} viewer
  */
 export function mountVideo(tools, name, viewer) {
+  let before = 0;
+  if (tools !== null) offerVideo(tools, name, viewer.canvas, SECONDS, (share) => {
+    viewer.turn(360 * (share - before));
+    before = share < 1 ? share : 0;
+  });
+}
+
+/**
+ * Offer a video where the browser can record one.
+ * @param {HTMLElement} tools Takes the button.
+ * @param {string} name Of the file, without its suffix.
+ * @param {HTMLCanvasElement} canvas
+ * @param {number} seconds How long it is.
+ * @param {function(number): void} show Shows the picture at a share of the video, 0 to 1.
+ */
+export function offerVideo(tools, name, canvas, seconds, show) {
   const format = FORMATS.find((each) => globalThis.MediaRecorder?.isTypeSupported(each));
-  if (tools === null || format === undefined) return;
+  if (format === undefined) return;
   const button = element("button", { type: "button", class: "quiet", onclick: () => attempt(async () => {
     button.disabled = true;
     try {
-      save(await recorded(viewer, format, (share) => { button.textContent = `Recording ${Math.round(100 * share)} %`; }), `${name}.${format.slice(6).split(";")[0]}`);
+      const told = (share) => { show(share); button.textContent = `Recording ${Math.round(100 * share)} %`; };
+      save(await recorded(canvas, format, seconds, told), `${name}.${format.slice(6).split(";")[0]}`);
     } finally {
       button.disabled = false;
       button.textContent = "Save a video";
@@ -29,22 +46,19 @@ export function mountVideo(tools, name, viewer) {
   tools.append(button);
 }
 
-/** Turn the light once around, and return what is seen meanwhile. */
-function recorded(viewer, format, progress) {
+/** Return what a canvas shows while `show` is called with shares of the time from 0 to 1. */
+function recorded(canvas, format, seconds, show) {
   return new Promise((resolve, reject) => {
     const parts = [];
-    const recorder = new MediaRecorder(viewer.canvas.captureStream(PICTURES_PER_S), { mimeType: format, videoBitsPerSecond: BITS_PER_S });
+    const recorder = new MediaRecorder(canvas.captureStream(PICTURES_PER_S), { mimeType: format, videoBitsPerSecond: BITS_PER_S });
     recorder.addEventListener("dataavailable", ({ data }) => parts.push(data));
     recorder.addEventListener("stop", () => resolve(new Blob(parts, { type: format })));
     recorder.addEventListener("error", () => { reject(new Error("the browser cannot record what it shows")); });
     recorder.start();
     const began = performance.now();
-    let before = 0;
     const step = (now) => {
-      const share = Math.min(1, Math.max(0, now - began) / (1000 * SECONDS));
-      viewer.turn(360 * (share - before));
-      before = share;
-      progress(share);
+      const share = Math.min(1, Math.max(0, now - began) / (1000 * seconds));
+      show(share);
       if (share < 1) requestAnimationFrame(step);
       else recorder.stop();
     };

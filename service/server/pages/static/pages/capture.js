@@ -5,7 +5,7 @@ import { byId, element, factText, show, words } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
 import { JobsTable } from "../jobs_table.js";
-import { heldBy, litFacts, offerSteps } from "../object/next_steps.js";
+import { hasUnknownLights, heldBy, litFacts, offerSteps, setPrimary } from "../object/next_steps.js";
 import { mountPhotographs } from "../object/photographs.js";
 import { removeLater } from "../object/removal.js";
 import { proposalOf } from "../upload/proposal.js";
@@ -58,11 +58,15 @@ function present(capture) {
 /** Show what can be done with a capture that holds this: what it is made for as buttons, the same with options, and the rest behind More. */
 function offer(facts) {
   const holds = heldBy(facts);
-  const first = offerSteps(byId("next"), facts, identifier);
-  if (!holds.includes("light")) byId("next").querySelector("[data-kind]:not([hidden])")?.classList.remove("quiet"); // else lighting it comes first
+  const first = offerSteps(byId("next"), facts, identifier, [], toObject);
+  setPrimary(byId("next"));
   for (const box of byId("more").querySelectorAll(".job-form")) {
     if (holds.length > 0 && !box.dataset.begins.split(" ").some((each) => holds.includes(each))) box.remove();
     else if (first.includes(box.querySelector("form").dataset.kind)) byId("first").append(box);
+  }
+  for (const group of byId("more").querySelectorAll("[data-group]")) show(group, group.querySelector(".job-form") !== null);
+  if (hasUnknownLights(facts)) {
+    for (const choice of byId("work").querySelectorAll("[data-kind=solve] [data-name=lights] select, [data-kind=pipeline] [data-name=lights] select")) choice.value = "unknown";
   }
   offerPreview(byId("preview"), byId("previewed"), identifier, facts, first[0]);
   const list = calibrationList(facts, byId("more"));
@@ -71,12 +75,22 @@ function offer(facts) {
   show(byId("work"), true);
 }
 
+async function fillTable() {
+  for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job);
+}
+
+/** Go where a job that was begun is followed, and what it makes is shown. */
+function toObject() {
+  location.assign(`/object/${identifier}`);
+}
+
 async function look(facts) {
   const step = await chosenStep(identifier);
   const { files } = await openView(identifier, null, step, byId("preparing"));
   const view = await ViewFile.open(files);
-  if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier);
+  if (heldBy(facts).length === 0) offerSteps(byId("next"), litFacts(facts, view), identifier, [], toObject);
   show(byId("relight"), view.info.relight !== null && step === null);
+  setPrimary(byId("next"));
   byId("findings").replaceChildren(...view.info.findings.map((finding) => element("li", {}, finding)));
   if (view.info.frames.length === 0) return;
   show(byId("lights"), true);
@@ -84,6 +98,5 @@ async function look(facts) {
 }
 
 byId("delete").addEventListener("click", () => removeLater(`/v1/captures/${identifier}`, byId("name").textContent, "/captures"));
-await load(open);
-await load(async () => { for await (const job of listing("/v1/jobs?limit=500", "jobs")) table.put(job); });
+await load(() => Promise.all([open(), fillTable()]));
 await attempt(() => watch("/v1/events", { job: (job) => table.put(job), gone: ({ id }) => table.drop(id) }));

@@ -4,6 +4,7 @@ import { listing, load } from "../api.js";
 import { askHowToImport, mountDropZone } from "../upload/drop_zone.js";
 import { byId, element, time } from "../element.js";
 
+/** Return what fills a list, when all of it is here. */
 async function list(what) {
   const body = byId(what).tBodies[0];
   const rows = [];
@@ -13,7 +14,7 @@ async function list(what) {
       element("td", {}, element("span", { class: `state ${item.state}` }, item.state)),
       element("td", {}, item.problem ?? content(item.facts), " ", question(item)), element("td", {}, time(item.created_at))));
   }
-  body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
+  return () => body.replaceChildren(...(rows.length > 0 ? rows : [element("tr", {}, element("td", { colspan: 4 }, `There are no ${what} yet.`))]));
 }
 
 /** Return the button that asks how files are imported that were looked at, perhaps in another tab; null where there is nothing to ask. */
@@ -31,5 +32,5 @@ function content(facts) {
   return parts.join(", ");
 }
 
-mountDropZone(list);
-await load(() => Promise.all([list("captures"), list("environments")]));
+mountDropZone(async (what) => (await list(what))());
+await load(async () => { for (const fill of await Promise.all([list("captures"), list("environments")])) fill(); });

@@ -116,7 +116,7 @@ export async function mountObject(parent, view, directions, frames, space) {
   const stops = element("input", { type: "range", min: -10, max: 10, step: 0.1, value: 0, "aria-label": "Exposure of the object in stops" });
   const renderer = new BasisRenderer(canvas, relight, view.info.color_space, new Uint16Array(index));
   renderer.setMatte(new Uint8Array(matte));
-  for (const [term, block] of relight.basis.entries()) renderer.setTerm(term, new Uint16Array(await view.block(block)));
+  for (const [term, block] of relight.basis.entries()) await renderer.setTerm(term, new Uint16Array(await view.block(block)));
   const matrix = matrixBetween(space, view.info.color_space);
   const nearest = directions.map((direction) => nearestOf(direction, lights.map((each) => each.direction)).index);
   let shown = 0;

@@ -1,10 +1,14 @@
 /** The page of one job: progress, stages, log and results, and what can be done with it. */
 
-import { attempt, listing, load, post, read, Refusal, remove, resultsOf, save } from "../api.js";
-import { byId, bytes, duration, element, show, time, words } from "../element.js";
+import { attempt, listing, load, post, read, resultsOf, save } from "../api.js";
+import { byId, bytes, duration, element, show, time } from "../element.js";
 import { watch } from "../events.js";
 import { enableForms } from "../form.js";
 import { titleOf } from "../jobs_table.js";
+import { setPrimary } from "../object/next_steps.js";
+import { removeLater } from "../object/removal.js";
+import { requestRows } from "../object/request.js";
+import { reloadWhenBack } from "../repeat.js";
 
 const identifier = byId("main").dataset.identifier;
 const ENDED = ["succeeded", "failed", "cancelled"];
@@ -41,43 +45,10 @@ function present(job) {
 
 /** Show what was asked for as the form of its kind names it: inputs and what differs from the defaults, and the rest folded away. */
 async function presentRequest(job) {
-  const valueAt = (path) => path.split(".").reduce((value, name) => value?.[name], job.request) ?? "";
-  const given = [[], []]; // chosen, and as it is by default
-  if (job.request.name) given[0].push(["Name", job.request.name]);
-  for (const { paths, label, default: usual } of await formWords(job.request.kind)) {
-    const value = valueAt(paths[0]);
-    if (value === "" || value.length === 0 || (label === "Name" && paths[0] === "name")) continue;
-    const isUsual = valueText(value) === usual || (value === false && usual === "");
-    given[Number(isUsual)].push([label, value]);
-  }
-  const [chosen, usual] = given.map((rows) => rows.flatMap(([label, value]) => [element("dt", {}, label), element("dd", {}, ...[value].flat().flatMap((each, at) => [at > 0 ? ", " : "", link(each)]))]));
+  const { chosen, usual } = await requestRows(job);
   byId("request").replaceChildren(...chosen);
   byId("usual").replaceChildren(...usual);
   show(byId("usual-part"), usual.length > 0);
-}
-
-/** Return how the form of a kind names its fields; jobs that the service makes on its own have no form, and their fields are named by themselves. */
-async function formWords(kind) {
-  try {
-    return await read(`/forms/${kind}`);
-  } catch (error) {
-    if (!(error instanceof Refusal && error.status === 422)) throw error;
-    return ["capture", "maps", "intake"].map((name) => ({ paths: [name], label: words(name), default: "" }));
-  }
-}
-
-/** Return a value of a request as a person reads it: a document by its name, or by how much it holds. */
-function valueText(value) {
-  if (typeof value === "boolean") return value ? "true" : "";
-  if (typeof value !== "object") return String(value);
-  if (Array.isArray(value)) return value.map(valueText).join(",");
-  return value.name ?? value.schema ?? `${Object.keys(value).length} values`;
-}
-
-function link(value) {
-  if (/^cap_/.test(value)) return element("a", { href: `/captures/${value}` }, value);
-  if (/^job_/.test(value)) return element("a", { href: `/jobs/${value}` }, value);
-  return typeof value === "boolean" ? (value ? "yes" : "no") : valueText(value);
 }
 
 async function log() {
@@ -100,6 +71,7 @@ async function presentResults(job) {
   offer("cues", job.state === "succeeded" && names.includes("cues.json"), `/drive/${identifier}`);
   offer("asset", job.state === "succeeded" && names.some((name) => /^asset\.(usdz|glb)$/.test(name)), `/asset/${identifier}`);
   offer("light", job.request.capture !== undefined && job.request.kind !== "depth" && !names.includes(SEQUENCE), `/light/${job.request.capture}`);
+  setPrimary(byId("object").parentElement);
   const forms = [...byId("work").querySelectorAll("form[data-kind]")];
   const fitting = job.state === "succeeded" ? forms.filter((form) => form.closest(".job-form").dataset.begins.split(" ").some((name) => names.includes(name))) : [];
   if (fitting.length > 0 && byId("work").hidden) {
@@ -129,15 +101,22 @@ function download(event, result) {
 
 async function follow() {
   let job = await read(`/v1/jobs/${identifier}`);
-  attempt(() => presentRequest(job));
+  const request = attempt(() => presentRequest(job));
   present(job);
   const results = attempt(() => presentResults(job)); // the job is followed whether or not they can be had now
+  await request;
   if (ENDED.includes(job.state)) {
     await results;
     return;
   }
-  await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
-  job = await read(`/v1/jobs/${identifier}`);
+  attempt(async () => { // for as long as the job runs, while the page shows how far it is
+    await watch(`/v1/jobs/${identifier}/events`, { job: (now) => { job = now; present(now); } });
+    await ended();
+  }, { again: reloadWhenBack, onaway: reloadWhenBack });
+}
+
+async function ended() {
+  const job = await read(`/v1/jobs/${identifier}`);
   present(job);
   await presentResults(job);
 }
@@ -148,9 +127,5 @@ for (const [id, action] of Object.entries({ cancel: "cancel", retry: "retry", re
     if (action !== "cancel") await follow();
   }));
 }
-byId("delete").addEventListener("click", () => attempt(async () => {
-  if (!confirm("Delete this job and its results?")) return;
-  await remove(`/v1/jobs/${identifier}`);
-  location.assign("/jobs");
-}));
+byId("delete").addEventListener("click", () => removeLater(`/v1/jobs/${identifier}`, byId("name").textContent, "/jobs"));
 await load(follow);

@@ -2,6 +2,7 @@
 
 import { attempt, submitJob } from "../api.js";
 import { show } from "../element.js";
+import { requestOf } from "../object/next_steps.js";
 import { mountResults, PREVIEW, viewOf } from "../object/results.js";
 import { followed } from "../view_jobs.js";
 
@@ -22,7 +23,8 @@ export function middleOf([width, height]) {
  * @param {{resolution?: number[], captures?: number}} facts Of the capture.
  * @param {string|undefined} step The kind of job that is offered first.
  */
-export function offerPreview(button, place, capture, { resolution, captures }, step) {
+export function offerPreview(button, place, capture, facts, step) {
+  const { resolution, captures } = facts;
   const kind = MADE_BY[step];
   if (kind === undefined || captures !== 1 || resolution === undefined || Math.min(...resolution) < LEAST_PX) return;
   show(button, true);
@@ -30,7 +32,8 @@ export function offerPreview(button, place, capture, { resolution, captures }, s
     button.disabled = true;
     try {
       place.replaceChildren();
-      const job = await followed(await submitJob({ kind, capture, name: PREVIEW, options: { crop: middleOf(resolution) } }), place,
+      const wanted = requestOf(kind, capture, facts);
+      const job = await followed(await submitJob({ ...wanted, name: PREVIEW, options: { ...wanted.options, crop: middleOf(resolution) } }), place,
         "The middle of the frames is solved, a quarter of their pixels.", "the preview was not made");
       await mountResults(place, await viewOf(job.id, place));
     } finally {

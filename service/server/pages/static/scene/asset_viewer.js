@@ -7,6 +7,8 @@ import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lightin
 import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
 import { VIEW_TRANSFORM } from "../view/display.js";
 import { previewOf, readEnvironment } from "../view/environment_map.js";
+import { Address } from "../publish/address.js";
+import { ControlAddress } from "../view/control_address.js";
 import { Distance, lengthText } from "./distance.js";
 import { OrbitScene } from "./orbit_scene.js";
 import { RigLights } from "./rig_lights.js";
@@ -156,6 +158,16 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     control.environment.value = "";
     if (given !== undefined) use(async () => ({ name: given.name, data: await given.arrayBuffer() }));
   });
+  for (const option of [...control.surface.options]) if (!surfaces.has(option.value)) option.remove();
+  const [address, camera] = [new ControlAddress({ "lit-by": control.lit, surface: control.surface, markers: control.markers, shadows: control.shadows }), new Address({ camera: 6 })];
+  address.read();
+  if (control.lit.value === MAP) control.lit.value = ROOM; // of a file that is not open yet
+  const given = {};
+  camera.read(given);
+  if (given.camera !== undefined) view.place = given.camera;
+  view.onmove(() => camera.write({ camera: view.place }));
+  panel.addEventListener("change", () => address.write());
+  surfaces.show(control.surface.value);
   light();
 
   return {

@@ -102,6 +102,22 @@ export class OrbitScene {
     return { rows, cols, pixels };
   }
 
+  /** Where the camera stands and what it looks at, from the middle of the object, in its radii: six numbers. */
+  get place() {
+    return [this.camera.position, this.#controls.target].flatMap((each) => each.clone().sub(this.center).divideScalar(this.radius).toArray());
+  }
+
+  set place(numbers) {
+    [this.camera.position, this.#controls.target].forEach((each, at) => each.fromArray(numbers, 3 * at).multiplyScalar(this.radius).add(this.center));
+    this.#controls.update();
+    this.changed();
+  }
+
+  /** Call a function when the camera has moved. */
+  onmove(action) {
+    this.#controls.addEventListener("change", action);
+  }
+
   /** Show the first view again. */
   reset() {
     this.#controls.reset();

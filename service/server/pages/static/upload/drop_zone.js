@@ -97,11 +97,17 @@ async function end(what, found, line, status, link) {
   line.append(await proposalOf(found, async (importing) => {
     status.textContent = "being imported";
     const imported = await settled(importing, "captures", link);
-    if (imported.state === "ready") await end(what, imported, line, status, link);
+    if (imported.state === "ready" && isOnly(line)) location.assign(`/object/${imported.id}`);
+    else if (imported.state === "ready") await end(what, imported, line, status, link);
     else status.textContent = "";
     await changed(what);
     return imported;
   }));
+}
+
+/** Return whether nothing else is sent, looked at or asked about, so that the page may be left. */
+function isOnly(line) {
+  return [...byId("uploads").querySelectorAll("progress, .proposal")].every((each) => line.contains(each));
 }
 
 async function take(found) {

@@ -18,6 +18,7 @@ export async function proposalOf(capture, done) {
   const shown = element("div", { class: "proposal" },
     element("p", {}, element("strong", {}, proposal.summary)),
     element("p", {}, proposal.sure ? "Sure" : "Not sure", `: ${proposal.because}.`),
+    proposal.lights === "unknown" ? element("p", {}, "Lights unknown: they are taken for distant ones, and found from the photographs when these are solved.") : null,
     proposal.assumed.length === 0 ? null : element("p", {}, "Taken for granted: "),
     element("ul", {}, ...proposal.assumed.map((sentence) => element("li", {}, sentence.replace(/--[a-z-]+/g, (flag) => labels.get(flag) ?? flag)))), form);
   form.addEventListener("submit", async (event) => {

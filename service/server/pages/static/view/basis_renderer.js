@@ -15,6 +15,7 @@ const FRAGMENT = `#version 300 es
 precision highp float;
 precision highp sampler2DArray;
 precision highp usampler2D;
+precision highp sampler3D;
 uniform sampler2DArray basis;
 uniform sampler2D matte;
 uniform sampler2D coefficients;   // a column for each term; a row for each tile left of the wipe, then for each right of it
@@ -23,27 +24,41 @@ uniform int side;                 // of a tile, pixels
 uniform int tileCount;
 uniform int terms;
 uniform float border;             // of the wipe, in pixels
-uniform float height;
+uniform int stride;               // pixels of the capture in a row, of which one is drawn
+uniform float height;             // of what is drawn
 uniform float gain;
+uniform sampler3D table;          // of a view transform, over the stops of red, green and blue
+uniform vec3 range;               // of the table: whether it is used, its first stop, its stops
 uniform mat3 rec709;              // from the working space
 uniform vec3 backdrop;            // encoded
 out vec4 colour;
 void main() {
-  ivec2 place = ivec2(gl_FragCoord.x, height - gl_FragCoord.y);  // the first row is at the top
+  ivec2 place = ivec2(gl_FragCoord.x, height - gl_FragCoord.y) * stride + stride / 2;  // the first row is at the top
+  place = min(place, textureSize(matte, 0) - 1);
   float cover = texelFetch(matte, place, 0).r;
   if (cover == 0.0) {
     colour = vec4(backdrop, 1.0);
     return;
   }
   vec3 sum = vec3(0.0);
-  int row = int(texelFetch(tiles, place / side, 0).r) + (gl_FragCoord.x < border ? 0 : tileCount);
+  int row = int(texelFetch(tiles, place / side, 0).r) + (float(place.x) + 0.5 < border ? 0 : tileCount);
   for (int k = 0; k < terms; k++) {
     sum += texelFetch(coefficients, ivec2(k, row), 0).rgb * texelFetch(basis, ivec3(place, k), 0).rgb;
   }
-  vec3 linear = clamp(rec709 * (gain * sum), 0.0, 1.0);
-  vec3 encoded = mix(12.92 * linear, 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, vec3(greaterThan(linear, vec3(0.0031308))));
+  vec3 scene = rec709 * (gain * sum);
+  vec3 encoded;
+  if (range.x > 0.0) {
+    float side = float(textureSize(table, 0).x);
+    vec3 stops = clamp((log2(max(scene, 1e-6)) - range.y) / range.z, 0.0, 1.0);
+    encoded = texture(table, (0.5 + stops * (side - 1.0)) / side).rgb * cover;
+  } else {
+    vec3 linear = clamp(scene, 0.0, 1.0);
+    encoded = mix(12.92 * linear, 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, vec3(greaterThan(linear, vec3(0.0031308))));
+  }
   colour = vec4(encoded + (1.0 - cover) * backdrop, 1.0);
 }`;
+
+const SLICE = 1 << 18; // pixels that are put into a texture at once
 
 /** Return whether this browser can relight. */
 export function canRender() {
@@ -67,12 +82,13 @@ export class BasisRenderer {
     this.relight = relight;
     const program = link(gl, VERTEX, FRAGMENT);
     gl.useProgram(program);
-    const names = ["height", "basis", "matte", "coefficients", "terms", "border", "gain", "rec709", "backdrop", "tiles", "side", "tileCount"];
+    const names = ["height", "basis", "matte", "coefficients", "terms", "border", "gain", "rec709", "backdrop", "tiles", "side", "tileCount", "stride", "table", "range"];
     this.#places = Object.fromEntries(names.map((name) => [name, gl.getUniformLocation(program, name)]));
     gl.uniform1i(this.#places.basis, 0);
     gl.uniform1i(this.#places.matte, 1);
     gl.uniform1i(this.#places.coefficients, 2);
     gl.uniform1i(this.#places.tiles, 3);
+    gl.uniform1i(this.#places.table, 4);
     gl.uniform1i(this.#places.terms, relight.terms);
     gl.uniform1i(this.#places.side, relight.tiles.side);
     gl.uniform1i(this.#places.tileCount, relight.tiles.count);
@@ -90,22 +106,28 @@ export class BasisRenderer {
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.R16UI, relight.tiles.cols, relight.tiles.rows, 0, gl.RED_INTEGER, gl.UNSIGNED_SHORT, tiles);
     this.#sampling(gl.TEXTURE_2D);
+    this.setView(null);
     this.timer = new FrameTimer(gl);
   }
 
-  /** Take a coefficient image: half floats [3, rows, cols]. */
-  setTerm(term, planes) {
+  /** Take a coefficient image, half floats [3, rows, cols], some rows at a time, between which the page answers its user. */
+  async setTerm(term, planes) {
     const gl = this.#gl;
     const { rows, cols } = this.relight;
     const count = rows * cols;
-    const pixels = new Uint16Array(4 * count); // four channels are read faster than three
-    for (let at = 0; at < count; at += 1) {
-      pixels[4 * at] = planes[at];
-      pixels[4 * at + 1] = planes[count + at];
-      pixels[4 * at + 2] = planes[2 * count + at];
+    const most = Math.max(1, Math.floor(SLICE / cols));
+    const pixels = new Uint16Array(4 * cols * Math.min(most, rows)); // four channels are read faster than three
+    for (let row = 0; row < rows; row += most) {
+      const some = Math.min(most, rows - row);
+      for (let at = 0, from = row * cols; at < some * cols; at += 1, from += 1) {
+        pixels[4 * at] = planes[from];
+        pixels[4 * at + 1] = planes[count + from];
+        pixels[4 * at + 2] = planes[2 * count + from];
+      }
+      gl.activeTexture(gl.TEXTURE0);
+      gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, row, term, cols, some, 1, gl.RGBA, gl.HALF_FLOAT, pixels);
+      if (row + some < rows) await new Promise((resolve) => { setTimeout(resolve); });
     }
-    gl.activeTexture(gl.TEXTURE0);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, term, cols, rows, 1, gl.RGBA, gl.HALF_FLOAT, pixels);
   }
 
   /** Take the coverage: bytes [rows, cols]. */
@@ -117,23 +139,62 @@ export class BasisRenderer {
     this.#sampling(gl.TEXTURE_2D);
   }
 
+  /** Show linear light through a table of view_transforms.js; null: clipped, and encoded as sRGB. */
+  setView(table) {
+    const gl = this.#gl;
+    const { side, bytes, first, stops } = table ?? { side: 1, bytes: new Uint8Array(3), first: 0, stops: 1 };
+    gl.activeTexture(gl.TEXTURE4);
+    gl.bindTexture(gl.TEXTURE_3D, gl.createTexture());
+    gl.texImage3D(gl.TEXTURE_3D, 0, gl.RGB8, side, side, side, 0, gl.RGB, gl.UNSIGNED_BYTE, bytes);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_3D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T, gl.TEXTURE_WRAP_R]) gl.texParameteri(gl.TEXTURE_3D, name, gl.CLAMP_TO_EDGE);
+    gl.uniform3f(this.#places.range, table === null ? 0 : 1, first, stops);
+  }
+
   /**
    * Draw the picture.
-   * @param {{shown: Float32Array, compared: Float32Array|null, border: number, gain: number, backdrop: number[]}} picture Coefficients
-   * [tiles, terms, 3] left and right of the border (0 to 1; null: there is nothing right of it); gain; encoded colour behind the object.
+   * @param {{shown: Float32Array, compared: Float32Array|null, border: number, gain: number, backdrop: number[], stride?: number, band?: number[], isSame?: boolean}} picture Coefficients
+   * [tiles, terms, 3] left and right of the border (0 to 1; null: there is nothing right of it); gain; encoded colour behind the object; of how many pixels
+   * in a row and a column one is drawn, all of them at the bottom left of the canvas; rows from and to which is drawn; whether the coefficients are those before.
    */
-  draw({ shown, compared, border, gain, backdrop }) {
+  draw({ shown, compared, border, gain, backdrop, stride = 1, band = null, isSame = false }) {
     const gl = this.#gl;
-    const { width, height } = this.canvas;
+    const [width, height] = this.sizeOf(stride);
     gl.viewport(0, 0, width, height);
+    const [from, to] = band ?? [0, height];
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(0, height - to, width, to - from);
+    gl.uniform1i(this.#places.stride, stride);
     gl.uniform1f(this.#places.height, height);
     gl.activeTexture(gl.TEXTURE2);
     const { terms, tiles: { count } } = this.relight;
-    [shown, compared].forEach((each, side) => each !== null && gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, side * count, terms, count, gl.RGB, gl.FLOAT, each));
-    gl.uniform1f(this.#places.border, compared === null ? width : border * width);
+    [shown, compared].forEach((each, side) => each !== null && !isSame && gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, side * count, terms, count, gl.RGB, gl.FLOAT, each));
+    gl.uniform1f(this.#places.border, (compared === null ? 1 : border) * this.canvas.width);
     gl.uniform1f(this.#places.gain, gain);
     gl.uniform3f(this.#places.backdrop, ...backdrop);
-    this.timer.during(() => gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4));
+    const drawing = () => gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    if (band === null) this.timer.during(drawing);
+    else drawing(); // a part, after the motion
+  }
+
+  /** Return width and height of a picture of one of so many pixels in a row. */
+  sizeOf(stride) {
+    return [Math.ceil(this.canvas.width / stride), Math.ceil(this.canvas.height / stride)];
+  }
+
+  /** Return what says when all is drawn that was asked for so far. */
+  fence() {
+    const fence = this.#gl.fenceSync(this.#gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.#gl.flush();
+    return fence;
+  }
+
+  /** Return whether what was asked for before a fence is drawn, and forget the fence then. */
+  isPast(fence) {
+    const gl = this.#gl;
+    if (!gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+    gl.deleteSync(fence);
+    return true;
   }
 
   /** Return the bytes [height, width, 4] of what was drawn, from the top. */

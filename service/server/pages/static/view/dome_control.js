@@ -2,7 +2,7 @@
 
 import { placeOf } from "../dome.js";
 import { element } from "../element.js";
-import { unit } from "./light_model.js";
+import { unit } from "./disc_light.js";
 
 const SIDE = 240;
 const STEP_DEGREES = 5;

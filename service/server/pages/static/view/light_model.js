@@ -5,11 +5,10 @@
  * Directions are those of environment maps: +y at the top, +z in the middle, +x a quarter from the left edge.
  */
 
+import { discSamples } from "./disc_light.js";
 import { covariance, quadratureWeights } from "./kernel_quadrature.js";
 
-const MIN_SAMPLES = 64;
 const WHOLE = 1 - 1e-6; // but for rounding
-const GOLDEN = Math.PI * (3 - Math.sqrt(5));
 
 /** Light as sums over its directions, in three channels. */
 class LightSum {
@@ -198,28 +197,6 @@ export class LightModel {
   }
 }
 
-/** The energy of an environment map in rows as high as the grid's, whose columns can be turned. */
-export class EnvironmentProfile {
-  /**
-   * @param {{rows: number, cols: number, pixels: Float32Array}} map Radiance [rows, cols, 3], linear.
-   * @param {number} rows Of the grid.
-   */
-  constructor(map, rows) {
-    this.cols = map.cols;
-    this.energy = new Float64Array(3 * rows * map.cols);
-    for (let row = 0; row < map.rows; row += 1) {
-      const polar = (Math.PI * (row + 0.5)) / map.rows;
-      const solidAngle = Math.sin(polar) * (Math.PI / map.rows) * ((2 * Math.PI) / map.cols);
-      const place = ((row + 0.5) / map.rows) * rows - 0.5; // shared by the two nearest rows of the grid
-      const top = Math.floor(place);
-      for (const [to, part] of [[top, 1 - (place - top)], [top + 1, place - top]]) {
-        const into = 3 * Math.max(0, Math.min(rows - 1, to)) * map.cols;
-        for (let at = 0; at < 3 * map.cols; at += 1) this.energy[into + at] += part * solidAngle * map.pixels[3 * row * map.cols + at];
-      }
-    }
-  }
-}
-
 /**
  * Add colours times a weight in each channel to others.
  * @param {Float32Array} found [n, 3]
@@ -235,33 +212,6 @@ export function addWeighted(found, colours, [red, green, blue]) {
   }
 }
 
-/** Return directions spread evenly over a disc on the sphere (Vogel 1979). */
-export function discSamples(direction, angleDegrees) {
-  const low = 2 * Math.sin((angleDegrees * Math.PI) / 720) ** 2;
-  const count = Math.max(MIN_SAMPLES, Math.ceil((2 * Math.PI * low) / (Math.PI / 90) ** 2));
-  const axis = direction.map(Math.abs);
-  const helper = [0, 0, 0];
-  helper[axis.indexOf(Math.min(...axis))] = 1;
-  const x = unit(cross(direction, helper));
-  const y = cross(direction, x);
-  return Array.from({ length: count }, (_, index) => {
-    const fall = ((index + 0.5) / count) * low;
-    const across = Math.sqrt(fall * (2 - fall));
-    const turn = (index + 0.5) * GOLDEN;
-    return [0, 1, 2].map((c) => across * Math.cos(turn) * x[c] + across * Math.sin(turn) * y[c] + (1 - fall) * direction[c]);
-  });
-}
-
-/** Return a vector of length one. */
-export function unit(vector) {
-  const length = Math.hypot(...vector);
-  return vector.map((each) => each / length);
-}
-
 function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }

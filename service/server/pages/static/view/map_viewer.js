@@ -5,12 +5,11 @@ import { ControlAddress } from "./control_address.js";
 import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
 import { mountHistogram, short } from "./histogram.js";
 import { drawAxes } from "./map_axes.js";
+import { MapPlace, ZOOM } from "./map_place.js";
 import { codeWords, OUTSIDE, REFUSED, stateOf, UNSURE } from "./pixel_states.js";
 import { TiledImage } from "./tiled_image.js";
 
 const STATE_WORDS = { [UNSURE]: "unsure: the value is not vouched for", [REFUSED]: "refused", [OUTSIDE]: "outside the object" };
-const LARGEST_SCALE = 64;
-const ZOOM = 1.25;
 const PAN = 0.1; // of the canvas, for one press of an arrow key
 const NONE = "";
 const OVERLAID = /^confidence$|^(\w+_)?sigma(_\w+)?$/; // names of layers that say how sure others are
@@ -25,7 +24,6 @@ const WAYS = { wipe: "by a wipe", difference: "as the difference of their colour
  * @returns {{destroy: function(): void}}
  */
 export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
-  const { rows, cols } = view.info;
   const canvas = element("canvas", { class: "map", tabindex: 0, role: "img",
     "aria-label": "Map. Plus and minus zoom, arrow keys move, 0 shows all, Enter chooses the pixel in the middle." });
   const context = canvas.getContext("2d");
@@ -50,11 +48,11 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   const panel = element("div", { class: "panel" }, named("Layer", layerSelect), named("Compare with", otherSelect), howRow, wipeRow,
     overSelect.options.length > 1 ? named("Grey out by", overSelect) : null, overHistogram,
     named("Rows and columns", axes), named("Hatch unsure pixels", hatched.unsure), named("Hatch refused pixels", hatched.refused), colourRow, stopsRow, histogram,
-    element("p", { class: "actions" }, button("Zoom in", () => zoom(ZOOM)), button("Zoom out", () => zoom(1 / ZOOM)), button("Show all", fit)),
+    element("p", { class: "actions" }, button("Zoom in", () => map.zoom(ZOOM)), button("Zoom out", () => map.zoom(1 / ZOOM)), button("Show all", () => map.fit())),
     element("p", { class: "help" }, `Colours are shown through ${VIEW_TRANSFORM}.`));
   parent.replaceChildren(element("div", { class: "viewer" }, element("div", { class: "stage" }, canvas, value), panel));
 
-  let place = { x: 0, y: 0, scale: 1 };
+  const map = new MapPlace(canvas, view.info, { isBeside: beside, changed: draw });
   let image = null;
   let other = null;
   let over = null; // a grey veil over the image, where this says that values are unsure
@@ -80,6 +78,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     requestAnimationFrame(() => {
       asked = false;
       const { width, height } = canvas;
+      const place = map.now;
       context.clearRect(0, 0, width, height);
       const marks = { unsure: hatched.unsure.checked, refused: hatched.refused.checked };
       const way = other === null ? null : how.value;
@@ -130,39 +129,9 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     return other !== null && how.value === "beside";
   }
 
-  function fit() {
-    const scale = Math.min(canvas.width / (beside() ? 2 : 1) / cols, canvas.height / rows);
-    place = { scale, x: (canvas.width - scale * cols) / 2, y: (canvas.height - scale * rows) / 2 };
-    draw();
-  }
-
-  function zoom(factor, x = canvas.width / 2, y = canvas.height / 2) {
-    const smallest = Math.min(canvas.width / cols, canvas.height / rows) / 2;
-    const scale = Math.max(smallest, Math.min(LARGEST_SCALE, place.scale * factor));
-    place = { scale, x: x - ((x - place.x) * scale) / place.scale, y: y - ((y - place.y) * scale) / place.scale };
-    draw();
-  }
-
-  function pan(x, y) {
-    place = { ...place, x: place.x + x, y: place.y + y };
-    draw();
-    read(canvas.width / 2, canvas.height / 2);
-  }
-
-  function pixelOf(x, y) {
-    const shift = beside() ? (x < canvas.width / 2 ? -1 : 1) * canvas.width / 4 : 0;
-    const [row, col] = [Math.floor((y - place.y) / place.scale), Math.floor((x - place.x - shift) / place.scale)];
-    return row < 0 || col < 0 || row >= rows || col >= cols ? null : [row, col];
-  }
-
-  function onCanvas(event) {
-    const box = canvas.getBoundingClientRect();
-    return [((event.clientX - box.left) * canvas.width) / box.width, ((event.clientY - box.top) * canvas.height) / box.height];
-  }
-
   async function read(x, y) {
     const mine = ++looked;
-    const pixel = pixelOf(x, y);
+    const pixel = map.pixelAt(x, y);
     if (pixel === null) return;
     const shown = [image, other, over].filter((each) => each !== null && each.layer.name !== "status");
     const asked = [view.layer("status"), view.layer("mask")].map((layer) => (layer === undefined ? null : view.pixel(layer, ...pixel)));
@@ -187,38 +156,22 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     return values.map(short).join(", ") + (layer.unit === null ? "" : ` ${layer.unit}`);
   }
 
-  let dragged = null;
-  canvas.addEventListener("pointerdown", (event) => {
-    dragged = { at: onCanvas(event), place, moved: false };
-    canvas.setPointerCapture(event.pointerId);
-  });
-  canvas.addEventListener("pointermove", (event) => {
-    const [x, y] = onCanvas(event);
-    if (dragged !== null) {
-      const [dx, dy] = [x - dragged.at[0], y - dragged.at[1]];
-      dragged.moved ||= Math.hypot(dx, dy) > 4;
-      if (dragged.moved) place = { ...dragged.place, x: dragged.place.x + dx, y: dragged.place.y + dy };
-      draw();
-    }
-    read(x, y);
-  });
-  canvas.addEventListener("pointerup", (event) => {
-    const pixel = pixelOf(...onCanvas(event));
-    if (dragged !== null && !dragged.moved && pixel !== null) onpick(...pixel);
-    dragged = null;
-  });
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    zoom(event.deltaY < 0 ? ZOOM : 1 / ZOOM, ...onCanvas(event));
-  }, { passive: false });
+  map.listen({ pointed: read, clicked: pick });
+
+  function pick(x, y) {
+    const pixel = map.pixelAt(x, y);
+    if (pixel !== null) onpick(...pixel);
+  }
+
+  function pan(x, y) {
+    map.pan(x * canvas.width, y * canvas.height);
+    read(canvas.width / 2, canvas.height / 2);
+  }
+
   const keys = {
-    "+": () => zoom(ZOOM), "=": () => zoom(ZOOM), "-": () => zoom(1 / ZOOM), 0: fit,
-    ArrowLeft: () => pan(PAN * canvas.width, 0), ArrowRight: () => pan(-PAN * canvas.width, 0),
-    ArrowUp: () => pan(0, PAN * canvas.height), ArrowDown: () => pan(0, -PAN * canvas.height),
-    Enter: () => {
-      const pixel = pixelOf(canvas.width / 2, canvas.height / 2);
-      if (pixel !== null) onpick(...pixel);
-    },
+    "+": () => map.zoom(ZOOM), "=": () => map.zoom(ZOOM), "-": () => map.zoom(1 / ZOOM), 0: () => map.fit(),
+    ArrowLeft: () => pan(PAN, 0), ArrowRight: () => pan(-PAN, 0), ArrowUp: () => pan(0, PAN), ArrowDown: () => pan(0, -PAN),
+    Enter: () => pick(canvas.width / 2, canvas.height / 2),
   };
   canvas.addEventListener("keydown", (event) => {
     if (!(event.key in keys)) return;
@@ -231,7 +184,7 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
   for (const each of [stops, wipe]) each.dispatchEvent(new Event("set"));
   panel.addEventListener("input", () => address.write());
   for (const each of [layerSelect, otherSelect, overSelect, how]) each.addEventListener("change", select);
-  how.addEventListener("change", fit);
+  how.addEventListener("change", () => map.fit());
   wipe.addEventListener("input", draw);
   axes.addEventListener("change", draw);
   for (const each of Object.values(hatched)) each.addEventListener("change", draw);
@@ -243,10 +196,10 @@ export function mount(parent, view, { onpick = () => {}, others = [] } = {}) {
     const size = [box.width, box.height].map((side) => Math.round(side * ratio));
     if (Math.min(...size) === 0 || (size[0] === canvas.width && size[1] === canvas.height)) return; // hidden, or shown again as it was left
     [canvas.width, canvas.height] = size;
-    fit();
+    map.restore();
   });
   select();
-  fit();
+  map.restore();
   resized.observe(canvas);
   return { destroy: () => resized.disconnect() };
 }

@@ -1,23 +1,25 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
-import { element, numberOf, tell } from "../element.js";
+import { element, tell } from "../element.js";
 import { ViewState } from "../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
 import { ControlAddress } from "./control_address.js";
-import { VIEW_TRANSFORM } from "./display.js";
 import { mountDomeControl } from "./dome_control.js";
+import { DrawLoop } from "./draw_loop.js";
 import { previewOf, readEnvironment } from "./environment_map.js";
-import { EnvironmentProfile, LightModel, unit } from "./light_model.js";
+import { EnvironmentProfile } from "./environment_profile.js";
+import { Exposure } from "./exposure.js";
+import { LightModel } from "./light_model.js";
+import { lightPanel, sizeOf } from "./light_panel.js";
 import { floats } from "./view_file.js";
+import { viewTable } from "./view_transforms.js";
 import { mountZoomed } from "./zoomed_picture.js";
 
 const BEYOND_SHARE = 0.05; // from which the commands warn too
 const SPIN_DEGREES_PER_S = 30;
 const FIRST_LIGHT = [0.45, 0.5, 0.74]; // above right of the camera
 const BACKDROP = 0.2; // encoded grey around the object, the same in light and dark, since colours are judged before it
-const WHITE_PERCENTILE = 0.99;
-const SAMPLES = 2000; // pixels that the first exposure is taken from
 const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The frames can still be made by a job, and the captured images looked at.";
 
 /**
@@ -27,51 +29,26 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
  * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
  *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
  *     light; `embedded`: the page moves the light, and the address is its own.
- * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void,
- *     canvas: HTMLCanvasElement|null, over: object|null, turn: function(number): void}>} `over` is that of zoomed_picture.js; `turn` turns the environment by degrees, or the light where there is none.
+ * @returns {Promise<{destroy: function(): void, state: function(): any, pixels: function(): Uint8Array, set: function(any): void, settled: function(): Promise<void>,
+ *     canvas: HTMLCanvasElement|null, over: object|null, turn: function(number): void}>} `over` is that of zoomed_picture.js; `turn` turns the environment by degrees,
+ *     or the light where there is none; `settled` waits for the whole picture.
  */
 export async function mount(parent, view, { environments, load, onchange, embedded = false }) {
   const { relight } = view.info;
   if (!canRender()) {
     parent.replaceChildren(element("p", { class: "fault" }, NO_WEBGL));
-    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, canvas: null, over: null, turn: () => {} };
+    return { destroy: () => {}, state: () => null, pixels: () => null, set: () => {}, settled: async () => {}, canvas: null, over: null, turn: () => {} };
   }
   const lights = view.info.frames.filter((frame) => frame.direction !== null);
   const place = new ViewState({ width: relight.cols, height: relight.rows }, embedded ? {} : { light: 3, centre: 2, zoom: 1 }, FIRST_LIGHT);
   const drawn = element("canvas", { width: relight.cols, height: relight.rows });
+  const front = element("canvas"); // the last picture that was done
   const warning = element("p", { class: "beyond", role: "status", hidden: true });
-  const dome = element("div");
-  const preview = element("div");
-  const control = {
-    lit: element("input", { type: "checkbox", checked: true }),
-    brightness: range("Brightness of the light", -6, 6, 0.1, 0), colour: element("input", { type: "color", value: "#ffffff" }),
-    size: range("Size of the light in degrees", 0, 90, 0.5, 0.5), environment: element("select", { "aria-label": "Environment map" }, element("option", { value: "" }, "none"),
-      ...environments.map(({ id, name }) => element("option", { value: id }, name))),
-    file: element("input", { type: "file", accept: ".exr,.hdr", class: "visually-hidden" }),
-    environmentStops: range("Brightness of the environment", -10, 10, 0.1, 0), turn: range("Turn of the environment in degrees", 0, 360, 0.1, 0),
-    exposure: range("Exposure in stops", -10, 10, 0.1, 0),
-    compare: element("select", { "aria-label": "Photograph to compare with" }, element("option", { value: "" }, "nothing"),
-      ...lights.map((frame, index) => element("option", { value: index }, frame.image))),
-    wipe: range("Where the two pictures meet", 0, 100, 1, 50),
-  };
-  const speed = element("p", { class: "help", "data-shows": "speed" }, `${sizeOf(relight)}.`);
-  const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false" }, "Spin");
-  const row = (text, each) => element("label", {}, `${text} `, each, each.type === "range" ? numberOf(each) : null);
-  const wipeRow = row("Wipe", control.wipe);
-  const panel = element("div", { class: "panel" },
-    element("fieldset", {}, element("legend", {}, "Light"), row("On", control.lit), dome, row("Brightness (stops)", control.brightness),
-      row("Colour", control.colour), row("Size (degrees)", control.size)),
-    element("fieldset", {}, element("legend", {}, "Environment"), row("Map", control.environment),
-      element("label", { class: "button quiet" }, "Open a file", control.file), preview, row("Brightness (stops)", control.environmentStops),
-      row("Turn (degrees)", control.turn), play),
-    element("fieldset", {}, element("legend", {}, "Picture"), row("Exposure (stops)", control.exposure),
-      element("button", { type: "button", class: "quiet", onclick: () => { expose(); change(); } }, "Expose for this light"), row("Compare with the photograph", control.compare), wipeRow,
-      element("p", { class: "help" }, `Shown through ${VIEW_TRANSFORM}.`)),
-    element("fieldset", { class: "figures" }, element("legend", {}, "How exact, how fast"), element("p", { class: "help" }, errorOf(relight)), speed));
+  const { control, panel, dome, preview, speed, play, expose: exposeButton, wipeRow } = lightPanel(relight, lights, environments);
   const stage = element("div", { class: "stage" });
   parent.replaceChildren(element("div", { class: "viewer" }, stage, panel));
   const pixelSize = view.info.camera.pixel_size_m ? view.info.camera.pixel_size_m * relight.step : null;
-  const zoomed = mountZoomed(stage, drawn, place, { changed: onGesture, pixelSize, still: embedded });
+  const zoomed = mountZoomed(stage, front, place, { changed: onGesture, pixelSize, still: embedded });
   const { canvas } = zoomed;
   stage.append(warning);
 
@@ -82,14 +59,16 @@ export async function mount(parent, view, { environments, load, onchange, embedd
   const renderer = new BasisRenderer(drawn, relight, view.info.color_space, tiles);
   const matte = new Uint8Array(await view.block(relight.matte));
   renderer.setMatte(matte);
+  const exposure = new Exposure(relight, matte, tiles);
   const unitIrradiance = Math.max(...(lights[0]?.irradiance ?? [1]));
   const fromDisplay = matrixBetween(DISPLAY_SPACE, view.info.color_space);
   let map = null; // { id, name, profile }
   let asked = false;
   const domeControl = mountDomeControl(dome, model, lights.map((frame) => frame.direction), move);
+  const loop = new DrawLoop(renderer, show);
 
   const address = embedded ? null : new ControlAddress({ on: control.lit, brightness: control.brightness, colour: control.colour, size: control.size,
-    environment: control.environment, "environment-stops": control.environmentStops, turn: control.turn, stops: control.exposure,
+    environment: control.environment, "environment-stops": control.environmentStops, turn: control.turn, stops: control.exposure, view: control.view,
     compare: control.compare, wipe: control.wipe });
   const given = address?.read() ?? [];
 
@@ -132,35 +111,38 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     asked = true;
     requestAnimationFrame(() => {
       asked = false;
-      draw();
+      loop.ask(picture());
     });
   }
 
-  function draw() {
+  /** Return what is to be drawn, as the renderer takes it, and warn of light from where none was captured. */
+  function picture() {
     const now = state();
     const sum = sumOf(now);
-    const shown = model.coefficients(sum);
     const chosen = control.compare.value;
-    const compared = chosen === "" ? null : model.capturedImage(Number(chosen));
-    renderer.draw({ shown, compared, border: Number(control.wipe.value) / 100, gain: 2 ** now.exposure, backdrop: [BACKDROP, BACKDROP, BACKDROP] });
-    zoomed.draw(`rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`);
-    const { framesPerSecond, gpuMs } = renderer.timer.figures();
-    if (framesPerSecond !== null) speed.textContent = `${sizeOf(relight)}: ${framesPerSecond.toFixed(0)} pictures a second${gpuMs === null ? "" : `, ${gpuMs.toPrecision(2)} ms each on the graphics processor`}.`;
     const share = model.shareBeyond(sum);
     warning.hidden = share < BEYOND_SHARE;
     canvas.classList.toggle("hatched", share >= BEYOND_SHARE);
     warning.textContent = warning.hidden ? "" : `${Math.round(100 * share)} % of the light comes from beyond the captured lights (more than ${relight.beyond_degrees.toFixed(0)}° from each): the nearest of them stand in for it, with their own shading and shadows.`;
+    return { shown: model.coefficients(sum), compared: chosen === "" ? null : model.capturedImage(Number(chosen)), border: Number(control.wipe.value) / 100,
+      gain: 2 ** now.exposure, backdrop: [BACKDROP, BACKDROP, BACKDROP] };
   }
 
-  /** Set the exposure at which all but the brightest pixels of the picture are below white. */
+  /** Show a picture that is done, of one of `stride` pixels in a row. */
+  function show(stride) {
+    const [width, height] = renderer.sizeOf(stride);
+    if (front.width !== width || front.height !== height) [front.width, front.height] = [width, height];
+    front.getContext("2d").drawImage(drawn, 0, drawn.height - height, width, height, 0, 0, width, height);
+    canvas.dataset.stride = String(stride);
+    zoomed.draw(`rgb(${Array(3).fill(Math.round(255 * BACKDROP))})`);
+    const { framesPerSecond, gpuMs } = renderer.timer.figures();
+    const size = stride === 1 ? "" : `, at ${width} × ${height} pixels until it is still`;
+    if (framesPerSecond !== null) speed.textContent = `${sizeOf(relight)}: ${framesPerSecond.toFixed(0)} pictures a second${gpuMs === null ? "" : `, ${gpuMs.toPrecision(2)} ms each on the graphics processor`}${size}.`;
+  }
+
   function expose() {
-    const coefficients = model.coefficients(sumOf(state()));
-    const levels = covered.map((place, index) => {
-      const from = 3 * relight.terms * tileOf(place, relight, tiles);
-      return Math.max(...[0, 1, 2].map((c) => terms.reduce((sum, term, k) => sum + coefficients[from + 3 * k + c] * term[3 * index + c], 0)));
-    });
-    const white = levels.sort((a, b) => a - b)[Math.floor(WHITE_PERCENTILE * (levels.length - 1))];
-    if (white > 0) control.exposure.value = String(Math.round(-10 * Math.log2(white)) / 10);
+    const stops = exposure.stops(model.coefficients(sumOf(state())));
+    if (stops !== null) control.exposure.value = String(stops);
   }
 
   function sumOf(now) {
@@ -191,10 +173,23 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     change();
   }
 
+  function turn(degrees) {
+    if (map !== null) {
+      control.turn.value = String((Number(control.turn.value) + degrees + 360) % 360);
+      change();
+      return;
+    }
+    const [x, y, z] = place.light;
+    const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
+    move([x * cos - y * sin, x * sin + y * cos, z]); // around the view axis, so that it stays among the captured lights
+  }
+
   drawn.addEventListener("webglcontextlost", () => tell("The graphics processor has stopped drawing.", "fault", () => location.reload()));
   for (const each of [control.lit, control.brightness, control.colour, control.size, control.environmentStops, control.turn, control.exposure, control.wipe, control.compare]) {
     each.addEventListener("input", change);
   }
+  exposeButton.addEventListener("click", () => { expose(); change(); });
+  control.view.addEventListener("change", () => attemptHere(useView));
   control.environment.addEventListener("change", () => attemptHere(async () => {
     const id = control.environment.value;
     if (id === "") dropEnvironment();
@@ -209,15 +204,16 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     control.environment.value = "";
     await chooseEnvironment(null, file.name, await file.arrayBuffer());
   }));
-  function turn(degrees) {
-    if (map !== null) {
-      control.turn.value = String((Number(control.turn.value) + degrees + 360) % 360);
-      change();
-      return;
-    }
-    const [x, y, z] = place.light;
-    const [cos, sin] = [Math.cos((degrees * Math.PI) / 180), Math.sin((degrees * Math.PI) / 180)];
-    move([x * cos - y * sin, x * sin + y * cos, z]); // around the view axis, so that it stays among the captured lights
+
+  async function useView() {
+    renderer.setView(await viewTable(control.view.value));
+    change();
+  }
+
+  /** Return when the whole picture is shown of what was last asked for. */
+  async function settled() {
+    await new Promise((resolve) => { requestAnimationFrame(resolve); });
+    await loop.settled();
   }
 
   let spinning = null;
@@ -237,66 +233,36 @@ export async function mount(parent, view, { environments, load, onchange, embedd
     spinning = requestAnimationFrame(step);
   });
 
-  const covered = spread(matte, SAMPLES);
-  const terms = await Promise.all(relight.basis.map(async (block, term) => {
-    const planes = await view.block(block);
-    renderer.setTerm(term, new Uint16Array(planes));
-    return at(floats(planes, "float16"), covered);
+  await Promise.all(relight.basis.map(async (block, term) => {
+    const planes = new Uint16Array(await view.block(block));
+    await renderer.setTerm(term, planes);
+    exposure.setTerm(term, planes);
   }));
   if (given.includes("environment") && control.environment.value === "") tell("The environment of this address is not on this server. Choose another.");
   if (control.environment.value !== "") {
     const { name, data } = await load(control.environment.value);
     await useEnvironment(control.environment.value, name, data);
   }
+  if (given.includes("view")) await attemptHere(useView);
   if (!given.includes("stops")) expose();
   change();
+  await settled();
   canvas.dataset.ready = "";
   return {
     destroy: () => {
       cancelAnimationFrame(spinning);
+      loop.stop();
       zoomed.destroy();
     },
     state,
-    pixels: () => { draw(); return renderer.pixels(); },
+    pixels: () => { loop.drawNow(picture()); return renderer.pixels(); },
+    settled,
     figures: () => renderer.timer.figures(),
     set: (direction) => move(direction),
     canvas,
     over: { ...zoomed.over, step: relight.step },
     turn,
   };
-}
-
-/** Return the places of at most `count` covered pixels, evenly spread. */
-function spread(matte, count) {
-  const inside = [];
-  matte.forEach((cover, at) => { if (cover === 255) inside.push(at); });
-  const step = Math.max(1, Math.floor(inside.length / count));
-  return inside.filter((_, index) => index % step === 0);
-}
-
-/** Return the tile that a pixel lies in. */
-function tileOf(place, { cols, tiles: { side, cols: across } }, index) {
-  return index[Math.floor(Math.floor(place / cols) / side) * across + Math.floor((place % cols) / side)];
-}
-
-function sizeOf({ terms, rows, cols }) {
-  return `${terms} coefficient images of ${((rows * cols) / 1e6).toPrecision(2)} megapixels`;
-}
-
-/** Return what a basis leaves, as measured when it was made. */
-function errorOf({ held_out: held, relative_rms: captured }) {
-  const levels = (value) => value.toPrecision(2);
-  return `Against relit relight, under ${held.key_lights} lights that the basis was not made from: ${levels(held.mean_levels)} of 255 levels off on average, ${levels(held.largest_levels)} under the worst of them, ${levels(held.even_sky_levels)} under light from all around. It keeps the captured images within ${(100 * captured).toPrecision(2)} % (RMS). A view job with more terms is closer.`;
-}
-
-/** Return the colours [places, 3] of planes [3, pixels]. */
-function at(planes, places) {
-  const count = planes.length / 3;
-  return places.flatMap((place) => [planes[place], planes[count + place], planes[2 * count + place]]);
-}
-
-function range(name, low, high, step, value) {
-  return element("input", { type: "range", min: low, max: high, step, value, "aria-label": name });
 }
 
 function decoded(value) {

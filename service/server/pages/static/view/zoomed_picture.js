@@ -10,7 +10,7 @@ const LABEL = "The object under the chosen light. Drag or use the arrow keys to 
 /**
  * Show a canvas.
  * @param {HTMLElement} stage Takes the picture, and becomes the full screen.
- * @param {HTMLCanvasElement} source What is shown.
+ * @param {HTMLCanvasElement} source Is shown, as large as the state says or smaller.
  * @param {import("../publish/view_state.js").ViewState} state Of the picture.
  * @param {{changed: function(object): void, pixelSize: number|null, still: boolean}} options `changed` is given what gestures change of the state; `pixelSize` of
  *   the source in metres; `still`: without gestures and buttons.
@@ -38,7 +38,7 @@ export function mountZoomed(stage, source, state, { changed, pixelSize, still })
     context.fillStyle = around;
     context.fillRect(0, 0, ...size);
     context.imageSmoothingQuality = "high";
-    context.drawImage(source, size[0] / 2 - state.centre[0] * scale, size[1] / 2 - state.centre[1] * scale, source.width * scale, source.height * scale);
+    context.drawImage(source, size[0] / 2 - state.centre[0] * scale, size[1] / 2 - state.centre[1] * scale, state.width * scale, state.height * scale);
     put((u, v) => [canvas.clientLeft + width / 2 + ((u - state.centre[0]) * scale) / ratio, canvas.clientTop + height / 2 + ((v - state.centre[1]) * scale) / ratio]);
     if (pixelSize !== null) showScale(bar, (1000 * pixelSize * ratio) / scale);
   }

@@ -1,0 +1,95 @@
+/** Relit frames of an object: a player over small pictures that the server makes of them, a filmstrip, a video, and the files. */
+
+import { attempt, fetched, listing } from "../api.js";
+import { bytes, element } from "../element.js";
+import { savingLink } from "./files.js";
+import { offerVideo } from "./video.js";
+
+const FRAME = /^(.*\/)?frame\.\d+\.exr$/;
+const PICTURES_PER_S = 24;
+const PARALLEL = 3;
+const STRIP_PX = 72; // height of the pictures of the filmstrip
+
+/**
+ * Show the frames of jobs, of which a person chooses one; at first the newest.
+ * @param {HTMLElement} parent Takes them. @param {any[]} jobs That have relit frames. @param {function(any): string} nameOf A job.
+ */
+export async function mountFrames(parent, jobs, nameOf) {
+  const chosen = element("select", {}, ...jobs.map((job) => element("option", { value: job.id }, nameOf(job))));
+  const place = element("div");
+  let stop = () => {};
+  const again = () => attempt(async () => {
+    stop();
+    stop = await player(place, chosen.value);
+  });
+  chosen.addEventListener("change", again);
+  parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Frames of ", chosen)), place);
+  await again();
+}
+
+/** Show the frames of a job; return what ends the loading of their pictures. */
+async function player(place, job) {
+  const frames = [];
+  for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
+  if (frames.length === 0) throw new Error("this job has no frames any more");
+  const canvas = element("canvas", { class: "frames-picture", role: "img", "aria-label": "A relit frame" });
+  const slider = element("input", { type: "range", min: 0, max: frames.length - 1, step: 1, value: 0, "aria-label": "Frame" });
+  const [told, tools] = [element("output", { class: "help" }), element("p", { class: "actions view-tools" })];
+  const strip = element("ol", { class: "filmstrip plain", tabindex: 0, "aria-label": "Filmstrip" });
+  const files = element("details", {}, element("summary", {}, `${frames.length === 1 ? "The frame" : `All ${frames.length} frames`} as EXR`),
+    element("ul", { class: "plain" }, ...frames.map((result) => element("li", {}, savingLink({ name: result.name, result }), ` ${bytes(result.size)}`))));
+  const pictures = [];
+  let [at, playing, isOver] = [0, null, false];
+
+  function show(index) {
+    at = index;
+    slider.value = String(index);
+    const picture = pictures[index];
+    told.textContent = `${frames[index].name} (${index + 1} of ${frames.length})${picture === undefined ? ", its picture is being made" : ""}`;
+    [...strip.children].forEach((each, place) => each.firstChild.setAttribute("aria-pressed", String(place === index)));
+    if (picture === undefined) return;
+    if (canvas.width !== picture.width || canvas.height !== picture.height) [canvas.width, canvas.height] = [picture.width, picture.height];
+    canvas.getContext("2d").drawImage(picture, 0, 0);
+  }
+
+  function stopPlaying() {
+    clearInterval(playing);
+    playing = null;
+    play.setAttribute("aria-pressed", "false");
+  }
+
+  const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false", onclick: () => {
+    if (playing !== null) return stopPlaying();
+    play.setAttribute("aria-pressed", "true");
+    playing = setInterval(() => (place.contains(canvas) ? show((at + 1) % frames.length) : stopPlaying()), 1000 / PICTURES_PER_S);
+    return undefined;
+  } }, "Play");
+  slider.addEventListener("input", () => show(Number(slider.value)));
+
+  async function fill(index) {
+    const small = element("canvas", { height: STRIP_PX });
+    const button = strip.children[index].firstChild;
+    const path = `/v1/jobs/${job}/pictures/${frames[index].name.split("/").map(encodeURIComponent).join("/")}`;
+    const picture = await createImageBitmap(await fetched(path, (answer) => answer.blob()));
+    pictures[index] = picture;
+    small.width = Math.max(1, Math.round((STRIP_PX * picture.width) / picture.height));
+    const pen = small.getContext("2d");
+    pen.imageSmoothingQuality = "high";
+    pen.drawImage(picture, 0, 0, small.width, small.height);
+    button.replaceChildren(small);
+    if (index === at) show(index);
+  }
+
+  strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",
+    onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
+  place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told)), tools, strip, files);
+  const waiting = frames.map((_, index) => index);
+  const load = async () => { for (let next = waiting.shift(); next !== undefined && !isOver; next = waiting.shift()) await fill(next); };
+  show(0);
+  await fill(waiting.shift());
+  attempt(() => Promise.all(Array.from({ length: PARALLEL }, load)).then(() => {
+    if (frames.length > 1 && !isOver) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => show(Math.min(frames.length - 1, Math.floor(share * frames.length))));
+    canvas.dataset.ready = "";
+  }));
+  return () => { isOver = true; stopPlaying(); };
+}

@@ -1,0 +1,45 @@
+"""Names that are markup are shown as text, whoever gave them: environments, keys, results, frames, layers, workers and devices."""
+
+import json
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+HOSTILE = "<img src=x onerror=alert(1)>"
+ENVIRONMENT = {"id": "env_0123456789abcdefghjk", "name": HOSTILE, "state": "ready", "registered": False, "problem": None, "facts": {},
+               "view": None, "created_at": "2026-11-20T08:59:00Z"}
+
+
+def changed(value, names: set[str]):
+    """JSON with markup at the end of each text of these names."""
+    if isinstance(value, list):
+        return [changed(each, names) for each in value]
+    if isinstance(value, dict):
+        return {name: each + HOSTILE if name in names and isinstance(each, str) else changed(each, names)
+                for name, each in value.items()}
+    return value
+
+
+@pytest.mark.parametrize(("place", "path", "names"), [
+    ("job", "**/results", {"name"}), ("capture", "**/results/view.json", {"image", "label", "suspect", "name"}),
+    ("light", "**/results/view.json", {"image", "label"}), ("maps", "**/results/view.json", {"title", "unit"}),
+    ("light", "**/v1/environments*", None),
+    ("home", "**/v1/environments*", None), ("captures", "**/v1/environments*", None), ("job", "**/results/report.json", {"method"})])
+def test_a_name_that_is_markup_is_text(page, solved, place, path, names):
+    asked = []
+
+    def answer(route):
+        asked.append(route.request.url)
+        found = route.fetch()
+        value = found.json()
+        told = {**value, "items": [ENVIRONMENT]} if names is None else changed(value, names)
+        route.fulfill(response=found, body=json.dumps(told))
+
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    page.route(path, answer)
+    page.goto({"home": "/", "captures": "/captures", "machines": "/machines", **solved.pages}[place])
+    page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
+    if "report" not in path:
+        page.wait_for_function("(text) => document.querySelector('main').textContent.includes(text)", arg=HOSTILE)
+    assert asked and page.locator("main img").count() == 0
