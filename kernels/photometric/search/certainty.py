@@ -37,8 +37,9 @@ FREE = 0.4
 """Part of the variance by the curvature of the mixture, and of the squared spread of models averaged, that errors have: lobes that are free
 let a normal go further than the truth does, and a mean errs less than what it is the mean of."""
 OWN = 0.3
-"""Part of the variance by the curvature that a pixel has for itself: the rest stands for misfit that neighbours share, until their surface
-shows how much there is. Measured on path-traced scenes and real objects."""
+"""Part of the variance by the curvature that a pixel has for itself where its mode is sharp: the rest stands for misfit that neighbours
+share, until their surface shows how much there is. It rises to 1 where the mode is as flat as counts, because readings that leave a normal
+open do so however well they fit. Measured on path-traced scenes and real objects."""
 SOFTNESS = 0.2
 """Part of the whole cost by which costs of candidates may differ through misfit of the model alone."""
 BREAKDOWN = 0.5
@@ -88,7 +89,8 @@ def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, sprea
         around = mixed * around + single.weight * _around(single.openness.astype(np.float64), alone, lights)
         noise = mixed * noise + single.weight * alone
     averaged = FREE * spread.astype(np.float64) ** 2
-    variance, own = (np.minimum(part * around + averaged, FLATTEST**2) for part in (1, OWN))
+    own_part = OWN + (1 - OWN) * np.minimum(around / (FREE * FLATTEST**2), 1)
+    variance, own = (np.minimum(part * around + averaged, FLATTEST**2) for part in (1, own_part))
     apart = np.maximum(APART_DEGREES, APART_SIGMAS * np.sqrt(variance))
     softness = 2 * noise + SOFTNESS * total
     judged = np.stack([total, softness, np.cos(np.radians(np.minimum(apart, 180)))], axis=1)
