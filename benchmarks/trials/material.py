@@ -39,9 +39,16 @@ class Case(NamedTuple):
     in_model: bool = True
     tilt_degrees: float = 0.0
     """How far the lights that the manifest gives are off."""
+    ball: bool = False
+    """A ball of the same material floats before the body."""
 
 
+BALL = {"type": "sphere", "center": [0.25, 0.2, 1.6], "radius": 0.28}
 CASES = (
+    Case("svbrdf, matt, 64 lights", MATT),
+    Case("svbrdf, matt, a ball before the body, 64 lights", MATT, ball=True),
+    Case("svbrdf, gloss, a ball before the body, 64 lights", GLOSS, ball=True),
+    Case("svbrdf, metal, a ball before the body, 64 lights", GOLD, ball=True),
     Case("svbrdf, gloss, 64 lights", GLOSS),
     Case("svbrdf, metal, 64 lights", GOLD),
     Case("svbrdf, metal of another lobe, 64 lights", CHROME, in_model=False),
@@ -109,8 +116,8 @@ def lump(mi: Any, bsdf: dict[str, Any]) -> Any:
     return mesh
 
 
-def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray) -> Body:
-    """Trace the body under each light, and its normals."""
+def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray, *, ball: bool) -> Body:
+    """Trace the body under each light, and its normals; with a ball before it where one is asked for."""
     def sun(way: np.ndarray) -> dict[str, Any]:
         return {"type": "directional", "direction": [float(-x) for x in way], "irradiance": {"type": "rgb", "value": [np.pi] * 3}}
 
@@ -118,7 +125,7 @@ def render(mi: Any, bsdf: dict[str, Any], directions: np.ndarray) -> Body:
     sensor = mi.load_dict({"type": "orthographic", "film": film, "sampler": {"type": "independent"},
                            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])})
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": BOUNCES, "hide_emitters": True},
-                          "body": lump(mi, bsdf), "sun": sun(directions[0])})
+                          "body": lump(mi, bsdf), "sun": sun(directions[0]), **({"ball": BALL | {"bsdf": bsdf}} if ball else {})})
     images = []
     for seed, way in enumerate(directions):
         params = mi.traverse(scene)
@@ -186,9 +193,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
         directions = cap(LIGHTS)
         bodies: dict[str, Body] = {}
         for case in CASES:
-            key = json.dumps(case.bsdf)
+            key = json.dumps([case.bsdf, case.ball])
             if key not in bodies:
-                bodies[key] = render(mi, case.bsdf, directions)
+                bodies[key] = render(mi, case.bsdf, directions, ball=case.ball)
             with tempfile.TemporaryDirectory() as folder:
                 capture = photograph(case, bodies[key], directions, Path(folder))
                 yield judge(case.name, case.in_model, capture, bodies[key].normal, bodies[key].mask)

@@ -60,6 +60,7 @@ class SvbrdfFit(NamedTuple):
     specular: np.ndarray  # [n, 3] float32, F0
     roughness: np.ndarray  # [n] float32
     sigma: np.ndarray  # [n] float32, standard deviation of the normal, degrees
+    unseen: np.ndarray  # [n] float32: the part of it, in quadrature, that stands for errors of neighbours until their surface shows them
     residual: np.ndarray  # [n] float32: root of the mean cost per light, in units of the noise
     mixture: Mixture  # of pixels with two materials; F0 and roughness above are then those of one lobe close to both
 
@@ -117,8 +118,9 @@ def solve_svbrdf(samples: Samples, start: np.ndarray, *, shape: Diffuse, lobe: D
     material, mixture = mix_materials(samples, normal, material, pairs, shape=lobe)
     if shared is not None:
         spread = np.hypot(spread, doubt_of_f0(samples, normal, material, shared, shape=lobe))
-    sigma = standard_deviation(samples, found, normal, spread, lone)
-    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma, np.sqrt(found.best.cost), mixture)
+    sigma, unseen = standard_deviation(samples, found, normal, spread, lone)
+    return SvbrdfFit(normal, material.diffuse_albedo, material.specular, material.roughness, sigma, unseen,
+                     np.sqrt(found.best.cost), mixture)
 
 
 def nearby_shapes(shape: Diffuse) -> list[Diffuse]:

@@ -23,6 +23,7 @@ from service.solve.lights.diagnosis import diagnose
 from service.solve.lights.intensities import LightsOverTime
 from service.solve.methods.methods import METHODS
 from service.solve.opening import Opened, open_solve
+from stage.capture.camera import Camera
 from stage.capture.capture import Capture
 from stage.capture.point_lights import DistantLights
 from stage.colour.colour_spaces import linear_space
@@ -124,9 +125,8 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if placement is not None:
         solution.height = placement.height
         solution.warnings += placement.warnings()
-    if solution.judged_by_surface and solution.height is not None:
-        normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
-        raise_error(solution, integrability.doubt(normal, solution.height, estimated, opened.capture.camera).reshape(-1))
+    if solution.unseen is not None and solution.height is not None:
+        _judge_by_surface(solution, estimated, opened.capture.camera)
     if request.materials is Materials.COHERENT:
         agree_on_materials(solution, sigma, shape)
     refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
@@ -181,6 +181,18 @@ def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale:
         **({} if stack.motion is None else {"motion": stack.motion}),
     ))
     return SolveResult(maps, maps_path, report_path, counts, tuple(solution.suspects), tuple(solution.warnings))
+
+
+def _judge_by_surface(solution: Solution, estimated: np.ndarray, camera: Camera) -> None:
+    """Replace what stands in σ for errors that neighbours share by what the surface shows of them."""
+    assert solution.unseen is not None and solution.height is not None
+    shape, found = estimated.shape, _part_numbers(solution)
+    part = np.where(estimated, 1 if found is None else found, 0)
+    normal = np.moveaxis(solution.normal.reshape(3, *shape), 0, -1)
+    own = np.sqrt(np.maximum(solution.standard_error() ** 2 - solution.unseen.astype(np.float32) ** 2, 0))
+    shown = np.hypot(own.reshape(shape), integrability.doubt(normal, solution.height, part, camera))
+    sigma = integrability.beside_parts(shown, part).reshape(-1)
+    solution.sigma = np.where(np.isin(solution.status, ESTIMATED), sigma, solution.sigma).astype(np.float16)
 
 
 def _say_of_pairs(given: SolveInput, method: Method, solution: Solution) -> None:

@@ -237,7 +237,7 @@ class _Walk:
         count = self._given.stack.pixel_count
         sigma = self.result.sigma
         sigma[:] = LARGEST_ERROR
-        abundance, pair = np.zeros(count, np.float16), np.zeros(count, np.uint8)
+        abundance, pair, unseen = np.zeros(count, np.float16), np.zeros(count, np.uint8), np.zeros(count, np.float16)
         light_on = {} if light is None else {device: light.on(device) for device in self._given.devices}  # None: there are no pixels
 
         def fit(batch: Batch) -> None:
@@ -253,12 +253,12 @@ class _Walk:
             self._specular[:, pixels] = material.specular.T
             self._roughness[pixels] = material.roughness
             abundance[pixels], pair[pixels] = found.mixture
-            sigma[pixels], result.residual[pixels] = found.sigma, found.residual
+            sigma[pixels], unseen[pixels], result.residual[pixels] = found.sigma, found.unseen, found.residual
 
         self._batches("normals", fit, Results(
-            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, result.residual),
+            (result.normal, result.albedo, self._specular, self._roughness, abundance, pair, sigma, unseen, result.residual),
             (None if light is None else light.found, self._shape, self._lobe, self._supported, materials, self._pairs, self._metals)))
-        result.judged_by_surface = True
+        result.unseen = unseen
         if (mixed := abundance > 0).any():
             result.abundance, result.pair, result.pairs = abundance, pair, self._pairs
             result.facts["mixed_pixels"] = int(mixed.sum())

@@ -8,7 +8,7 @@ import pytest
 from kernels.status import Status
 from service.requests.solve import Method, SolveRequest
 from service.solve.height.height import whole_surface
-from service.solve.height.integrability import LARGEST_TRACE, doubt, misfit
+from service.solve.height.integrability import LARGEST_TRACE, MIXED, MIXED_DEGREES, beside_parts, doubt, misfit
 from service.solve.solve import solve
 from stage.capture.camera import Camera
 from stage.results.maps import SurfaceMaps
@@ -87,6 +87,26 @@ def test_normals_of_no_surface_are_doubted():
     rim = mask & (normal[..., 2] < 0.75)
     assert np.median(misfit(spun, height, mask, camera)[rim]) > 5
     assert 3 < np.median(found[rim]) < LARGEST_TRACE
+
+
+def test_a_step_between_parts_is_no_misfit():
+    """Half of the ball lies 20 pixels nearer: differences of heights across the step show no normal, those beside it what they did."""
+    normal, height, mask, camera = ball()
+    nearer = np.arange(SIDE)[None] < SIDE // 2
+    stepped = height + 20.0 * nearer
+    assert doubt(normal, stepped, np.where(mask, 1 + nearer, 0), camera)[mask].max() < 0.1
+    assert doubt(normal, stepped, mask.astype(int), camera)[:, SIDE // 2][mask[:, SIDE // 2]].min() > 1
+
+
+def test_pixels_beside_another_part_are_doubted():
+    """They may see both parts. Pixels along the outline of the object, and inside a part, keep their standard deviation."""
+    part = np.zeros((8, 8), dtype=int)
+    part[1:7, 1:4], part[1:7, 4:7] = 1, 2
+    raised = beside_parts(np.full(part.shape, 0.5), part)
+    beside = np.zeros_like(part, dtype=bool)
+    beside[1:7, 3:5] = True
+    np.testing.assert_allclose(raised[beside], np.hypot(0.5 * MIXED, MIXED_DEGREES))
+    np.testing.assert_array_equal(raised[~beside], 0.5)
 
 
 def test_the_size_of_bands_changes_nothing(monkeypatch):
