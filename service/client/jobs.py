@@ -243,7 +243,7 @@ def _stream(connection: Connection, job: str, last: JobView | None) -> Iterator[
                     yield JobView.model_validate_json(event.data)
 
 
-PATH = "/v1/hooks"
+HOOKS_PATH = "/v1/hooks"
 
 
 class Hooks:
@@ -254,20 +254,20 @@ class Hooks:
 
     def create(self, wanted: NewHook) -> NewHookView:
         """Create a hook, and return it with its secret, which is not shown again."""
-        return self._connection.ask(NewHookView, "POST", PATH, json=wanted.model_dump(mode="json"), repeatable=False)
+        return self._connection.ask(NewHookView, "POST", HOOKS_PATH, json=wanted.model_dump(mode="json"), repeatable=False)
 
     def all(self) -> list[HookView]:
         """Return the hooks of the project, the oldest first."""
-        return self._connection.ask(HookList, "GET", PATH).hooks
+        return self._connection.ask(HookList, "GET", HOOKS_PATH).hooks
 
     def get(self, hook: str) -> HookView:
         """Return one hook."""
-        return self._connection.ask(HookView, "GET", self._connection.path(PATH, hook))
+        return self._connection.ask(HookView, "GET", self._connection.path(HOOKS_PATH, hook))
 
     def test(self, hook: str) -> DeliveryView:
         """Queue a delivery of the type hook.test; `get` tells what came of it."""
-        return self._connection.ask(DeliveryView, "POST", f"{self._connection.path(PATH, hook)}/test", repeatable=False)
+        return self._connection.ask(DeliveryView, "POST", f"{self._connection.path(HOOKS_PATH, hook)}/test", repeatable=False)
 
     def delete(self, hook: str) -> None:
         """Delete a hook; what waits is not sent any more."""
-        self._connection.send("DELETE", self._connection.path(PATH, hook), repeatable=False)
+        self._connection.send("DELETE", self._connection.path(HOOKS_PATH, hook), repeatable=False)

@@ -35,9 +35,9 @@ from service.relight.clipping import Clipping, clipped_channels
 from service.relight.combine import frames_on_device
 from service.relight.far_light import captured_lights
 from service.relight.model_light import ModelLight, NearLights
-from service.relight.model_range import LitBeyond, LitModel, ModelRange, Portion, correction
+from service.relight.model_range import LitBeyond, LitModel, ModelRange, correction
 from service.relight.range_light import LightOnDevice, RangeLight
-from service.relight.surface_model import KEPT_BYTES, ModelBatch, SurfaceModel
+from service.relight.surface_model import KEPT_BYTES, ModelBatch, Portion, SurfaceModel
 from service.relight.weights.triangulation import left_out, triangles_between
 from service.reporting.progress import Timings
 from service.reporting.provenance import other_inputs

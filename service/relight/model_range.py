@@ -14,17 +14,16 @@ import warp as wp
 from kernels import device as devices
 from kernels.packs import Band
 from kernels.relight.directions.direction_grid import direction_grid
-from kernels.relight.frames.combine import combine_rows
 from kernels.relight.model.beyond import followed
 from kernels.relight.model.captured import Captured
 from kernels.relight.model.gloss_ratio import ratio_of_sums
 from kernels.relight.model.responses import Responses, empty_responses, respond, shown_gloss
-from kernels.relight.model.shading import SourcesOnDevice, Surface, shade_frames, upload_sources
+from kernels.relight.model.shading import SourcesOnDevice, shade_frames, upload_sources
 from kernels.relight.model.sources import far, join, own_rows
-from kernels.relight.shadows.horizon import Horizons, see_above
+from kernels.relight.shadows.horizon import see_above
 from service.relight.far_light import FarSamples, captured_lights, hidden_as_captured
-from service.relight.range_light import RangeBeyond, RangeLight
-from service.relight.surface_model import ModelBatch, SurfaceModel
+from service.relight.range_light import ChunkBeyond, ChunkLight, FrameEnergy, RangeBeyond, RangeLight, SmallLights
+from service.relight.surface_model import ModelBatch, Portion, SurfaceModel
 from stage.capture.point_lights import DistantLights
 
 RESPONSE_BYTES, CUDA_RESPONSE_BYTES = 16 << 20, 256 << 20
@@ -58,76 +57,6 @@ class LitBeyond(NamedTuple):
     whole: np.ndarray  # [3, n]
     gloss: np.ndarray  # [3, n] the specular part of it
     captured: np.ndarray  # [3, n] under what stands in for it in the weighted sum of images
-
-
-class FrameEnergy(NamedTuple):
-    """The energy of frames at fixed directions, as weights of responses to them."""
-
-    weights: np.ndarray  # [positions, 3, n] float32; 0 where no frame stands
-    places: list[int]
-    """Position of each frame in the full chunk: a sum may depend on it in its last bit, and frames that are made later must be the same."""
-
-    @staticmethod
-    def of(energy: Sequence[np.ndarray], places: Sequence[int]) -> "FrameEnergy":
-        """Take the energy [n, 3] of each frame."""
-        weights = np.zeros((max(places) + 1, 3, len(energy[0])), dtype=np.float32)
-        for place, each in zip(places, energy, strict=True):
-            weights[place] = each.T
-        return FrameEnergy(weights, list(places))
-
-    def at(self, directions: np.ndarray) -> "FrameEnergy":
-        """Return the energy at some of the directions, by their numbers."""
-        return self._replace(weights=self.weights[:, :, directions])
-
-    def matt(self, responses: Responses, albedo: np.ndarray) -> np.ndarray:
-        """Return [frames, 3, n] the diffuse part of the radiance of pixels of an albedo [3, n]."""
-        count, _, terms = self.weights.shape
-        sums = combine_rows(responses.matt, self.weights.reshape(3 * count, 1, terms)).numpy().reshape(count, 3, -1)
-        return np.asarray(albedo * sums[self.places, :, : albedo.shape[1]])
-
-    def gloss(self, rows: wp.array, count: int) -> np.ndarray:
-        """Return [frames, 3, count] the specular part of the radiance, from rows as of Responses.gloss."""
-        return np.asarray(combine_rows(rows, self.weights).numpy()[self.places, :, :count])
-
-
-class SmallLights(NamedTuple):
-    """The small bright places of neighbouring frames."""
-
-    frames: slice
-    """The place of these frames in all that are made."""
-    sources: SourcesOnDevice
-    direction: np.ndarray  # [n, 3] of the samples of all these frames
-
-
-class ChunkLight(NamedTuple):
-    """The light of the frames of a chunk, on the device as far as it is shaded."""
-
-    broad: FrameEnergy
-    captured: FrameEnergy
-    small: tuple[SmallLights, ...]
-    added: FrameEnergy | None
-    beyond: "ChunkBeyond | None"
-
-
-class ChunkBeyond(NamedTuple):
-    """The part of it that lies beyond the captured lights."""
-
-    broad: FrameEnergy
-    captured: FrameEnergy
-    small: SourcesOnDevice
-
-
-class Portion(NamedTuple):
-    """Neighbouring packs of a batch."""
-
-    pixels: slice
-    """The pixels of the batch that the portion covers."""
-    surface: Surface
-    band: Band
-    visible: wp.array  # [lights, P] of the captured lights
-    horizons: tuple[Horizons | None, ...]
-    """Horizons for each group of small lights; None where it has none."""
-    position: np.ndarray  # [n] row-major positions in the image
 
 
 class ModelRange:

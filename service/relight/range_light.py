@@ -9,27 +9,25 @@ gets is that of service.relight.model_range on the CPU.
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from kernels import packs
 from kernels.relight.directions.direction_grid import direction_grid, spread
-from kernels.relight.frames.combine import sum_rows, upload_weights
+from kernels.relight.frames.combine import combine_rows, sum_rows, upload_weights
 from kernels.relight.model.beyond import share_beyond
 from kernels.relight.model.guided import FramesOnDevice, FrameSums, Pixels, correct_frames
 from kernels.relight.model.responses import Responses
-from kernels.relight.model.shading import shade_frames
+from kernels.relight.model.shading import SourcesOnDevice, shade_frames
 from kernels.relight.model.sources import Sources, disc_samples, far
 from kernels.relight.shadows.horizon import see_above
 from service.relight.far_light import NO_SAMPLES, FarLight, FarSamples, disc_light, hidden_as_captured
 from service.relight.model_light import CapturedEnergy, weighting_beyond
+from service.relight.surface_model import Portion
 from service.relight.weights.weighting import share_samples
 from service.requests.relight import LightWeights
-
-if TYPE_CHECKING:
-    from service.relight.model_range import ChunkLight, FrameEnergy, Portion
 
 SMALL_DISC_DEGREES = 20.0
 """Largest diameter of a disc that casts shadows of its own; the visibility of larger ones is interpolated from the captured lights."""
@@ -101,10 +99,67 @@ def _parts(light: FarLight) -> tuple[FarSamples, FarSamples]:
     return FarSamples.join(small), FarSamples.join(broad)
 
 
+class FrameEnergy(NamedTuple):
+    """The energy of frames at fixed directions, as weights of responses to them."""
+
+    weights: np.ndarray  # [positions, 3, n] float32; 0 where no frame stands
+    places: list[int]
+    """Position of each frame in the full chunk: a sum may depend on it in its last bit, and frames that are made later must be the same."""
+
+    @staticmethod
+    def of(energy: Sequence[np.ndarray], places: Sequence[int]) -> "FrameEnergy":
+        """Take the energy [n, 3] of each frame."""
+        weights = np.zeros((max(places) + 1, 3, len(energy[0])), dtype=np.float32)
+        for place, each in zip(places, energy, strict=True):
+            weights[place] = each.T
+        return FrameEnergy(weights, list(places))
+
+    def at(self, directions: np.ndarray) -> "FrameEnergy":
+        """Return the energy at some of the directions, by their numbers."""
+        return self._replace(weights=self.weights[:, :, directions])
+
+    def matt(self, responses: Responses, albedo: np.ndarray) -> np.ndarray:
+        """Return [frames, 3, n] the diffuse part of the radiance of pixels of an albedo [3, n]."""
+        count, _, terms = self.weights.shape
+        sums = combine_rows(responses.matt, self.weights.reshape(3 * count, 1, terms)).numpy().reshape(count, 3, -1)
+        return np.asarray(albedo * sums[self.places, :, : albedo.shape[1]])
+
+    def gloss(self, rows: wp.array, count: int) -> np.ndarray:
+        """Return [frames, 3, count] the specular part of the radiance, from rows as of Responses.gloss."""
+        return np.asarray(combine_rows(rows, self.weights).numpy()[self.places, :, :count])
+
+
+class SmallLights(NamedTuple):
+    """The small bright places of neighbouring frames."""
+
+    frames: slice
+    """The place of these frames in all that are made."""
+    sources: SourcesOnDevice
+    direction: np.ndarray  # [n, 3] of the samples of all these frames
+
+
+class ChunkLight(NamedTuple):
+    """The light of the frames of a chunk, on the device as far as it is shaded."""
+
+    broad: FrameEnergy
+    captured: FrameEnergy
+    small: tuple[SmallLights, ...]
+    added: FrameEnergy | None
+    beyond: "ChunkBeyond | None"
+
+
+class ChunkBeyond(NamedTuple):
+    """The part of it that lies beyond the captured lights."""
+
+    broad: FrameEnergy
+    captured: FrameEnergy
+    small: SourcesOnDevice
+
+
 class LightOnDevice:
     """The light of the frames of a chunk on a CUDA device, and the frames."""
 
-    def __init__(self, chunk: "ChunkLight", frames: FramesOnDevice, places: Sequence[int]) -> None:
+    def __init__(self, chunk: ChunkLight, frames: FramesOnDevice, places: Sequence[int]) -> None:
         """Upload the light; `places` are the numbers of the frames in `frames`."""
         self.chunk, self._frames, self._device = chunk, frames, frames.radiance.device.alias
         self._places = wp.array(np.asarray(places), dtype=wp.int32, device=self._device)
@@ -113,11 +168,11 @@ class LightOnDevice:
         self._added = None if chunk.added is None else self._upload(chunk.added)
         self._beyond = None if chunk.beyond is None else (self._upload(chunk.beyond.broad), self._upload(chunk.beyond.captured))
 
-    def _upload(self, energy: "FrameEnergy") -> wp.array:
+    def _upload(self, energy: FrameEnergy) -> wp.array:
         """Return [frames, 3, n] energy of the frames, with zero frames after them."""
         return upload_weights(energy.weights[energy.places], self._device)
 
-    def correct(self, portion: "Portion", pixels: Pixels, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array) -> None:
+    def correct(self, portion: Portion, pixels: Pixels, facing: wp.array, grid: Responses, captured: Responses, shown: wp.array) -> None:
         """Correct the frames at the pixels of a portion, from its responses to the directions of the grid that are `facing`."""
         nothing = wp.empty((0, 3, grid.matt.shape[1] * grid.matt.dtype._length_), dtype=wp.float32, device=self._device)
         broad = _taken(self._broad, facing)

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from kernels import device as devices
+from kernels.packs import Band
 from kernels.relight.model.shading import PLANES, SecondLobe, Surface, upload_surface
 from kernels.relight.shadows.horizon import HeightField, Horizons, azimuths_of, find_horizons, height_field
 from kernels.relight.shadows.occlusion import see_lights
@@ -35,6 +36,19 @@ class ModelBatch(NamedTuple):
 
     pixels: np.ndarray  # [n] row-major positions in the image
     surface: Surface
+
+
+class Portion(NamedTuple):
+    """Neighbouring packs of a batch."""
+
+    pixels: slice
+    """The pixels of the batch that the portion covers."""
+    surface: Surface
+    band: Band
+    visible: wp.array  # [lights, P] of the captured lights
+    horizons: tuple[Horizons | None, ...]
+    """Horizons for each group of small lights; None where it has none."""
+    position: np.ndarray  # [n] row-major positions in the image
 
 
 class SurfaceModel:

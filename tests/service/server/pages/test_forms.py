@@ -40,6 +40,8 @@ LISTS = {"corners": [1.5, 1, 9, 1, 9, 5, 1, 5], "grid": [6, 4]}
 """Values of lists of another length than most."""
 INSTEAD = {("calibrate-laser-planes", "step_m"): ("board", "square_m")}
 """What an option stands in place of."""
+WITH = {("inspect-board", "stiffness_m"): {"remove": "spline"}}
+"""What an option needs beside it."""
 
 
 def fields(form: Form):
@@ -82,6 +84,9 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
         others = INSTEAD.get((kind, field.name), ())
         for other in others:
             del request["options"][other]
+        beside = WITH.get((kind, field.name), {})
+        if beside:
+            request.setdefault("options", {}).update(beside)
         for path in field.paths:
             target = request
             *parents, last = path.split(".")
@@ -90,7 +95,7 @@ def test_places_lead_to_the_values_of_the_command_line(kind):
             target[last] = value
         text = ",".join(map(str, value)) if isinstance(value, list) else value
         words = {name: given for name, given in typed.items() if name not in others}
-        assert ANY_JOB.validate_python(request) == build(model, words | {field.name: text}), field.name
+        assert ANY_JOB.validate_python(request) == build(model, words | beside | {field.name: text}), field.name
 
 
 def test_what_each_job_begins_with_is_declared():
