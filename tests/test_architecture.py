@@ -345,18 +345,3 @@ def test_a_text_and_a_type_of_fields_stand_in_one_module():
                 if text or annotated or spelling:
                     found.setdefault((node.targets[0].id, ast.unparse(node.value)), set()).add(name)
     assert {name: modules for name, modules in found.items() if len(modules) > 1} == {}
-
-
-def test_kernels_that_are_made_when_they_are_needed_are_made_under_one_lock():
-    """Warp parses a kernel as it is made, and CPython 3.11 fails where two threads parse: `kernels.device.once` lets one of them."""
-    made, alone = 0, []
-    for name, path in FILES.items():
-        for function in tree_of(path).body if top(name) == "kernels" else []:
-            inner = [each for each in ast.walk(function) if isinstance(each, (ast.FunctionDef, ast.ClassDef)) and each is not function]
-            if isinstance(function, ast.FunctionDef) and any(
-                    ast.unparse(decorator).startswith(("wp.kernel", "wp.func", "wp.struct"))
-                    for each in inner for decorator in each.decorator_list):
-                made += 1
-                if [ast.unparse(each) for each in function.decorator_list] not in (["once"], ["devices.once"]):
-                    alone.append(f"{name}.{function.name}")
-    assert made > 50 and not alone

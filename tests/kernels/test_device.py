@@ -1,3 +1,4 @@
+import ast
 import os
 import subprocess
 import sys
@@ -120,3 +121,18 @@ def test_starting_says_nothing():
     done = subprocess.run([sys.executable, "-c", "from kernels import device; device.names()"], capture_output=True, text=True,
                           cwd=Path(__file__).parents[2])
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_kernels_that_are_made_when_they_are_needed_are_made_under_one_lock():
+    """Warp parses a kernel as it is made, and CPython 3.11 fails where two threads parse: `kernels.device.once` lets one of them."""
+    made, alone = 0, []
+    for path in Path(devices.__file__).parent.rglob("*.py"):
+        for function in ast.parse(path.read_text(encoding="utf-8")).body:
+            inner = [each for each in ast.walk(function) if isinstance(each, (ast.FunctionDef, ast.ClassDef)) and each is not function]
+            if isinstance(function, ast.FunctionDef) and any(
+                    ast.unparse(decorator).startswith(("wp.kernel", "wp.func", "wp.struct"))
+                    for each in inner for decorator in each.decorator_list):
+                made += 1
+                if [ast.unparse(each) for each in function.decorator_list] not in (["once"], ["devices.once"]):
+                    alone.append(f"{path.name}: {function.name}")
+    assert made > 50 and not alone
