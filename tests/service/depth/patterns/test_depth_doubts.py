@@ -1,6 +1,7 @@
 """relit depth on patterns that are bent, scattered, mirrored or declared wrongly: a right depth, a low confidence, or a sentence."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -60,7 +61,10 @@ def test_bent_waves_are_found(relit, tmp_path, light, name):
     write_capture(tmp_path / "bent", bent(light), PHASES[name], light=light)
     maps, report, out = solve(relit, tmp_path / "bent", "--least-confidence", "0")
     error = np.abs(maps.depth - light.depth)[maps.mask]
-    assert "relit calibrate response" in report["warnings"][0] and "level^2.2" in report["warnings"][0] and "projector.response" in out
+    assert "relit calibrate response" in report["warnings"][0] and "projector.response" in out
+    # where several periods are made to agree, the exponent takes over what the pixels' footprint rounds off the waves
+    seen = float(re.search(r"level\^([\d.]+\d|\d)", report["warnings"][0])[1])
+    assert seen == pytest.approx(2.2, abs=0.25 if name == "three periods" else 0.05)
     assert (error > 5 * maps.sigma[maps.mask]).mean() < 0.03
     write_capture(tmp_path / "linear", ROOM, PHASES[name], light=light)
     assert solve(relit, tmp_path / "linear")[1]["warnings"] == []

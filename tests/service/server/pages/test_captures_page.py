@@ -39,7 +39,7 @@ def test_a_folder_is_uploaded_whole_but_for_hidden_files(server, page, folder):
     found = stored(server, folder.name)
     assert found["state"] == "ready"
     assert {file["path"]: file["sha256"] for file in found["files"]} == local
-    assert page.locator("#facts").inner_text().split("\n") >= ["Identifier"]
+    page.locator("#facts").get_by_text("Identifier", exact=True).wait_for()
     assert "128 × 128" in page.locator("#facts").inner_text()
 
 

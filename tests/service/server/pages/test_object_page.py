@@ -281,6 +281,7 @@ def test_notes_are_kept_with_the_object_at_their_places(page, made, browser):
 def test_a_video_is_recorded_by_the_browser(page, made):
     page.goto(made.pages["light"])
     made.wait_for_content(page, "light")
+    page.wait_for_function("() => globalThis.relit?.state().light")
     before = page.evaluate("relit.state().light.direction")
     with page.expect_download() as download:
         page.get_by_role("button", name="Save a video").click()
