@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 RIGID_TOLERANCE = 1e-4
 """The largest difference between R Rᵀ and the identity: matrices are typed and printed with four digits or more."""
 ROTATION_ROUNDING = 1e-6
-"""The same of a rotation that is none but for single precision."""
+"""The largest such difference that single precision alone makes; beyond it a rotation is said to be off."""
 
 OPENCV_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """The rotation from the camera frame to the axes of OpenCV, x right, y down, z forward; it is its own inverse."""

@@ -66,7 +66,7 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
     The amplitude is the mean over the periods. UNDECIDED: another wrap within the projector fits about as well. MULTIPATH: none fits. Both
     keep the coordinate that fits best, and its deviation in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has
     no phase says why. Where the periods disagree by more than their deviations, sigma grows by the root of χ² over its degrees of freedom:
-    motion between frames and bent waves shift each period otherwise.
+    motion between frames and bent waves shift each period by another amount.
 
     Args:
         extent: projector pixels along the axis.

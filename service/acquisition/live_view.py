@@ -127,10 +127,6 @@ def main(rig: str, camera: str, folder: str) -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
-
-
 class LivePage:
     """Serves the page on the loopback as long as it is open; afterwards the lamps are dark and the camera is free."""
 
@@ -189,3 +185,7 @@ def _handler(view: LiveView) -> type[BaseHTTPRequestHandler]:
             self.wfile.write(content)
 
     return Handler
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -25,8 +25,8 @@ SHADE_PART = 0.05
 
 def refuse_other_settings(folder: Path, earlier: Mapping[str, str], now: Mapping[str, str], shots: Sequence[Shot]) -> None:
     """Refuse to go on where a camera tells another value of a setting than it told when the capture began.
-    `folder`: of the capture, for messages. `shots`: of the plan; where it sets exposure times, they may differ. Raises RequestError if
-    names the setting and both values."""
+    `folder`: of the capture, for messages. `shots`: of the plan; where it sets exposure times, they may differ. Raises RequestError,
+    which names the setting and both values."""
     timed = EXPOSURE_TIMES if any(shot.exposure_s is not None for shot in shots) else ()
     change = _other_setting({name: value for name, value in earlier.items() if name not in timed}, now)
     if change is not None:

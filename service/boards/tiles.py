@@ -20,8 +20,8 @@ from stage.sets.board import SCAN_FILE, SCAN_SCHEMA, BoardScan, Tile
 SPIKE = 6.0
 """σ beyond its neighbours from which on a point is an outlier."""
 RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
-ANIMALS = (1, 4, 20, 110, 638)
-"""The forms that so many pixels side by side, or corner to corner, have."""
+GROUP_FORMS = (1, 4, 20, 110, 638)
+"""The number of forms that a group of 1, 2, … pixels has which touch by sides or corners (fixed polykings)."""
 CHANCE = 0.001
 """The expected number of groups of a size in a tile from which on that size comes together by chance."""
 
@@ -125,7 +125,7 @@ def without_spikes(height: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> t
 def _together(outliers: int, pixels: int) -> int:
     """Return how many outliers come together by chance, where so many of the pixels are outliers and do not know of each other."""
     share = outliers / max(pixels, 1)
-    return max(size for size, forms in enumerate(ANIMALS, start=1) if size == 1 or pixels * forms * share**size > CHANCE)
+    return max(size for size, forms in enumerate(GROUP_FORMS, start=1) if size == 1 or pixels * forms * share**size > CHANCE)
 
 
 def _pose(where: str, tile: Tile, maps: DepthMaps) -> np.ndarray:

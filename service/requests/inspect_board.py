@@ -44,7 +44,6 @@ class InspectBoardOptions(Options):
     """Least part that must be inspected for a board to pass: of the pixels of each region that does not say it, and of all nominal pixels;
     a missing pixel is inspected if no defect of the smallest size hides there. None: 0.9 where there are regions, else 1."""
 
-
     @model_validator(mode="after")
     def _stiff(self) -> Self:
         if self.stiffness_m is not None and self.remove is not BoardForm.SPLINE:

@@ -21,8 +21,6 @@ from stage.transforms import ROTATION_ROUNDING, off_rotation, scaled_rotation
 
 FAR_AWAY = 100.0
 """Coordinates of more than so many times the size of a scan are counted from another origin."""
-MANY_POINTS = 1000
-"""Points of a scan that are looked at to count different ones."""
 LARGE_M, SMALL_M = 50.0, 0.001
 """A scan of a format that has no unit is asked about if it is larger or smaller, metres."""
 METRIC = (".e57", ".ptx", ".las", ".laz")
@@ -134,7 +132,9 @@ def _read(request: ScansImport, names: list[str], poses: dict[str, np.ndarray]) 
 
 def _check_points(path: Path, points: np.ndarray) -> None:
     """Refuse points [n, 3] that span no surface."""
-    different = len(np.unique(points[:MANY_POINTS], axis=0))
+    different, rest = 0, points
+    while len(rest) and different < LEAST_POINTS:
+        different, rest = different + 1, rest[(rest != rest[0]).any(axis=1)]
     if different < LEAST_POINTS:
         raise ResultError(f"{path}: holds {different} different point{'s' * (different != 1)}: a surface has {LEAST_POINTS} or more")
 
@@ -156,7 +156,7 @@ def _doubts(request: ScansImport, scans: list[_Scan], sizes: list[float], metric
                                 f"{sizes[smallest]:.3g} m: are they in one unit? import those of another unit apart"))
     elif not metric and not SMALL_M < sizes[largest] < LARGE_M:
         others = " or ".join(f"{unit} ({size:.3g} m)" for unit, metres in UNITS_M.items()
-                  if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[request.unit.value]) <= USUAL_M[1])
+                             if USUAL_M[0] <= (size := sizes[largest] * metres / UNITS_M[request.unit.value]) <= USUAL_M[1])
         said.append(("warning", f"the largest scan is {sizes[largest]:.3g} m large: is its unit {request.unit}? "
                                 f"give --unit{others and f', which may be {others}'}"))
     off = max((off_rotation(scan.pose) for scan in scans if scan.pose is not None), default=0.0)

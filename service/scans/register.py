@@ -36,7 +36,7 @@ from service.scans.registration_words import (
 )
 from stage.errors import ScanError
 from stage.files import write_text
-from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, made_rotations, read_scan_set, write_scan_set
+from stage.sets.scan_set import SCAN_SET_FILE, ScanEntry, ScanSet, read_scan_set, rotation_warnings, write_scan_set
 
 
 class RegisterResult(NamedTuple):
@@ -142,7 +142,7 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
 def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
     """Return the poses of the scans of a set."""
     listed, reference = alone.scans, _checked(request, file, alone)
-    said = alone.warnings() + made_rotations(listed)
+    said = alone.warnings() + rotation_warnings(listed)
     table, threads = listed.turntable, _threads(request)
     timings.stage("read", len(listed.scans))
     if request.turntable is TableUse.FIXED:

@@ -1,7 +1,7 @@
 """Records of cameras in image files: exposure time, f-number and sensitivity, and how the recorded pixels are turned to be upright.
 
-Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tag Orientation, which TIFF 6.0 defines; in Radiance
-files the order of the rows and columns says the same.
+Source: CIPA DC-008, "Exchangeable image file format for digital still cameras: Exif", tags ExposureTime, FNumber and
+PhotographicSensitivity, and Orientation, which TIFF 6.0 defines; in Radiance files the order of the rows and columns says the same.
 """
 
 import math

@@ -170,8 +170,8 @@ def write_scan_set(scans: ScanSet, path: Path) -> None:
     write_text(path, body[:-2] + f',\n  "scans": [\n{entries}\n  ]\n}}\n')
 
 
-def made_rotations(scans: ScanSet) -> list[str]:
-    """Return a sentence on the poses of a set whose rotations are none but for more than rounding, as the nearest are taken."""
+def rotation_warnings(scans: ScanSet) -> list[str]:
+    """Return a sentence about the poses of a set whose rotations are off by more than rounding, which names the scans, or none."""
     off = {scan.name: off_rotation(np.array(scan.scan_to_world)) for scan in scans.scans if scan.scan_to_world is not None}
     named = [name for name, value in off.items() if value > ROTATION_ROUNDING]
     return [] if not named else [f"{', '.join(named)}: the rotation of scan_to_world is off orthonormal by up to "

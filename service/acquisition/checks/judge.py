@@ -254,7 +254,7 @@ class Judge:
     def _bright_fault(self, seen: Seen, used: list[tuple[np.float32, Seen]], usual: np.ndarray, dark: np.ndarray | float, should: float
                       ) -> Fault | None:
         """Return the fault of a picture of far more light than it should have, shaded as under its lamp and not as usual."""
-        most = max(should, *(float((each.sample.blocks - dark).mean()) for weight, each in used if abs(weight) > LEAST_BRIGHT_WEIGHT))
+        most = max([should, *(float((each.sample.blocks - dark).mean()) for weight, each in used if abs(weight) > LEAST_BRIGHT_WEIGHT)])
         gain = float((seen.sample.blocks - dark).mean()) / max(most, 1e-30)
         if gain < BRIGHT_GAIN or seen.root @ unit_root(expected_blocks(used)) < seen.root @ unit_root(usual):
             return None

@@ -1,4 +1,4 @@
-"""What the planes of a sweep may be off by: what depths change with them, and whether another sweep confirms them.
+"""How far the planes of a sweep may be off: how depths change with them, and whether another sweep confirms them.
 
 One sweep gives a surface as smooth as the true one under planes that are all off by one frame, or turned alike; nothing in it tells them.
 Stripes across the rows and stripes across the columns see the same surfaces, and do.
@@ -33,8 +33,8 @@ def unconfirmed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], 
     """Return a sentence about planes whose accuracy nobody declares: what one sweep does not tell, and what it would make.
 
     Args:
-        samples: of each frame whose stripe crosses the same lines, with those that are solved.
-        planes: of each of these frames.
+        samples: the samples of each frame whose stripe crosses the same lines; their depth is 0 where there is none.
+        planes: the plane of each of these frames, in the same order.
     """
     turned, moved = [], []
     for index, (part, plane) in enumerate(zip(samples, planes, strict=True)):
@@ -46,9 +46,9 @@ def unconfirmed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], 
         moved.append(np.abs(plane_depths(x, y, np.array(other.point_m), np.array(other.normal), along=along).depth - part.depth[seen]))
     if not turned or not np.isfinite(np.concatenate(turned)).any():
         return None
-    one_frame = np.concatenate(moved)
-    degree, frame = (1000 * float(np.nanmedian(values)) for values in (np.concatenate(turned), one_frame))
-    aside = f", or by {frame:.3g} mm if all are off by one frame" if len(planes) > 1 and np.isfinite(one_frame).any() else ""
+    degree, one_frame, aside = 1000 * float(np.nanmedian(np.concatenate(turned))), np.concatenate(moved), ""
+    if len(planes) > 1 and np.isfinite(one_frame).any():
+        aside = f", or by {1000 * float(np.nanmedian(one_frame)):.3g} mm if all are off by one frame"
     return (f"frames[].laser: one sweep does not tell whether its planes are right: depths are off by {degree:.3g} mm for each degree "
             f"that all are turned by{aside}, and the standard deviations hold the light alone: give accuracy_deg, which they then hold, "
             "or sweep planes across the other axis too")

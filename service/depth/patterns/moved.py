@@ -61,7 +61,7 @@ class EvenSums(NamedTuple):
             return None
         part, _ = found.parts(sample.grey[:, lit], noise)
         found = found._replace(usual=np.median(part, axis=1))
-        return found if found.moved(sample.grey[:, lit], noise).mean() <= MOST_MOVED else None
+        return found if found.moved(sample, noise)[lit].mean() <= MOST_MOVED else None
 
     def lit(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
         """Return which pixels are compared, of readings [frames, pixels]."""
@@ -75,8 +75,10 @@ class EvenSums(NamedTuple):
         deviation = np.sqrt(2 * (noise.read**2 + noise.gain * np.maximum(grey[self.white], 0))) / white
         return (sums - grey[self.black]) / white, deviation
 
-    def moved(self, grey: np.ndarray, noise: NoiseModel) -> np.ndarray:
-        """Return where surfaces have moved, of readings [frames, pixels], [pixels] bool."""
+    def moved(self, sample: Sample, noise: NoiseModel) -> np.ndarray:
+        """Return where surfaces have moved, [pixels] bool; nowhere where a frame is marked as saturated, whose sums say nothing."""
+        grey = sample.grey
         part, deviation = self.parts(grey, noise)
         away = np.abs(part - self.usual[:, None]).max(axis=0)
-        return np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))
+        found = np.asarray(self.lit(grey, noise) & (away > np.maximum(CLEAR_SIGMAS * deviation, LEAST_PART)))
+        return found if sample.saturated is None else found & ~sample.saturated.any(axis=0)

@@ -105,8 +105,9 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
     if moved.any():
+        clipped = "" if planes.saturated is not None else ", or readings are clipped, which a declared saturation would tell"
         warnings.append(f"frames[]: the even light of the frames differs at {100 * moved.sum() / mask.sum():.2g} % of the pixels, as where "
-                        "something has moved during the sequence: they are unsure")
+                        f"something has moved during the sequence{clipped}: they are unsure")
     facts = {"full_scale": float(f"{full:.6g}"), "frames": len(frames) * reads,
              "codes": {decoder.axis: decoder.name for decoder in (codes.columns, codes.rows) if decoder is not None},
              "unused": list(codes.unused)}
@@ -187,10 +188,11 @@ def _moved(planes: Planes, mask: np.ndarray, capture: Capture, collected: Collec
     sample = sample_of(planes, capture.camera, mask)
     sums = EvenSums.of(sample, collected, noise)
     moved = np.zeros(mask.shape, bool)
-    if sums is not None and sums.moved(sample.grey, noise).mean() > 0:
+    if sums is not None and sums.moved(sample, noise).any():
         for band in planes.bands(DECODE_BYTES_PER_PIXEL):
-            grey = sample._replace(values=planes.band(band)).grey
-            moved[band] = mask[band] & sums.moved(grey, noise).reshape(-1, mask.shape[1])
+            saturated = None if planes.saturated is None else planes.saturated[:, band].reshape(len(planes.saturated), -1)
+            part = sample._replace(values=planes.band(band), saturated=saturated)
+            moved[band] = mask[band] & sums.moved(part, noise).reshape(-1, mask.shape[1])
     return moved if moved.sum() > SAID * mask.sum() else np.zeros_like(moved)
 
 

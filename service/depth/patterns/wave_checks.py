@@ -84,7 +84,7 @@ class WaveFindings(NamedTuple):
 def check_waves(sample: Sample, collected: Collected, projector: PatternProjector, model: ProjectorModel | None,
                 noise: NoiseModel) -> WaveFindings:
     """Return what the waves of each axis without stripes say of their declaration; `model` is None without calibration."""
-    unconfirmed = None
+    said = None
     numbered = {code.axis for code in collected.codes if isinstance(code, BinaryCode | KaryCode)}
     alone = len({code.axis for code in collected.codes}) == 1
     for code in collected.codes:
@@ -94,16 +94,16 @@ def check_waves(sample: Sample, collected: Collected, projector: PatternProjecto
         if waves is None:
             continue
         if len(waves.periods) > 1:
-            wrong = _check_several(waves)
+            wrong, unconfirmed = _check_several(waves), None
         elif waves.periods[0] >= waves.extent:
             wrong, unconfirmed = _check_one(waves, sample, model, 0 if code.axis == "column" else 1, alone=alone)
         else:
             continue
         if wrong is not None:
             return WaveFindings(f"frames: the {code.axis} phases {wrong} in the frames' patterns", None)
-        if unconfirmed is not None:
-            unconfirmed = f"frames[].pattern: the {code.axis} phases {unconfirmed}"
-    return WaveFindings(None, unconfirmed)
+        if unconfirmed is not None and said is None:
+            said = f"frames[].pattern: the {code.axis} phases {unconfirmed}"
+    return WaveFindings(None, said)
 
 
 def waves_of(sample: Sample, code: PhaseCode, projector: PatternProjector, noise: NoiseModel) -> Waves | None:

@@ -177,7 +177,8 @@ def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCa
                         f"{full:g}, as those of a full counter: these are taken for saturated")
     first_bin, last_bin = max((nearest - start_m) / bin_m, 0.0), min((farthest - start_m) / bin_m, float(frames.counts.shape[1]))
     if fog is not None:
-        ends = [start_m + bin_m * value for value in (0, np.flatnonzero(fog.head)[-1] + 1)]
+        head = np.flatnonzero(fog.head)
+        ends = [start_m + bin_m * value for value in (head[0], head[-1] + 1)]
         warnings.append("frames[].tof: all pixels show light that begins near the camera and falls slowly with distance, as fog returns "
                         f"it: returns are not looked for from {ends[0]:.3g} to {ends[1]:.3g} m, where it is strongest; what is no stronger "
                         "than the fog has a low confidence, and the standard deviations hold the shift that its slope makes")

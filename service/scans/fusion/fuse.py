@@ -22,7 +22,7 @@ from service.scans.fusion.joined_normals import join_normals
 from service.scans.fusion.tiles import write_tiles
 from service.scans.pieces import SharedPieces
 from stage.files import write_text
-from stage.sets.scan_set import ScanSet, made_rotations, read_scan_set
+from stage.sets.scan_set import ScanSet, read_scan_set, rotation_warnings
 from stage.stack.fingerprint import digest
 
 MESH_FILE, ASSET_FILE = "mesh.ply", "asset.usdc"
@@ -73,7 +73,7 @@ def fuse(request: FuseRequest, progress: Progress | None = None, sharing: Shared
         made = (_tiles(request, scan_set, file, fused, provenance, timings) if request.tiles else
                 _whole(request, scan_set, file, fused, provenance, timings, device))
     facts = made.facts
-    warnings = [*made_rotations(scan_set), *fused.warnings, *_fusion_warnings(facts)]
+    warnings = [*rotation_warnings(scan_set), *fused.warnings, *_fusion_warnings(facts)]
     report_path = request.out / REPORT_FILE
     write_text(report_path, report(request, inputs={"name": scan_set.name, "scan_set": inputs},
                                    device=devices.describe(device), timings_s=timings.close(), **facts, warnings=warnings))

@@ -171,9 +171,9 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
     alone = {}
     for number in sorted(set(range(count)) - set(joined or basis)):
         others = [partial(work.ready, other) for other in sorted(basis, key=lambda other: abs(other - number))]
-        open_ = any(pair.state is PairState.AMBIGUOUS and number in (pair.a, pair.b) for pair in pairs.values())
-        words = None if open_ else why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
-                                             least_overlap=options.least_overlap)  # what looks alike turned does so mirrored
+        ambiguous = any(pair.state is PairState.AMBIGUOUS and number in (pair.a, pair.b) for pair in pairs.values())
+        words = None if ambiguous else why_alone(work.scan(number), others, extent=extents[number], others_extent=usual, cell_m=common,
+                                                  least_overlap=options.least_overlap)  # what looks alike turned does so mirrored
         alone[number] = (words or _refusal(number, names, pairs.values())) + _refused_targets(number, names, shown, targeted.values())
     advance(1.0)
     if solved is None:

@@ -58,6 +58,15 @@ def test_lamps_in_front_of_a_matte_cap_without_texture_are_no_ambient_light():
     assert named(scene, 0, ())[1] == {}
 
 
+def test_a_lamp_in_the_middle_of_a_ring_of_many_is_judged():
+    """Its prediction rests on all of the ring alike, and on none by a twentieth."""
+    around = 2 * np.pi * np.arange(40) / 40
+    ring = np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(40, 0.75**0.5)])
+    cap, directions = make_scene(size=48), np.vstack([[0.0, 0.0, 1.0], ring])
+    scene = Scene((0.5 * render(cap.normal, cap.albedo, directions, np.ones((41, 3)))).astype(np.float32), directions)
+    assert named(scene, 0, ())[1] == {}
+
+
 def test_the_lamp_beside_the_camera_of_a_small_dome_is_no_ambient_light():
     """No lamp of seven is predicted, because the one beside the camera is brighter than the mean of those around it."""
     ring = make_scene(size=64, lights=7)

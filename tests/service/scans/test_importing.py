@@ -168,6 +168,14 @@ def test_one_point_is_no_scan(relit, tmp_path):
     (folder / "scan_0.ply").unlink()
     (folder / "a.xyz").write_text("1 2 3\n" * 9)
     assert "a.xyz: holds 1 different point:" in relit.refused("import", "scans", folder, tmp_path / "set")
+
+
+def test_a_scan_that_begins_with_empty_places_is_one(relit, tmp_path):
+    """Organised clouds hold zeros where nothing was seen, whole rows of them at the border."""
+    cloud = np.random.default_rng(1).normal(0, 0.1, (500, 3)) + [0, 0, 1]
+    folder = write(tmp_path / "scans", [np.concatenate([np.zeros((2000, 3)), cloud])])
+    relit("import", "scans", folder, tmp_path / "set")
+    assert (tmp_path / "set" / "scan-set.json").is_file()
     assert find_viewpoints([np.ones((1, 3))], [None]).place is None
 
 

@@ -15,7 +15,7 @@ NOISE = NoiseModel(0.003, 1e-4)
 PATTERNS = [*phase_patterns("column", (16.0,), 3), *binary_patterns(EXTENT, "column", stripe_px=8)]
 
 
-def moved(by_px, gamma):
+def moved(by_px, gamma, full=np.inf):
     """Where frames, in the second half of which a dark strip stands farther right, show motion; and where it does."""
     rng = np.random.default_rng(3)
     at = np.arange(COLS) + np.zeros((ROWS, 1))
@@ -30,15 +30,20 @@ def moved(by_px, gamma):
     values = np.array(frames).reshape(len(PATTERNS), 1, -1)
     values = values + rng.normal(0, 1, values.shape) * np.sqrt(NOISE.read**2 + NOISE.gain * values)
     still = np.zeros((ROWS, COLS), np.float32)
-    sample = Sample(values.astype(np.float32), None, still, still, np.ones(still.shape, bool))
+    sample = Sample(np.minimum(values, full).astype(np.float32), (values >= full)[:, 0], still, still, np.ones(still.shape, bool))
     sums = EvenSums.of(sample, collect(PATTERNS), NOISE)
-    return sums.moved(sample.grey, NOISE), (np.abs(albedos[0] - albedos[-1]) > 0.2).ravel()
+    return sums.moved(sample, NOISE), (np.abs(albedos[0] - albedos[-1]) > 0.2).ravel()
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])
 def test_what_stands_still_has_not_moved(gamma):
     """Six deviations of noise: none of 3840 pixels by chance."""
     assert moved(0, gamma)[0].sum() == 0
+
+
+def test_clipped_highlights_that_stand_still_have_not_moved():
+    """The mean of a wave whose crests are clipped falls below half of white at the brighter half of the surface."""
+    assert moved(0, 1.0, full=0.5)[0].sum() == 0
 
 
 @pytest.mark.parametrize("gamma", [1.0, 2.2])

@@ -12,7 +12,7 @@ from service.depth.patterns.wave_checks import bent_back, check_waves
 from stage.patterns.codes import collect
 from stage.patterns.phase import phase_patterns
 
-EXTENT, ROWS, COLS = 400, 24, 150
+EXTENT, ROW_EXTENT, ROWS, COLS = 400, 300, 24, 150
 NOISE = NoiseModel(0.004, 1e-4)
 BASELINE = 0.2
 
@@ -20,7 +20,7 @@ BASELINE = 0.2
 def rig(side=1):
     """The projector beside the camera, looking the same way: x right, y down, z forward of it."""
     turn = np.diag([1.0, -1.0, -1.0])
-    return ProjectorModel((EXTENT, 300), (500.0, 500.0), (EXTENT / 2, 150.0), (0, 0, 0), (0, 0),
+    return ProjectorModel((EXTENT, ROW_EXTENT), (500.0, 500.0), (EXTENT / 2, 150.0), (0, 0, 0), (0, 0),
                           np.column_stack([turn, [-side * BASELINE, 0, 0]]))
 
 
@@ -37,12 +37,14 @@ def said(patterns, declared, *, side=1, field=0.42, gamma=1.0, calibrated=True):
     rng = np.random.default_rng(7)
     x, y, u = seen(side, field)
     albedo = 0.55 + 0.35 * np.sign(np.sin(60 * x) * np.sin(50 * y))
-    light = np.stack([np.nan_to_num(pattern.level(u, u, EXTENT)) ** gamma for pattern in patterns])
+    v = ROW_EXTENT / 2 - 500 * y / 2
+    light = np.stack([np.nan_to_num(pattern.level(u, v, EXTENT) if pattern.axis == "column" else pattern.level(v, u, ROW_EXTENT)) ** gamma
+                      for pattern in patterns])
     frames = albedo * (0.75 * light + 0.04)
     frames = frames + rng.normal(0, 1, frames.shape) * np.sqrt(NOISE.read**2 + NOISE.gain * frames)
     sample = Sample(frames.reshape(len(frames), 1, -1).astype(np.float32), None, x.astype(np.float32), y.astype(np.float32),
                     np.isfinite(u))
-    projector = PatternProjector((EXTENT, 300))
+    projector = PatternProjector((EXTENT, ROW_EXTENT))
     found = check_waves(sample, collect(list(declared)), projector, rig(side) if calibrated else None, NOISE)
     return (*found, bent_back(sample, collect(list(declared)), projector, NOISE))
 
@@ -91,6 +93,13 @@ def test_what_one_wave_does_not_tell_is_said():
 def test_a_wave_that_runs_backwards_is_said_without_calibration():
     wrong, unconfirmed, _ = said(ONE, reversed_steps(ONE), calibrated=False)
     assert wrong is None and "run against the image" in unconfirmed
+
+
+@pytest.mark.parametrize("periods", [(ROW_EXTENT,), (19.0, 22.0, 26.0)], ids=["one", "three"])
+def test_waves_of_the_rows_keep_what_is_said_of_the_columns(periods):
+    rows = phase_patterns("row", periods, 3)
+    wrong, unconfirmed, _ = said([*ONE, *rows], [*reversed_steps(ONE), *rows], calibrated=False)
+    assert wrong is None and unconfirmed.startswith("frames[].pattern: the column phases run")
 
 
 @pytest.mark.parametrize("gamma", [1.5, 2.1])
