@@ -1,7 +1,7 @@
 /** A diagram of all directions around the object, seen from the camera, on which a light is moved. Light from beyond the captured is hatched. */
 
-import { placeOf } from "../dome.js";
-import { element } from "../element.js";
+import { placeOf } from "../../dome.js";
+import { element } from "../../element.js";
 import { unit } from "./disc_light.js";
 
 const SIDE = 240;
