@@ -1,4 +1,4 @@
-"""Names that are markup are shown as text, whoever gave them: environments, results, frames, layers and units of a view, and methods of a report."""
+"""Names that are markup are shown as text, whoever gave them: environments, results, frames, layers, units and methods."""
 
 import json
 
