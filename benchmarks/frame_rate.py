@@ -24,8 +24,8 @@ PAGE = b"<!doctype html><title>frame rate</title><canvas></canvas>"
 LIGHTS = 96
 MOST_TILES = 1024
 DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
-  const { BasisRenderer } = await import('/view/basis_renderer.js');
-  const { addWeighted } = await import('/view/light_model.js');
+  const { BasisRenderer } = await import('/view/light/basis_renderer.js');
+  const { addWeighted } = await import('/view/light/light_model.js');
   let tile = 8;
   while (Math.ceil(side / tile) ** 2 > mostTiles) tile *= 2;
   const across = Math.ceil(side / tile);
@@ -59,7 +59,7 @@ DRAW = """async ({ side, layers, lights, mostTiles, seconds }) => {
     taken.push(picture());
     await new Promise((done) => { setTimeout(done); });
   }
-  const { DrawLoop } = await import('/view/draw_loop.js');
+  const { DrawLoop } = await import('/view/light/draw_loop.js');
   const tasks = [0];
   new PerformanceObserver((list) => tasks.push(...list.getEntries().map(({ duration }) => duration))).observe({ type: 'longtask' });
   const strides = [];

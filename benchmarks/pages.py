@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from benchmarks.clients import installed
 from benchmarks.first_picture import repeated
 from tests.service.server.pages.conftest import ARGUMENTS
-from tests.service.server.pages.test_motion import SHIFTS
+from tests.service.server.pages.object.test_motion import SHIFTS
 from tests.service.server_process import serving
 
 SAMPLES = Path(__file__).parents[1] / "samples"

@@ -68,8 +68,8 @@ class ChartCalibration(NamedTuple):
 
 def calibrate_chart(request: ChartRequest, progress: Progress | None = None) -> ChartCalibration:
     """Measure the colours of a camera from a chart in the frames of a capture, and write their matrices into a manifest.
-    Raises StageError: bad input, no chart, or one whose patches do not tell the colours; names what is wrong. Nothing is written. Raises
-    RequestError: options that do not fit."""
+    Raises StageError for bad input, no chart, or one whose patches do not tell the colours; it names what is wrong, and nothing is written.
+    Raises RequestError for options that do not fit."""
     timings = Timings(progress)
     timings.stage("open", 1)
     source = Capture.open(request.capture)

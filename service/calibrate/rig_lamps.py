@@ -84,8 +84,8 @@ class Target(NamedTuple):
 
 def calibrate_rig(request: RigCalibrationRequest, progress: Progress | None = None) -> RigCalibration:
     """Measure the primaries of a rig, and write its file.
-    Raises RequestError: options that do not fit. Raises StageError: bad input, or an image from which a primary cannot be measured; names
-    it. Nothing is written. Raises StorageError if a file cannot be written."""
+    Raises RequestError for options that do not fit. Raises StageError for bad input, or an image from which a primary cannot be measured;
+    it names the image, and nothing is written. Raises StorageError if a file cannot be written."""
     timings = Timings(progress)
     timings.stage("open", 1)
     capture, rig = Capture.open(request.capture), read_rig(request.rig)

@@ -51,7 +51,7 @@ def check_in_process(folder: Path, *, environment: bool, root: Path | None, max_
     `folder`: of the capture or the environment, or the file of a registered environment. `root`: the folder below which a registered one
     lies, so that no link is followed out of its folder; None: it was uploaded. `progress`: of the check; an exception that it raises ends
     the process. Returns the description that `service.captures.admit` returns. Raises RequestError if the files cannot be used; the
-    sentence names them below the folder. Raises RuntimeError: an error of relit itself; the message is its traceback."""
+    sentence names them below the folder. Raises RuntimeError for an error in relit; the message is its traceback."""
     return _ask({"do": "check", "folder": str(folder), "environment": environment, "root": None if root is None else str(root),
                  "max_pixels": max_pixels}, progress)
 

@@ -44,7 +44,6 @@ HELD = 1e-3
 them most: it is held where it is. A cylinder of 64 flat sides has 8e-4 about its axis."""
 
 
-
 class Placement(NamedTuple):
     """The pose of a scan on its design, and how sure it is."""
 
@@ -75,7 +74,7 @@ def place(design: Design, scan: ScannedSurface, *, search: bool, reach_m: float,
     """Find the pose of a scan on its design.
     `search`: nothing is known of the pose; False: it is right to within the reach of a rough fit, a fiftieth of the design's size.
     `reach_m`: distance of points from the design beyond which they do not belong to it. `datum`: tells the points by which the pose is
-    found at last; None: all. Raises ScanError: less than half of the scan can be laid on the design."""
+    found at last; None: all. Raises ScanError if less than half of the scan can be laid on the design."""
     drawn = np.random.default_rng(0).permutation(len(scan.points))
     if not SMALLER < scan.size / design.size < LARGER:
         raise ScanError(f"the scan does not lie on the design: {_sizes(design, scan)}")

@@ -72,8 +72,8 @@ class DriveResult(NamedTuple):
 
 def drive(request: DriveRequest, progress: Progress | None = None) -> DriveResult:
     """Find the levels of the lamps and write them.
-    Raises RequestError: options that do not fit, or an environment beyond all limits of the rig. Raises StageError or KernelError: bad
-    input; names file and field. Raises StorageError if a file cannot be written; nothing half-written is left."""
+    Raises RequestError for options that do not fit, or an environment beyond all limits of the rig. Raises StageError or KernelError for
+    bad input; it names file and field. Raises StorageError if a file cannot be written; nothing half-written is left."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     timings.stage("open", 1)
@@ -137,7 +137,7 @@ def _greatest(wanted: WantedLevels) -> float:
 
 def _check_limits(wanted: WantedLevels, dilated: Dilated, rig: Rig, request: DriveRequest, exposure: float) -> None:
     """Check that the lamps hold the light of every frame.
-    Raises RequestError: more than MOST_LEFT of the energy of a frame finds no lamp."""
+    Raises RequestError if more than MOST_LEFT of the energy of a frame finds no lamp."""
     irradiance = np.array([primary.irradiance for _, primary in rig.emitters])
 
     def left(level: np.ndarray, rest: np.ndarray) -> np.ndarray:

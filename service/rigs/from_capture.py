@@ -30,8 +30,8 @@ Part = TypeVar("Part", bound=Strict)
 
 def rig_from_capture(request: RigFromCaptureRequest) -> Rig:
     """Write the rig of the lamps that lit a capture and return it.
-    Raises RequestError: addresses beyond the protocol's. Raises StageError: bad input; names file and field. Raises StorageError if the
-    file cannot be written."""
+    Raises RequestError for addresses beyond the protocol's. Raises StageError for bad input; it names file and field. Raises StorageError
+    if the file cannot be written."""
     capture = Capture.open(request.capture)
     lights = lights_from_centre(capture)
     placed = place_lights(capture) if capture.lit_by(PointLight) else None
@@ -65,8 +65,8 @@ def rig_from_capture(request: RigFromCaptureRequest) -> Rig:
 
 def rig_from_csv(request: RigFromCsvRequest) -> Rig:
     """Write the rig of a table of lamps and return it.
-    Raises RequestError: addresses beyond the protocol's, or a primary of no known colour. Raises ManifestError if the table is wrong; names
-    the line and the column. Raises StorageError if the table cannot be read, or the rig not be written."""
+    Raises RequestError for addresses beyond the protocol's, or a primary of no known colour. Raises ManifestError if the table is wrong;
+    names the line and the column. Raises StorageError if the table cannot be read, or the rig not be written."""
     unknown = [name for name in request.primaries if name not in COLOURS]
     if unknown or len(set(request.primaries)) < len(request.primaries):
         raise RequestError(f"--primaries {','.join(request.primaries)}: give different ones of {', '.join(COLOURS)}")

@@ -61,7 +61,7 @@ class TwinPicture:
     """Pictures of a capture under the lamps of a rig; each lamp lights as the captured light does that stands nearest to it."""
 
     def __init__(self, rig: Rig, request: TwinRequest, timings: Timings) -> None:
-        """Read the images of the capture. Raises StageError: bad input; names file and field."""
+        """Read the images of the capture. Raises StageError for bad input; it names file and field."""
         timings.stage("open", 1)
         device = devices.resolve(request.device)
         capture = Capture.open(request.capture, request.pixels)

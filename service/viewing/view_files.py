@@ -261,9 +261,13 @@ class SolveReport(NamedTuple):
     """The lights that a solve found from the images; None: they are those of the manifest."""
 
     def lit(self, capture: Capture) -> Capture:
-        """Return the capture with the lights that the solve found in place of placeholders."""
+        """Return the capture with the lights that the solve found in place of placeholders.
+        Raises ResultError if the solve found those of another number of frames."""
         if self.lights is None or not has_placeholders(capture):
             return capture
+        if len(self.lights.direction) != len(capture.sources()):
+            raise ResultError(f"{capture.folder}: has {len(capture.sources())} lit frames, and the maps come from a solve that has found "
+                              f"the lights of {len(self.lights.direction)}: solve again")
         found = {frame.image: {"direction": (x, y, z), "irradiance": (r, g, b)} for frame, (x, y, z), (r, g, b) in zip(
             capture.sources(), self.lights.direction.tolist(), self.lights.irradiance.tolist(), strict=True)}
         frames = [frame.model_copy(update={"light": frame.light.model_copy(update=found[frame.image])})

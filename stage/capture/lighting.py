@@ -41,7 +41,7 @@ def lie_in_one_plane(direction: np.ndarray) -> bool:
 
 def extended_lights(capture: Capture) -> ExtendedLights:
     """Return the lights of the stack of a capture, all of which must be extended or distant.
-    Raises ManifestError: a light of another type, a source whose colour changes over its extent, fewer than three lights, light from one
+    Raises ManifestError for a light of another type, a source whose colour changes over its extent, fewer than three lights, light from one
     plane only, or a channel without light; the message names the frame."""
     where = capture.folder / FILE_NAME
     direction, solid_angle, share, irradiance = [], [], [], []

@@ -13,7 +13,7 @@ SUFFIXES = {".exr", ".hdr"}
 
 
 def check_environment(path: Path) -> None:
-    """Check the header of an environment map. Raises ImageError: not EXR or HDR, or not twice as wide as high."""
+    """Check the header of an environment map. Raises ImageError if it is not EXR or HDR, or not twice as wide as high."""
     if path.suffix.lower() not in SUFFIXES:
         raise ImageError(f"{path}: an environment is a lat-long .exr or .hdr")
     header = images.read_header(path)

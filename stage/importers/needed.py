@@ -36,9 +36,9 @@ class Needed(NamedTuple):
 def needed_files(lengths: Mapping[str, int]) -> tuple[Needed, ...]:
     """Return the files of each capture in a folder: those of the folder, or of each folder in it that has images or arrays.
 
-    Calibrations and tables of the folder above a capture come with it, where its own folder has none of their name.
-    `lengths`: the bytes of each file of the folder, by its path with / between folders. Raises ManifestError: no file can be part of a
-    capture; the sentence says what was looked for."""
+    Calibrations and tables of the folder above a capture come with it, where its own folder has none of their name. `lengths`: the bytes of
+    each file of the folder, by its path with / between folders. Raises ManifestError if no file can be part of a capture; the sentence says
+    what was looked for."""
     shown = {path: length for path, length in lengths.items() if not any(part.startswith(".") for part in path.split("/"))}
     inside: dict[str, list[str]] = defaultdict(list)
     tables: dict[str, list[str]] = defaultdict(list)

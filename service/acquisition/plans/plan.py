@@ -136,7 +136,7 @@ def needs_projector(sequences: Iterable[AnySequence]) -> bool:
 
 def read_plan(given: str) -> Plan:
     """Return the plan of a file, or of names with commas between them, such as dark,olat.
-    Raises RequestError if the text is neither. Raises ManifestError if the file is wrong; names file and field."""
+    Raises RequestError if it names neither a file nor a known sequence. Raises ManifestError if the file is wrong; names file and field."""
     if Path(given).suffix == ".json" or Path(given).is_file():
         return read_record(given, Plan, PLAN_SCHEMA)
     names = given.split(",")

@@ -31,8 +31,8 @@ def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str 
                 textures: TextureFormat = TextureFormat.PNG16) -> AssetReport:
     """Write solved maps as a .glb file, whole or not at all.
     `name`: free text; the root node, the mesh and the material are named after it. `textures`: the bits of normals, roughness and metallic;
-    colours have 8. Raises AssetError: EXR textures; no height layer, or no face; a colour space that is not known; more than the 4 GiB that
-    a .glb can hold. Raises StorageError if the disk refuses; what was there before is left as it was."""
+    colours have 8. Raises AssetError for EXR textures, maps without a height layer or without a face, a colour space that is not known, or
+    more than the 4 GiB that a .glb can hold. Raises StorageError if the disk refuses; what was there before is left as it was."""
     target = Path(path)
     check_textures(target, textures)
     mesh, look, provenance, unit_m = surface_of(maps)
@@ -56,7 +56,7 @@ def write_depth(
     textures: TextureFormat = TextureFormat.PNG16,
 ) -> tuple[str, ...]:
     """Write a depth as a .glb file, whole or not at all, and return sentences on what the asset lacks.
-    Raises AssetError: EXR textures; no point, or no face for a mesh; a cloud that is not one of this depth; more than 4 GiB. Raises
+    Raises AssetError for EXR textures, no point, no face for a mesh, a cloud that is not one of this depth, or more than 4 GiB. Raises
     StorageError if the disk refuses; what was there before is left as it was."""
     target = Path(path)
     check_textures(target, textures)

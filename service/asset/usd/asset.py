@@ -22,8 +22,9 @@ NOTHING = Surroundings()
 def write_asset(maps: SurfaceMaps, path: str | Path, *, name: str, version: str = FIRST_VERSION,
                 textures: TextureFormat = TextureFormat.PNG16, levels: int = 0, surroundings: Surroundings = NOTHING) -> AssetReport:
     """Write solved maps as a USD asset in the camera frame.
-    Raises AssetError: another suffix; EXR textures in a .usdz; lights of a .usdz beside a .usda or .usdc of its name; no height layer, or
-    no face; a colour space that is not known. Raises StorageError if the disk refuses; what was there before is left as it was.
+    Raises AssetError for another suffix, EXR textures in a .usdz, lights of a .usdz beside a .usda or .usdc of its name, maps without a
+    height layer or without a face, or a colour space that is not known. Raises StorageError if the disk refuses; what was there before is
+    left as it was.
 
     Args:
         path: its suffix chooses the format. Beside a .usda and .usdc go the folders `<stem>_layers` and `<stem>_textures`; a .usda and a

@@ -52,9 +52,9 @@ class _Parts(NamedTuple):
 def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, name: str, geometry: Geometry = Geometry.MESH,
                 version: str = FIRST_VERSION, textures: TextureFormat = TextureFormat.PNG16) -> tuple[str, ...]:
     """Write a depth as a USD asset with a mesh, which is cut at breaks of the depth, and the measured points as variants of `geo`.
-    Returns sentences on what the asset lacks. Raises AssetError: another suffix; an EXR texture in a .usdz; no point, or no face for a mesh
-    that is asked for; a cloud that is not one of this depth. Raises StorageError if the disk refuses; what was there before is left as it
-    was.
+    Returns sentences on what the asset lacks. Raises AssetError for another suffix, an EXR texture in a .usdz, no point, no face for a mesh
+    that is asked for, or a cloud that is not one of this depth. Raises StorageError if the disk refuses; what was there before is left as
+    it was.
 
     Args:
         cloud: what points.ply holds, or None.
@@ -128,8 +128,8 @@ def _set_uncertainty(prim: UsdGeom.Gprim, maps: DepthMaps, rows: np.ndarray, col
 def write_points(cloud: PointCloud, path: str | Path, *, name: str, provenance: dict[str, str] | None = None) -> None:
     """Write a point cloud in metres as a USD layer, .usda or .usdc, whole or not at all.
 
-    The intensity of points, where they have one, becomes the primvar of that name.
-    Raises AssetError: another suffix, or no point. Raises StorageError if the disk refuses."""
+    The intensity of points, where they have one, becomes the primvar of that name. Raises AssetError for another suffix, or no point.
+    Raises StorageError if the disk refuses."""
     target = Path(path)
     if target.suffix.lower() not in POINT_SUFFIXES:
         raise AssetError(f"{target} cannot be written as USD points: its suffix must be .usda or .usdc")

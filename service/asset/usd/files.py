@@ -60,8 +60,8 @@ def write_layer(target: Path, define: Callable[[Usd.Stage], None]) -> None:
 
 def install(target: Path, layer: Path, files: Sequence[Path], *, ours: Container[str], apart: Sequence[Path] = ()) -> None:
     """Flush an asset to the disk and put it in place of an older one, whole or not at all; as a package where the target is a .usdz.
-    Raises AssetError: larger than a package can be. Raises StorageError: there is something else in place of a folder. Raises OSError if
-    the disk refuses; what was there before is put back.
+    Raises AssetError if it is larger than a package can be. Raises StorageError if there is something else in place of a folder. Raises
+    OSError if the disk refuses; what was there before is put back.
 
     Args:
         layer: the asset's first layer, in the folder of temporary_folder_beside.

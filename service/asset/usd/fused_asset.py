@@ -24,7 +24,7 @@ from stage.results.mesh import TriangleMesh
 
 def write_fused(unwrapped: UnwrappedMesh, baked: BakedImages, path: Path, *, name: str, provenance: dict[str, str]) -> None:
     """Write a fused surface in the world frame, with the images over its texture, as a USD asset.
-    Raises AssetError: another suffix. Raises StorageError if the disk refuses; what was there before is left as it was."""
+    Raises AssetError for another suffix. Raises StorageError if the disk refuses; what was there before is left as it was."""
     maps = baked.maps
     look = metallic_look(maps) if maps.diffuse_albedo is not None else None
     with writing_asset(path, Description(name, None, provenance)) as files:

@@ -56,8 +56,8 @@ def write_sequence_asset(moments: Iterator[Moment], target: Path, description: D
                          frames_per_second: float) -> SequenceSizes:
     """Write the steps of a sequence as time samples, whole or not at all.
     `moments`: in the order of time, one step or more, all with faces or none; each is held only while it is written. `description`: goes
-    into the root prim and the layer; it has a camera. `frames_per_second`: time codes a second. Raises AssetError: another suffix, no step,
-    or a step without a vertex. Raises StorageError if the disk refuses; what was there before is left as it was."""
+    into the root prim and the layer; it has a camera. `frames_per_second`: time codes a second. Raises AssetError for another suffix, no
+    step, or a step without a vertex. Raises StorageError if the disk refuses; what was there before is left as it was."""
     if target.suffix.lower().removeprefix(".") not in TIME_SAMPLED:
         raise AssetError(f"{target} cannot hold a sequence: its suffix must be .usdc or .usdz, which take one step after another")
     sizes: list[SequenceSizes] = []

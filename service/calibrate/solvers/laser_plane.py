@@ -52,7 +52,8 @@ class LightPlane(NamedTuple):
 
 
 def board_plane(corners: np.ndarray, board: tuple[int, int], square_m: float, camera: Camera) -> BoardPlane:
-    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row."""
+    """Return the plane of a chessboard. `corners`: [across × down, 2] image coordinates, row by row. `board`: its inner corners across and
+    down. `camera`: a calibrated perspective one."""
     across, down = np.meshgrid(np.arange(board[0]), np.arange(board[1]))
     points = np.stack([across.ravel(), down.ravel(), np.zeros(across.size)], axis=1) * square_m
     x, y = camera.plane_at(corners[:, 0], corners[:, 1])

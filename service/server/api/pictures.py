@@ -2,9 +2,9 @@
 
 import tempfile
 from pathlib import Path
-from threading import Lock
 from typing import Annotated, Any
 
+import anyio.to_thread
 from fastapi import APIRouter, Depends, Response
 
 from service.server.api.problems import ApiError, responses
@@ -13,19 +13,19 @@ from service.server.api.results import Opened, Tags, headers_of, opened, unchang
 router = APIRouter(prefix="/v1/jobs/{job}/pictures", tags=["results"], responses=responses(401, 403, 404, 412, 422, 429, 503))
 SIDE = 512
 """Longest side of a picture, pixels."""
-MOST_PIXELS = 36_000_000
-"""Pixels of a file that is decoded for a picture: those of a frame of 8K."""
+MOST_VALUES = 4 * 36_000_000
+"""Values of a file that is decoded for a picture, in all of its channels: those of a frame of 8K with coverage."""
 BACKDROP = 0.2
 """Display value of the grey behind the object, as on the page that relights."""
 QUALITY = 85
 JPEG: dict[int | str, dict[str, Any]] = {200: {"description": "The picture.", "content": {"image/jpeg": {
     "schema": {"type": "string", "format": "binary"}}}}, 304: {"description": "If-None-Match names the file as it is."}}
-one_at_a_time = Lock()
-"""Held while a file is decoded, so that a player asks for the memory of one."""
+one_at_a_time = anyio.CapacityLimiter(1)
+"""Held while a file is decoded, so that a player asks for the memory of one; those that wait hold no thread of other requests."""
 
 
 @router.get("/{name:path}", responses=JPEG, response_class=Response, summary="See a small picture of a result")
-def result_picture(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
+async def result_picture(file: Annotated[Opened, Depends(opened)], if_match: Tags = None, if_none_match: Tags = None) -> Response:
     """Send an EXR file as a JPEG of at most 512 × 512 pixels: linear light clipped and encoded as sRGB, over a neutral grey."""
     from stage.errors import StageError
 
@@ -36,10 +36,10 @@ def result_picture(file: Annotated[Opened, Depends(opened)], if_match: Tags = No
     if not file.name.lower().endswith(".exr"):
         raise ApiError("invalid", f"{file.name} is no EXR file, of which there are pictures")
     try:
-        with one_at_a_time:
-            return Response(_jpeg(Path(f"/proc/self/fd/{file.descriptor}"), file.name), media_type="image/jpeg", headers=headers)
-    except StageError as error:
-        raise ApiError("invalid", f"{file.name}: cannot be shown: it is damaged") from error
+        picture = await anyio.to_thread.run_sync(_jpeg, Path(f"/proc/self/fd/{file.descriptor}"), file.name, limiter=one_at_a_time)
+    except (StageError, ValueError) as error:
+        raise ApiError("invalid", f"{file.name}: cannot be shown: it is damaged, or its colours are those of no known space") from error
+    return Response(picture, media_type="image/jpeg", headers=headers)
 
 
 def _jpeg(path: Path, name: str) -> bytes:
@@ -51,8 +51,8 @@ def _jpeg(path: Path, name: str) -> bytes:
     from stage.formats.images import write_jpeg
 
     header = exr.read_header(path)
-    if not {"R", "G", "B"} <= set(header.channels) or header.width * header.height > MOST_PIXELS:
-        raise ApiError("invalid", f"{name} has no R, G and B, or more than {MOST_PIXELS:,} pixels")
+    if not {"R", "G", "B"} <= set(header.channels) or header.width * header.height * len(header.channels) > MOST_VALUES:
+        raise ApiError("invalid", f"{name} has no R, G and B, or more than {MOST_VALUES:,} values in its channels")
     channels, metadata = exr.read(path)
     step = -(-max(header.width, header.height) // SIDE)
 

@@ -331,3 +331,7 @@ def test_a_capture_under_lights_that_nobody_has_measured_is_relit_under_those_th
     found = strict((tmp_path / "maps" / "report.json").read_text())["found"]["unknown_lights"]["directions"]
     assert np.allclose([frame["direction"] for frame in solved["frames"]], found, atol=1e-5)  # the report has five digits
     assert solved["relight"]["terms"] > 3 and solved["samples"] is not None
+    del manifest["frames"][-1]
+    (folder / "capture.json").write_text(json.dumps(manifest))
+    fewer = relit("view", folder, "--maps", tmp_path / "maps", "--out", tmp_path / "fewer")
+    fewer.refused("the maps come from a solve that has found the lights of")

@@ -77,7 +77,7 @@ async function once(path, handlers, last, keep, opened, signal) {
 }
 
 /** Takes the text of a stream apart (https://html.spec.whatwg.org/multipage/server-sent-events.html, section 9.2.6). */
-export class EventParser {
+class EventParser {
   #rest = "";
   #event = { name: "message", data: [], id: null };
 

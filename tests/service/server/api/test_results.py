@@ -10,15 +10,19 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import numpy as np
+import OpenImageIO as oiio
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.server.api import pictures
 from service.server.api.problems import ApiError
 from service.server.api.results import Opened, _names, _part
 from service.server.base.settings import Settings
 from service.server.storage.folder import FolderStorage
 from stage.errors import StorageError
+from stage.formats import exr
 from tests.service.server.api.asgi import Call, app_of
 from tests.service.server.api.conftest import SAMPLES
 from tests.service.server.api.job_calls import ENDED, NOBODY, finish, made_by, refused, submit
@@ -239,6 +243,29 @@ class Untouched(FolderStorage):
 
     def open(self, prefix: str, name: str) -> Path | None:
         raise StorageError(f"{name!r} was looked for")
+
+
+def test_pictures_are_made_of_whole_images_of_known_colours_and_bounded_size(tmp_path, monkeypatch):
+    planes = {channel: np.full((600, 300), 0.5, np.float16) for channel in "RGBA"}
+    with app_of(Settings(data=tmp_path, anonymous=True)) as app:
+        job = queue(app.state.service.database, "default")
+        folder = tmp_path / "projects/default/jobs" / job
+        folder.mkdir(parents=True)
+        exr.write(folder / "large.exr", planes, color_space="lin_rec709_scene", metadata={})
+        (folder / "cut.exr").write_bytes((folder / "large.exr").read_bytes()[:-100])
+        exr.write(folder / "odd.exr", planes, color_space="of no configuration", metadata={})
+        exr.write(folder / "many.exr", planes | {"more": planes["A"]}, color_space="lin_rec709_scene", metadata={})
+
+        def answer(name: str) -> Call:
+            return asyncio.run(Call(app, f"/v1/jobs/{job}/pictures/{name}").run())
+
+        (tmp_path / "shown.jpg").write_bytes(answer("large.exr").body)
+        shown = oiio.ImageBuf(str(tmp_path / "shown.jpg")).get_pixels(oiio.FLOAT)
+        assert shown.shape == (300, 150, 3)  # one of two in a row, so that the longest side is at most 512
+        assert np.abs(shown - (0.735 + 0.5 * 0.2)).max() < 0.01  # 0.5 as sRGB encodes it, over grey; eight bits and JPEG
+        monkeypatch.setattr(pictures, "MOST_VALUES", 4 * 600 * 300)
+        assert {name: answer(name).status for name in ("large.exr", "cut.exr", "odd.exr", "many.exr", "../large.exr", "no.exr")} == {
+            "large.exr": 200, "cut.exr": 422, "odd.exr": 422, "many.exr": 422, "../large.exr": 404, "no.exr": 404}
 
 
 def test_names_with_tricks_never_reach_the_storage(tmp_path):

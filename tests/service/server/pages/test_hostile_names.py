@@ -1,4 +1,4 @@
-"""Names that are markup are shown as text, whoever gave them: environments, keys, results, frames, layers, workers and devices."""
+"""Names that are markup are shown as text, whoever gave them: environments, results, frames, layers, units and methods."""
 
 import json
 
@@ -38,7 +38,7 @@ def test_a_name_that_is_markup_is_text(page, solved, place, path, names):
 
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     page.route(path, answer)
-    page.goto({"home": "/", "captures": "/captures", "machines": "/machines", **solved.pages}[place])
+    page.goto({"home": "/", "captures": "/captures", **solved.pages}[place])
     page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
     if "report" not in path:
         page.wait_for_function("(text) => document.querySelector('main').textContent.includes(text)", arg=HOSTILE)

@@ -10,7 +10,7 @@ import { listing } from "../api.js";
 const VIEWED = ["usdz", "glb"]; // formats that the page of assets shows
 
 /** Return the address of the page of a capture: of one that is not ready, the page that says why. */
-export function pageOf({ id, state }) {
+function pageOf({ id, state }) {
   return state === "ready" ? `/object/${id}` : `/captures/${id}`;
 }
 

@@ -37,7 +37,7 @@ export async function pictureOf(view) {
 export async function environmentPicture({ id, facts }) {
   const [width, height] = facts?.resolution ?? [0, 0];
   if (width * height === 0 || width * height > MOST_PIXELS) return null;
-  const { previewOf, readEnvironment } = await import("../view/environment_map.js");
+  const { previewOf, readEnvironment } = await import("../view/light/environment_map.js");
   const { name, data } = await loadEnvironment(id);
   const canvas = previewOf(await readEnvironment(data, name, "lin_rec709_scene"));
   canvas.className = "";

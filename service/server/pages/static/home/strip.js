@@ -14,7 +14,7 @@ const ACTIVE = ["running", "queued"];
  * @param {function(any): string} title Of a job.
  * @param {string} fault What keeps the service from work, or an empty text.
  */
-export function reasonOf(job, active, title, fault) {
+function reasonOf(job, active, title, fault) {
   const isBefore = (other) => other.state === "running" || other.priority > job.priority
     || (other.priority === job.priority && other.created_at < job.created_at);
   const before = active.filter((other) => other.id !== job.id && other.request.kind !== "check" && isBefore(other));

@@ -3,7 +3,7 @@
 import { attempt, fetched, listing, resultsOf } from "../api.js";
 import { bytes, element, tell } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
-import { canRender } from "../view/basis_renderer.js";
+import { canRender } from "../view/light/basis_renderer.js";
 import { captureOf, findView } from "../view_jobs.js";
 
 const SHOWN = /(^|\/)asset\.(usdz|glb)$/;

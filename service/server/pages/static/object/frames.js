@@ -17,20 +17,17 @@ const STRIP_PX = 72; // height of the pictures of the filmstrip
 export async function mountFrames(parent, jobs, nameOf) {
   const chosen = element("select", {}, ...jobs.map((job) => element("option", { value: job.id }, nameOf(job))));
   const place = element("div");
-  let stop = () => {};
-  const again = () => attempt(async () => {
-    stop();
-    stop = await player(place, chosen.value);
-  });
+  const again = () => attempt(() => player(place, chosen.value, (job) => job === chosen.value));
   chosen.addEventListener("change", again);
   parent.replaceChildren(element("p", { class: "actions" }, element("label", {}, "Frames of ", chosen)), place);
   await again();
 }
 
-/** Show the frames of a job; return what ends the loading of their pictures. */
-async function player(place, job) {
+/** Show the frames of a job, and load their pictures for as long as these frames are shown; `isChosen` says whether a job still is. */
+async function player(place, job, isChosen) {
   const frames = [];
   for await (const result of listing(`/v1/jobs/${job}/results`, "results", "after")) if (FRAME.test(result.name)) frames.push(result);
+  if (!isChosen(job)) return;
   if (frames.length === 0) throw new Error("this job has no frames any more");
   const canvas = element("canvas", { class: "frames-picture", role: "img", "aria-label": "A relit frame" });
   const slider = element("input", { type: "range", min: 0, max: frames.length - 1, step: 1, value: 0, "aria-label": "Frame" });
@@ -39,7 +36,7 @@ async function player(place, job) {
   const files = element("details", {}, element("summary", {}, `${frames.length === 1 ? "The frame" : `All ${frames.length} frames`} as EXR`),
     element("ul", { class: "plain" }, ...frames.map((result) => element("li", {}, savingLink({ name: result.name, result }), ` ${bytes(result.size)}`))));
   const pictures = [];
-  let [at, playing, isOver] = [0, null, false];
+  let [at, playing] = [0, null];
 
   function show(index) {
     at = index;
@@ -61,7 +58,7 @@ async function player(place, job) {
   const play = element("button", { type: "button", class: "quiet", "aria-pressed": "false", onclick: () => {
     if (playing !== null) return stopPlaying();
     play.setAttribute("aria-pressed", "true");
-    playing = setInterval(() => (place.contains(canvas) ? show((at + 1) % frames.length) : stopPlaying()), 1000 / PICTURES_PER_S);
+    playing = setInterval(() => (canvas.isConnected ? show((at + 1) % frames.length) : stopPlaying()), 1000 / PICTURES_PER_S);
     return undefined;
   } }, "Play");
   slider.addEventListener("input", () => show(Number(slider.value)));
@@ -84,12 +81,11 @@ async function player(place, job) {
     onclick: () => show(index) }, element("canvas", { height: STRIP_PX, width: STRIP_PX })))));
   place.replaceChildren(element("div", { class: "stage" }, canvas, element("p", { class: "frames-bar" }, play, slider, told)), tools, strip, files);
   const waiting = frames.map((_, index) => index);
-  const load = async () => { for (let next = waiting.shift(); next !== undefined && !isOver; next = waiting.shift()) await fill(next); };
+  const load = async () => { for (let next = waiting.shift(); next !== undefined && canvas.isConnected; next = waiting.shift()) await fill(next); };
   show(0);
   await fill(waiting.shift());
   attempt(() => Promise.all(Array.from({ length: PARALLEL }, load)).then(() => {
-    if (frames.length > 1 && !isOver) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => show(Math.min(frames.length - 1, Math.floor(share * frames.length))));
+    if (frames.length > 1 && canvas.isConnected) offerVideo(tools, `frames-${job}`, canvas, frames.length / PICTURES_PER_S, (share) => show(Math.min(frames.length - 1, Math.floor(share * frames.length))));
     canvas.dataset.ready = "";
   }));
-  return () => { isOver = true; stopPlaying(); };
 }

@@ -4,7 +4,7 @@ import { attempt, submitJob } from "../api.js";
 import { element } from "../element.js";
 import { loadEnvironment, readyEnvironments } from "../environments.js";
 import { commandOf, curlOf } from "../form.js";
-import { mount } from "../view/relight_viewer.js";
+import { mount } from "../view/light/relight_viewer.js";
 import { mountAnnotations } from "./annotations.js";
 import { mountVideo } from "./video.js";
 

@@ -18,17 +18,21 @@ const identifier = byId("main").dataset.identifier;
 const MADE_BY = { pipeline: ["solve"], export: ["pipeline"] }; // what need not be done any more where a kind has succeeded
 const address = new Address({ mode: 0 });
 const places = new Map(); // of the modes that were shown
+const known = new Set(); // jobs of this object that have succeeded
 const left = new Map(); // what the address said beside the mode when each was left
 let modes = {};
 let shown = null;
+
+/** Return whether a job is asked of this object, or of what other jobs have made of it. */
+function isOfObject({ capture, maps, registered, depths = [] }) {
+  return capture === identifier || [maps, registered, ...depths].some((each) => known.has(each));
+}
 
 /** Return the jobs of this object that have succeeded, the newest first: those of its capture, and those that go on with their results. */
 async function jobsOfObject() {
   const all = [];
   for await (const job of listing("/v1/jobs?limit=500&state=succeeded", "jobs")) all.push(job);
-  const known = new Set();
-  const goesOn = ({ maps, depths = [], registered }) => [maps, registered, ...depths].some((each) => known.has(each));
-  for (const job of all.toReversed()) if (job.request.capture === identifier || goesOn(job.request)) known.add(job.id);
+  for (const job of all.toReversed()) if (isOfObject(job.request)) known.add(job.id);
   return all.filter((job) => known.has(job.id) && job.request.kind !== "view" && job.request.name !== PREVIEW);
 }
 
@@ -125,5 +129,5 @@ await load(async () => {
     await choose(first);
   }
   await presented;
-  for (const job of await jobsUnderWay(identifier)) work.follow(job);
+  for (const job of await jobsUnderWay(isOfObject)) work.follow(job);
 });

@@ -3,8 +3,8 @@
 import { attempt, read, Refusal, resultsOf } from "../api.js";
 import { element } from "../element.js";
 import { chosenStep } from "../time_steps.js";
-import { mount as mountMaps } from "../view/map_viewer.js";
-import { mount as mountPlot } from "../view/pixel_plot.js";
+import { mount as mountMaps } from "../view/maps/map_viewer.js";
+import { mount as mountPlot } from "../view/maps/pixel_plot.js";
 import { ViewFile } from "../view/view_file.js";
 import { captureOf, openView } from "../view_jobs.js";
 

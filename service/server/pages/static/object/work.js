@@ -66,11 +66,11 @@ export class Work {
   }
 }
 
-/** Return the jobs of a capture that run or wait. */
-export async function jobsUnderWay(capture) {
+/** Return the jobs that run or wait, of those whose request is `wanted`. */
+export async function jobsUnderWay(wanted) {
   const found = [];
   for await (const job of listing("/v1/jobs?limit=500&state=running&state=queued", "jobs")) {
-    if (!LEFT_OUT.includes(job.request.kind) && job.request.capture === capture) found.push(job);
+    if (!LEFT_OUT.includes(job.request.kind) && wanted(job.request)) found.push(job);
   }
   return found;
 }

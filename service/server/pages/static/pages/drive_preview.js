@@ -1,11 +1,11 @@
 /** What is predicted of a drive: the balls and the object that the lamps light, and the environment as it turns. */
 
 import { element, numberOf } from "../element.js";
-import { BasisRenderer, canRender } from "../view/basis_renderer.js";
+import { BasisRenderer, canRender } from "../view/light/basis_renderer.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
 import { srgbByte, VIEW_TRANSFORM } from "../view/display.js";
-import { previewOf, readEnvironment } from "../view/environment_map.js";
-import { LightModel } from "../view/light_model.js";
+import { previewOf, readEnvironment } from "../view/light/environment_map.js";
+import { LightModel } from "../view/light/light_model.js";
 import { floats } from "../view/view_file.js";
 
 const SIDE = 120; // of a ball, pixels

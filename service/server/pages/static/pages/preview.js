@@ -10,7 +10,7 @@ const MADE_BY = { pipeline: "solve", solve: "solve", depth: "depth" }; // what s
 const LEAST_PX = 16; // of a side
 
 /** Return the middle of an image, half as wide and half as high, whole pairs of pixels from its corner: x, y, width and height. */
-export function middleOf([width, height]) {
+function middleOf([width, height]) {
   const half = [width, height].map((side) => 2 * Math.floor(side / 4));
   return [...[width, height].map((side, axis) => 2 * Math.floor((side - half[axis]) / 4)), ...half];
 }

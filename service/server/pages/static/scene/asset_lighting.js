@@ -48,7 +48,7 @@ export function meanIrradiance({ rows, cols, pixels }) {
  * Return a map as a texture of three.js: the bottom row first, and +x in the middle.
  * @param {{rows: number, cols: number, pixels: Float32Array}} map Radiance [rows, cols, 3], from the top, +z in the middle.
  */
-export function latLongTexture(map) {
+function latLongTexture(map) {
   const factor = Math.max(1, Math.ceil(map.cols / LARGEST_COLS));
   const [rows, cols] = [Math.floor(map.rows / factor), Math.floor(map.cols / factor)];
   const values = new Float32Array(4 * rows * cols).fill(1);

@@ -6,7 +6,7 @@ import { openAsset } from "./asset_file.js";
 import { Lighting, meanIrradiance, neutralRoom, stopsFor } from "./asset_lighting.js";
 import { converted, DISPLAY_SPACE, matrixBetween } from "../view/colour_spaces.js";
 import { VIEW_TRANSFORM } from "../view/display.js";
-import { previewOf, readEnvironment } from "../view/environment_map.js";
+import { previewOf, readEnvironment } from "../view/light/environment_map.js";
 import { Address } from "../publish/address.js";
 import { ControlAddress } from "../view/control_address.js";
 import { Distance, lengthText } from "./distance.js";

@@ -2,9 +2,9 @@
 
 import { BufferAttribute, BufferGeometry, LinearSRGBColorSpace, Points, PointsMaterial, Vector3 } from "three";
 import { element, numberOf, tell } from "../element.js";
-import { canRender } from "../view/basis_renderer.js";
+import { canRender } from "../view/light/basis_renderer.js";
 import { COLOUR_MAPS, colourTable } from "../view/display.js";
-import { mountHistogram, short } from "../view/histogram.js";
+import { mountHistogram, short } from "../view/maps/histogram.js";
 import { OrbitScene } from "./orbit_scene.js";
 
 const NO_WEBGL = "This browser has no WebGL2, which the points need. The maps above show the same depth, and the job's points.ply holds the points.";

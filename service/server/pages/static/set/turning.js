@@ -1,7 +1,7 @@
 /** A capture under a light that follows the pointer, and turns slowly while nobody points. */
 
 import { byId, tell } from "../element.js";
-import { mount } from "../view/relight_viewer.js";
+import { mount } from "../view/light/relight_viewer.js";
 import { ViewFile } from "../view/view_file.js";
 
 const DEGREES_PER_S = 24;

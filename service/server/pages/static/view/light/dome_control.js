@@ -1,7 +1,7 @@
 /** A diagram of all directions around the object, seen from the camera, on which a light is moved. Light from beyond the captured is hatched. */
 
-import { placeOf } from "../dome.js";
-import { element } from "../element.js";
+import { placeOf } from "../../dome.js";
+import { element } from "../../element.js";
 import { unit } from "./disc_light.js";
 
 const SIDE = 240;
@@ -9,7 +9,7 @@ const STEP_DEGREES = 5;
 const BACK = 2; // radius of the direction −z, where 1 is 90° from the view axis
 
 /** Return the direction at a place of the diagram, the inverse of placeOf; places outside are moved to its rim. */
-export function directionAt(x, y) {
+function directionAt(x, y) {
   const radius = Math.min(Math.hypot(x, y), BACK - 1e-3);
   const angle = (radius * Math.PI) / 2;
   const across = Math.hypot(x, y) || 1;

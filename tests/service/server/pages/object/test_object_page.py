@@ -107,6 +107,20 @@ def test_what_is_being_prepared_is_said_where_it_will_be_shown_and_in_no_other_m
     assert page.get_by_text("its view is being prepared").is_hidden()
 
 
+def test_a_job_under_way_that_goes_on_with_the_maps_of_an_object_is_on_its_page(server, small_page, made):
+    with server.client() as client:
+        jobs = client.get("/v1/jobs", params={"limit": 500, "kind": "export"}).json()["jobs"]
+    waiting = {**jobs[0], "state": "queued"}
+    foreign = {**waiting, "id": "job_0123456789abcdefghjk", "request": {**waiting["request"], "maps": "job_x123456789abcdefghjk"}}
+    page, listed = small_page, {"jobs": [waiting, foreign], "next": None}
+    page.route("**/v1/jobs?limit=500&state=running&state=queued", lambda route: route.fulfill(json=listed))
+    page.route(f"**/v1/jobs/{waiting['id']}", lambda route: route.fulfill(json=waiting))
+    page.route("**/v1/events", lambda route: None)  # nothing happens to it
+    page.goto(f"{made.pages['object']}#mode=photographs")
+    page.locator(f"#work li[data-job={waiting['id']}]", has_text="waits for a free worker").wait_for()
+    assert page.locator("#work li").count() == 1  # none of other objects
+
+
 def test_what_was_taken_for_granted_is_no_fault(page, made):
     def doubtful(route):
         answer = route.fetch()

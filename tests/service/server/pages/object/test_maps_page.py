@@ -85,7 +85,7 @@ def test_what_is_less_sure_is_greyed_out(opened, maps, by, title, sign):
 
 
 def test_rows_and_columns_are_numbered_along_the_edges(opened):
-    ticks = "async ([first, last, shortest]) => (await import('/static/view/map_axes.js')).ticks(first, last, shortest)"
+    ticks = "async ([first, last, shortest]) => (await import('/static/view/maps/map_axes.js')).ticks(first, last, shortest)"
     assert opened.evaluate(ticks, [0, 127, 13.2]) == [0, 20, 40, 60, 80, 100, 120]
     assert opened.evaluate(ticks, [37.5, 40.9, 0.3]) == [38, 39, 40]
     edge = """(canvas) => { const { data } = canvas.getContext('2d').getImageData(0, canvas.height - 5, canvas.width, 5);

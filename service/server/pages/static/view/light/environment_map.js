@@ -1,8 +1,8 @@
 /** Lat-long environment maps from files: OpenEXR and Radiance HDR, by the loaders of three.js, which are loaded when they are needed. */
 
-import { element } from "../element.js";
-import { converted, declaredSpace, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
-import { srgbByte } from "./display.js";
+import { element } from "../../element.js";
+import { converted, declaredSpace, DISPLAY_SPACE, matrixBetween } from "../colour_spaces.js";
+import { srgbByte } from "../display.js";
 
 const PREVIEW_COLS = 256;
 

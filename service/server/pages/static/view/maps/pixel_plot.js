@@ -1,8 +1,8 @@
 /** The readings of one pixel under every light, against the model that was fitted to them. */
 
-import { element } from "../element.js";
+import { element } from "../../element.js";
 import { short } from "./histogram.js";
-import { floats } from "./view_file.js";
+import { floats } from "../view_file.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT, LEFT, BOTTOM, TOP] = [640, 240, 48, 24, 8];
@@ -12,7 +12,7 @@ const BYTES = 6; // three half floats
 /**
  * Make a plot that shows pixels of a view.
  * @param {HTMLElement} parent Takes it.
- * @param {import("./view_file.js").ViewFile} view
+ * @param {import("../view_file.js").ViewFile} view
  * @returns {{show: function(number, number): Promise<void>}|null} Null: the view has no readings.
  */
 export function mount(parent, view) {

@@ -1,7 +1,7 @@
 /** The histogram of a layer, with two handles for the range of values that is shown. */
 
-import { element } from "../element.js";
-import { codeColour } from "./display.js";
+import { element } from "../../element.js";
+import { codeColour } from "../display.js";
 import { codeWords } from "./pixel_states.js";
 
 const COLOURS = ["#d5524a", "#3f9b54", "#4a78d5"];

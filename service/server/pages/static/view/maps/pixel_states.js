@@ -8,8 +8,8 @@ export const OUTSIDE = 3;
 /**
  * Return the state of every pixel of a tile.
  * @param {any} codes Of view.json.
- * @param {import("./view_file.js").Tile|null} status Null: the view has no status; then only the mask tells.
- * @param {import("./view_file.js").Tile} mask
+ * @param {import("../view_file.js").Tile|null} status Null: the view has no status; then only the mask tells.
+ * @param {import("../view_file.js").Tile} mask
  * @returns {Uint8Array}
  */
 export function statesOf(codes, status, mask) {

@@ -1,6 +1,6 @@
 /** The exposure at which all but the brightest pixels of a picture are below white, from some of its pixels. */
 
-import { floats } from "./view_file.js";
+import { floats } from "../view_file.js";
 
 const WHITE_PERCENTILE = 0.99;
 const SAMPLES = 2000; // pixels that are looked at

@@ -1,10 +1,10 @@
 /** Relights a capture live: a key light that is dragged, an environment that is spun, and captured lights to compare with. */
 
-import { element, tell } from "../element.js";
-import { ViewState } from "../publish/view_state.js";
+import { element, tell } from "../../element.js";
+import { ViewState } from "../../publish/view_state.js";
 import { BasisRenderer, canRender } from "./basis_renderer.js";
-import { converted, DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
-import { ControlAddress } from "./control_address.js";
+import { converted, DISPLAY_SPACE, matrixBetween } from "../colour_spaces.js";
+import { ControlAddress } from "../control_address.js";
 import { mountDomeControl } from "./dome_control.js";
 import { DrawLoop } from "./draw_loop.js";
 import { previewOf, readEnvironment } from "./environment_map.js";
@@ -12,9 +12,9 @@ import { EnvironmentProfile } from "./environment_profile.js";
 import { Exposure } from "./exposure.js";
 import { LightModel } from "./light_model.js";
 import { lightPanel, sizeOf } from "./light_panel.js";
-import { floats } from "./view_file.js";
-import { viewTable } from "./view_transforms.js";
-import { mountZoomed } from "./zoomed_picture.js";
+import { floats } from "../view_file.js";
+import { viewTable } from "../view_transforms.js";
+import { mountZoomed } from "../zoomed_picture.js";
 
 const BEYOND_SHARE = 0.05; // from which the commands warn too
 const SPIN_DEGREES_PER_S = 30;
@@ -25,7 +25,7 @@ const NO_WEBGL = "This browser has no WebGL2, which live relighting needs. The f
 /**
  * Show the live relighting of a view.
  * @param {HTMLElement} parent Takes it.
- * @param {import("./view_file.js").ViewFile} view With `relight`.
+ * @param {import("../view_file.js").ViewFile} view With `relight`.
  * @param {{environments: {id: string, name: string}[], load: function(string): Promise<{name: string, data: ArrayBuffer}>,
  *          onchange: function(any): void, embedded?: boolean}} options Environments of the server and how their files are read; `onchange` is told the
  *     light; `embedded`: the page moves the light, and the address is its own.

@@ -1,6 +1,6 @@
 /** Where a map lies on its canvas: zoomed and moved by pointers, fingers, wheel and keys, and kept in the address. */
 
-import { Address } from "../publish/address.js";
+import { Address } from "../../publish/address.js";
 
 const LARGEST_SCALE = 64;
 const CLICK_PX = 4; // a pointer that moves farther than this does not click

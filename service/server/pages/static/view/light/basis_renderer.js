@@ -3,7 +3,7 @@
  * row for each tile of the picture (docs/view.md). Pixels without object read nothing but their coverage.
  */
 
-import { DISPLAY_SPACE, matrixBetween } from "./colour_spaces.js";
+import { DISPLAY_SPACE, matrixBetween } from "../colour_spaces.js";
 import { FrameTimer } from "./frame_timer.js";
 
 const VERTEX = `#version 300 es

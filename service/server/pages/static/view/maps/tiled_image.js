@@ -1,6 +1,6 @@
 /** A layer of a view as an image: tiles of the level that fits, painted when they arrive, with hatching where pixels are unsure or refused. */
 
-import { paint } from "./display.js";
+import { paint } from "../display.js";
 import { OUTSIDE, REFUSED, statesOf, stencil, UNSURE } from "./pixel_states.js";
 
 const KEPT = 256;
@@ -13,7 +13,7 @@ export class TiledImage {
   #failed;
 
   /**
-   * @param {import("./view_file.js").ViewFile} view
+   * @param {import("../view_file.js").ViewFile} view
    * @param {any} layer Of view.json.
    * @param {function(): void} changed Called when something new can be drawn.
    * @param {function(Error): void} failed Called when a tile cannot be had.

@@ -1,7 +1,7 @@
 /** The controls of live relighting. */
 
-import { element, numberOf } from "../element.js";
-import { VIEW_TRANSFORMS } from "./view_transforms.js";
+import { element, numberOf } from "../../element.js";
+import { VIEW_TRANSFORMS } from "../view_transforms.js";
 
 /**
  * Return the controls by name, the panel that they stand in, and the places of it that change.

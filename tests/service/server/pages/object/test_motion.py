@@ -12,7 +12,7 @@ from tests.service.server.pages.conftest import new_context
 from tests.service.server.pages.frames import picture
 
 SLOW = """async () => {
-  const { DrawLoop } = await import("/static/view/draw_loop.js");
+  const { DrawLoop } = await import("/static/view/light/draw_loop.js");
   const [rows, cols, speed] = [1000, 1000, 500]; // pixels per ms: a whole picture takes two seconds
   const drawn = [];
   const pixels = ({ stride = 1, band = [0, rows] }) => (band[1] - band[0]) * cols / stride ** 2;

@@ -1,8 +1,8 @@
 /** Layers of a view as an image that can be zoomed and compared, with the value under the cursor. */
 
-import { element, numberOf, tell } from "../element.js";
-import { ControlAddress } from "./control_address.js";
-import { COLOUR_MAPS, VIEW_TRANSFORM } from "./display.js";
+import { element, numberOf, tell } from "../../element.js";
+import { ControlAddress } from "../control_address.js";
+import { COLOUR_MAPS, VIEW_TRANSFORM } from "../display.js";
 import { mountHistogram, short } from "./histogram.js";
 import { drawAxes } from "./map_axes.js";
 import { MapPlace, ZOOM } from "./map_place.js";
@@ -18,8 +18,8 @@ const WAYS = { wipe: "by a wipe", difference: "as the difference of their colour
 /**
  * Show the layers of a view.
  * @param {HTMLElement} parent Takes the viewer.
- * @param {import("./view_file.js").ViewFile} view
- * @param {{onpick?: function(number, number): void, others?: {name: string, view: import("./view_file.js").ViewFile}[]}} [options] `onpick` is called with row and
+ * @param {import("../view_file.js").ViewFile} view
+ * @param {{onpick?: function(number, number): void, others?: {name: string, view: import("../view_file.js").ViewFile}[]}} [options] `onpick` is called with row and
  *     column of a pixel that was chosen; `others` are views of the same pixels, to compare with, the first of which is at first.
  * @returns {{destroy: function(): void}}
  */
