@@ -44,8 +44,9 @@ def test_hooks_are_set_seen_and_deleted_by_admins_of_their_project_alone(keyed, 
         assert admin.delete(f"/v1/hooks/{hook['id']}").status_code == 204
         refused(admin.delete(f"/v1/hooks/{hook['id']}"), 404, "there is no hook_")
         refused(admin.post(f"/v1/hooks/{new_id('hook')}/test"), 404, "there is no hook_")
-    lines = audit.listing(keyed_database, project="alder", limit=9)
-    assert [(line["action"], line["object"]) for line in reversed(lines)] == [("hook.create", hook["id"]), ("hook.delete", hook["id"])]
+    # others of this service's tests have left lines of their own
+    actions = [line["action"] for line in audit.listing(keyed_database, project="alder", limit=9) if line["object"] == hook["id"]]
+    assert actions == ["hook.delete", "hook.create"]
 
 
 @pytest.mark.parametrize(("wanted", "words"), [

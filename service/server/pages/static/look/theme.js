@@ -21,5 +21,10 @@
     });
     system.addEventListener("change", present);
     present();
+    // here, since modules may be what is missing; its address alone would lose the mode of an object, which stands behind the #
+    document.querySelector("#stuck a")?.addEventListener("click", (event) => {
+      event.preventDefault();
+      location.reload();
+    });
   });
 })();
