@@ -39,6 +39,10 @@ def padded(count: int, multiple: int) -> int:
     return -(-count // multiple) * multiple
 
 
+HEADER_BYTES = 256
+"""More than the header of a file of a stack has: NumPy pads it to a multiple of 64 bytes."""
+
+
 @dataclass(frozen=True)
 class Stack:
     """The stack of an ingested capture. Every read maps the file again, so that the pages of a finished band leave the process."""
@@ -76,7 +80,7 @@ class Stack:
         """Return the stored values of a pixel range.
         Returns [3, lights padded, stop - start] float16, a view of a fresh read-only map; radiance = value · scale[light]. Raises
         StorageError if the cache was removed or is truncated."""
-        return self._map(values_path(self.folder, self.key), self.shape)[:, :, start:stop]
+        return self._map(values_path(self.folder, self.key), self.shape, np.float16)[:, :, start:stop]
 
     def saturated(self, start: int, stop: int) -> np.ndarray:
         """Return the saturation bits of a pixel range: [lights padded / 8, stop - start] uint8; bit l % 8 of byte l // 8 is set where light
@@ -85,7 +89,7 @@ class Stack:
         shape = (self.shape[1] // 8, self.shape[2])
         if not path.exists():
             return np.zeros((shape[0], stop - start), dtype=np.uint8)
-        return self._map(path, shape)[:, start:stop]
+        return self._map(path, shape, np.uint8)[:, start:stop]
 
     def pick(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stored values and saturation bits of single pixels.
@@ -95,7 +99,7 @@ class Stack:
         touched = max(1, min(PAGE_BYTES * len(pixels), 2 * count))
         for number, (channel, light) in enumerate(np.ndindex(channels, lights)):
             if number % max(1, PICK_BYTES // touched) == 0:  # scattered reads keep pages in the process as long as the map lives
-                planes = self._map(values_path(self.folder, self.key), self.shape)
+                planes = self._map(values_path(self.folder, self.key), self.shape, np.float16)
             values[channel, light] = planes[channel, light, pixels]
         return values, self.pick_saturated(pixels)
 
@@ -114,15 +118,20 @@ class Stack:
             return np.zeros((rows, len(pixels)), dtype=np.uint8)
         return np.stack([self.saturated(0, self.shape[2])[row, pixels] for row in range(rows)])
 
-    def _map(self, path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    def _map(self, path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
+        """Map a file of the stack, in NumPy's format. Its header is compared as text: NumPy would parse it as Python at each call,
+        and CPython 3.11 fails where a kernel is parsed in another thread meanwhile."""
         with storage("read", path):
+            with open(path, "rb") as file:
+                head = file.read(HEADER_BYTES)
+            begin = 10 + int.from_bytes(head[8:10], "little")
+            described = f"'descr': '{np.dtype(dtype).str}', 'fortran_order': False, 'shape': {shape}".encode()
+            if not head.startswith(b"\x93NUMPY\x01\x00") or described not in head[10:begin]:
+                raise StorageError(f"{path}: the cache is damaged: delete it and run again")
             try:
-                values = np.load(path, mmap_mode="r")
-            except (ValueError, EOFError) as error:
+                return np.memmap(path, dtype=dtype, mode="r", offset=begin, shape=shape)
+            except ValueError as error:  # it ends too early
                 raise StorageError(f"{path}: the cache is damaged: delete it and run again") from error
-        if values.shape != shape:
-            raise StorageError(f"{path}: the cache is damaged: delete it and run again")
-        return values
 
 
 def values_path(folder: Path, key: str) -> Path:
