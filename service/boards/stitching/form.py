@@ -12,7 +12,7 @@ from service.boards.stitching.overlap import TUKEY
 
 ROUNDS = 12
 DEGREE = 3
-"""Of splines: cubic."""
+"""The degree of the splines: they are cubic."""
 SIGMA_PLACES = 33
 """Places along each side of a board at which the σ of a spline is computed; between them it is interpolated."""
 BENDING = 1e-4

@@ -1,4 +1,4 @@
-"""The one place that knows a table of DBOS, and what is written there because no public call does it: the order of the queues.
+"""Writes the order of the queues into a table of DBOS, which no public call does; no other module knows a table of it.
 
 DBOS 3.4 sets the priority of a workflow only when it is queued, a new attempt would lose the place among equals, and with SQLite it orders
 the jobs of one second and one priority by their random names. `test_a_changed_priority_is_that_of_the_queue` fails where a later version

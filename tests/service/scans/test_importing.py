@@ -191,7 +191,7 @@ def test_sizes_that_ask_for_another_unit_are_asked_about(relit, tmp_path):
 
 
 def test_rotations_off_orthonormal_are_made_rotations_and_said(relit, tmp_path, views):
-    """Of a scan set, a PTX file and a .conf file; stretches of a thousandth and more are no poses."""
+    """Scan sets, PTX files and .conf files are treated alike; stretches of a thousandth and more are no poses."""
     folder = write(tmp_path / "scans", [points_of(view) for view in views[:2]])
     turn = Rotation.from_euler("xyz", [5, 24, -8], degrees=True)
     quaternion = (1 + 1.6e-4) * turn.inv().as_quat()

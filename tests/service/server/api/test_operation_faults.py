@@ -22,7 +22,7 @@ from tests.service.waiting import PATIENCE_S, at_once, until
 pytestmark = pytest.mark.long
 
 DRAIN_S = 4.0
-"""Of the server that is ended while it works; its step never ends."""
+"""Drain time, in seconds, of the server that is ended while it works, on a step that never ends."""
 
 
 def test_a_database_that_goes_away_and_comes_back(tmp_path, server_postgres):

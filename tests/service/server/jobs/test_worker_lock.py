@@ -109,7 +109,7 @@ WAIT_S = 60.0
 
 
 class Log:
-    """Of a supervisor, as a list."""
+    """The log of a supervisor, kept as a list."""
 
     def __init__(self):
         self.lines = []

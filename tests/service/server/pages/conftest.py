@@ -56,6 +56,18 @@ def browser():
         running.close()
 
 
+def spread_fingers(canvas) -> None:
+    """Move two fingers on a canvas apart, until they are twice as far from each other as at first."""
+    canvas.evaluate("""(canvas) => {
+      const { left, top, width, height } = canvas.getBoundingClientRect();
+      canvas.setPointerCapture = () => {};
+      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
+        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
+      send("pointerdown", 11, -20); send("pointerdown", 12, 20);
+      send("pointermove", 11, -40); send("pointermove", 12, 40);
+    }""")
+
+
 def new_context(browser, **options):
     """A context of the browser whose pages wait long enough on a loaded machine."""
     made = browser.new_context(**options)

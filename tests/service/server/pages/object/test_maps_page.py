@@ -8,7 +8,7 @@ import pytest
 from stage.capture.capture import Capture
 from stage.results.maps import SurfaceMaps
 from stage.stack.correction import Correction
-from tests.service.server.pages.conftest import SAMPLES
+from tests.service.server.pages.conftest import SAMPLES, spread_fingers
 
 pytestmark = pytest.mark.long
 
@@ -190,14 +190,7 @@ def test_every_map_of_the_capture_is_shown(opened):
 def test_a_link_shows_the_part_of_a_map_that_its_sender_saw_and_fingers_zoom_it(page, solved):
     page.goto(solved.pages["maps"])
     solved.wait_for_content(page, "maps")
-    page.locator("canvas.map").evaluate("""(canvas) => {
-      const { left, top, width, height } = canvas.getBoundingClientRect();
-      canvas.setPointerCapture = () => {};
-      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
-        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
-      send("pointerdown", 11, -20); send("pointerdown", 12, 20);
-      send("pointermove", 11, -40); send("pointermove", 12, 40);
-    }""")
+    spread_fingers(page.locator("canvas.map"))
     page.wait_for_function("() => location.hash.includes('map-zoom=2')")  # fingers twice as far apart
     page.locator("canvas.map").focus()
     page.keyboard.press("ArrowLeft")

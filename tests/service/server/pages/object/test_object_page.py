@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.service.server.pages.axe import violations_in_both_schemes
-from tests.service.server.pages.conftest import Solved, done, new_context
+from tests.service.server.pages.conftest import Solved, done, new_context, spread_fingers
 from tests.service.server.pages.frames import picture
 
 pytestmark = pytest.mark.long
@@ -243,14 +243,7 @@ def test_two_fingers_zoom_the_picture(browser, server, made):
     page = context.new_page()
     page.goto(made.pages["light"])
     made.wait_for_content(page, "light")
-    page.locator("canvas.picture").evaluate("""(canvas) => {
-      const { left, top, width, height } = canvas.getBoundingClientRect();
-      canvas.setPointerCapture = () => {};
-      const send = (type, id, x) => canvas.dispatchEvent(new PointerEvent(type, {
-        pointerId: id, pointerType: "touch", buttons: 1, bubbles: true, clientX: left + width / 2 + x, clientY: top + height / 2 }));
-      send("pointerdown", 11, -20); send("pointerdown", 12, 20);
-      send("pointermove", 11, -40); send("pointermove", 12, 40);
-    }""")
+    spread_fingers(page.locator("canvas.picture"))
     page.wait_for_function("() => location.hash.includes('zoom=2')")
     context.close()
 
