@@ -94,12 +94,14 @@ def test_a_manifest_that_is_broken_is_named(page, folder):
     assert all(words in fault.inner_text() for words in ("frames", "direction"))
 
 
-def test_an_environment_is_uploaded(server, page):
+def test_an_environment_is_uploaded(server, page, tmp_path):
+    file = shutil.copy(SAMPLES / "owl" / "environment.exr", tmp_path / "a sky of its own.exr")
     page.goto("/captures")
-    page.set_input_files("#file", SAMPLES / "owl" / "environment.exr")
-    page.locator("#environments tr", has_text="environment").locator(".state.ready").first.wait_for(timeout=UPLOAD_MS)
+    page.set_input_files("#file", file)
+    page.locator("#environments tr", has_text="a sky of its own").locator(".state.ready").wait_for(timeout=UPLOAD_MS)
     with server.client() as client:
-        assert client.get("/v1/environments").json()["items"][0]["state"] == "ready"
+        [found] = [each for each in client.get("/v1/environments").json()["items"] if each["name"].startswith("a sky of its own")]
+        assert found["state"] == "ready"
 
 
 def test_a_folder_without_images_is_refused_and_its_name_is_text(page, tmp_path):

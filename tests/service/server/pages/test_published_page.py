@@ -128,7 +128,8 @@ def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl,
     assert bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
     page.locator("#full").click()
     page.wait_for_function("document.fullscreenElement?.id === 'stage'")
-    page.keyboard.press("Escape")
+    page.evaluate("document.exitFullscreen()")  # a page that goes away while its size changes may never draw the next
+    page.wait_for_function("document.fullscreenElement === null")
     page.route(f"{owl[1]}museum.html", lambda route: route.fulfill(body=code, content_type="text/html"))
     page.goto(f"{owl[1]}museum.html")
     frame = page.frame_locator("iframe")

@@ -24,6 +24,13 @@ def opened(page, solved):
     return page
 
 
+def prepared_view(client, capture: str) -> dict:
+    """What was prepared of a capture alone, whatever else the server has prepared."""
+    view = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"]["kind"] == "view"
+                and job["request"]["capture"] == capture and job["request"].get("maps") is None)
+    return client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
+
+
 @pytest.mark.long
 def test_the_key_light_shows_what_the_batch_renders(opened, solved, tmp_path):
     opened.get_by_label("Size of the light in degrees").fill("10")
@@ -53,9 +60,7 @@ def test_dragging_moves_the_light_and_light_from_beyond_the_captured_is_said(ope
 def test_the_error_of_the_basis_and_the_rate_of_pictures_are_shown(opened, solved):
     """The error is the one that was measured when the basis was made; the rate appears when something moves."""
     with solved.server.client() as client:
-        view = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"]["kind"] == "view"
-                    and job["request"]["capture"] == solved.capture and job["request"].get("maps") is None)  # of the capture alone
-        relight = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["relight"]
+        relight = prepared_view(client, solved.capture)["relight"]
     opened.locator(".figures > summary").click()
     said = opened.locator(".figures").inner_text()
     assert f"under {relight['held_out']['key_lights']} lights that the basis was not made from" in said
@@ -106,9 +111,7 @@ def test_a_photograph_is_compared(opened, solved, tmp_path):
     shown = picture(opened)
     exposure = opened.evaluate("() => relit.state().exposure")
     with solved.server.client() as client:
-        jobs = client.get("/v1/jobs").json()["jobs"]
-        view = next(job for job in jobs if job["request"]["kind"] == "view" and job["request"]["maps"] is None)
-        frames = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()["frames"]
+        frames = prepared_view(client, solved.capture)["frames"]
         image = [frame["image"] for frame in frames if frame["direction"] is not None][CAPTURED]
         keys = {"schema": "relit.keys/1", "captured": [{"image": image, "keys": [{"frame": 1, "weight": 1}]}]}
         job = done(solved.server, client, {"kind": "relight", "capture": solved.capture, "keys": keys, "options": {"exposure": exposure}})
