@@ -38,7 +38,7 @@ function draw() {
   byId("count").textContent = !isLoaded || items.size === 0 ? "" : found.length === items.size ? `${found.length} in all` : `${found.length} of ${items.size}`;
   show(byId("more"), found.length > most);
   show(byId("empty"), isLoaded && items.size === 0);
-  if (isLoaded && items.size === 0) openDropZone(true);
+  if (isLoaded && items.size === 0) openDropZone();
   const address = new URLSearchParams(Object.entries(asks).filter(([name, value]) => value !== (name === "order" ? "newest" : "")));
   history.replaceState(null, "", address.size === 0 ? location.pathname : `?${address}`);
 }
@@ -50,9 +50,9 @@ function makeCard(item) {
   return card;
 }
 
-function openDropZone(open) {
-  show(byId("adding"), open);
-  byId("add").setAttribute("aria-expanded", String(open));
+function openDropZone() {
+  show(byId("adding"), true);
+  byId("add").setAttribute("aria-expanded", "true");
 }
 
 /** Take an item as it is now. */
@@ -141,10 +141,10 @@ byId("bar").addEventListener("submit", (event) => event.preventDefault());
 byId("more").addEventListener("click", () => { most += PAGE; draw(); });
 new IntersectionObserver(([entry]) => { if (entry.isIntersecting && !byId("more").hidden) byId("more").click(); }, { rootMargin: "600px" }).observe(byId("more"));
 byId("add").addEventListener("click", () => {
-  openDropZone(byId("adding").hidden);
-  if (!byId("adding").hidden) byId("folder").click(); // what most people want; the panel stays for the rest
+  openDropZone(); // it is open where nothing is here yet
+  byId("folder").click(); // what most people want; the panel stays for the rest
 });
-addEventListener("dragenter", () => { openDropZone(true); document.body.classList.add("dragging"); });
+addEventListener("dragenter", () => { openDropZone(); document.body.classList.add("dragging"); });
 for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
 addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));
 mountDropZone(fill);

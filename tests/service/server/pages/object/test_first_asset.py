@@ -89,8 +89,8 @@ def test_the_keyboard_alone_leads_from_a_folder_to_an_asset(counting, tmp_path):
     page, folder = counting, write_photographs(tmp_path / tmp_path.name)
     page.goto("/")
     page.wait_for_function("() => !document.querySelector('main').hasAttribute('aria-busy')")
-    tab_to(page, "Add a folder")
-    with page.expect_file_chooser() as chooser:
+    with page.expect_file_chooser() as chooser:  # begun before the keys, which do not wait for its beginning
+        tab_to(page, "Add a folder")
         page.keyboard.press("Enter")
     chooser.value.set_files(folder)
     page.locator(".proposal button").wait_for(timeout=WORK_MS)
