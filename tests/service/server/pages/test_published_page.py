@@ -121,6 +121,7 @@ def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl,
     page.goto(owl[1])
     picture(page)
     page.locator("#embed summary").click()
+    page.wait_for_function("document.querySelector('#embed textarea').value !== ''")  # it is written when the browser says that it is open
     code = page.locator("#embed textarea").input_value()
     bar = page.locator("#scale")
     length = {"4 cm": 40, "5 cm": 50, "2 cm": 20, "1 cm": 10}[bar.inner_text()]
@@ -128,8 +129,7 @@ def test_another_page_embeds_it_with_its_scale_and_fills_the_screen_with_it(owl,
     assert bar.bounding_box()["width"] == pytest.approx(length / 0.675 * zoom, rel=0.02)  # pixels of .675 mm; the border
     page.locator("#full").click()
     page.wait_for_function("document.fullscreenElement?.id === 'stage'")
-    page.evaluate("document.exitFullscreen()")  # a page that goes away while its size changes may never draw the next
-    page.wait_for_function("document.fullscreenElement === null")
+    page.keyboard.press("Escape")
     page.route(f"{owl[1]}museum.html", lambda route: route.fulfill(body=code, content_type="text/html"))
     page.goto(f"{owl[1]}museum.html")
     frame = page.frame_locator("iframe")
