@@ -1,12 +1,12 @@
 """An estimate for a GPU that is not at hand, from what products ask of a device and from published speeds: a section of docs/figures.md.
 
-    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed
+    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed; or own
 
 What is asked of the device is counted on an emulated one (tests/emulated_device.py). Small scenes stand for 12 megapixels: all limits of
 memory are made small in the same ratio, so that bands, batches and chunks of frames, and so launches and waits, are as many. Bytes, and the
 processor seconds of a run on the CPU of this machine, are a + b · pixels, and with frames (a + b · pixels) + frames · (c + d · pixels),
-from two sizes and two counts of frames. What is bounded by a number of patches or blocks of pixels is the same for both sizes; bytes for
-each patch of bounced light come from a third run with more of them.
+from two sizes and two counts of frames. What is bounded by a number of patches or blocks of pixels is the same for both sizes, and is added
+by itself: bytes for each patch of bounced light come from a third run with more of them, seconds from one that has as many as the product.
 """
 
 import json
@@ -36,14 +36,16 @@ from tests import device_ways, emulated_device
 PIXELS = 12_000_000
 LEAST_BYTES, LEAST_PIXELS = 16 << 20, 1 << 15
 """Constants of the product below these are no limits of memory."""
-TIMED_SIDES = 96, 192
+TIMED_SIDES = 192, 384
 FEW_PATCHES, MORE_PATCHES = 256, 1024
 """Patches of bounced light, and blocks whose middles settle it, in the small scenes: exactly as many, because the sides of their images are
 multiples of the roots of these numbers."""
+BOUNDED_SIDE = 424
+"""Side of a scene with as many patches and blocks, and pixels that stand for a patch, as there are at the full size."""
 HOST_CORES = 16
 """Cores of a host of one GPU."""
-ON_DEVICE = "service.relight.model_range._summed", "service.relight.guide.Guide._add"
-"""Functions of the host, on the CPU, whose work kernels do on CUDA."""
+ON_DEVICE = "service.relight.model_range._summed", "service.relight.guide.Guide._add", "warp.array.__del__"
+"""Functions of the host, on the CPU, whose work kernels do on CUDA; and what gives memory back, which CUDA's pool keeps."""
 ALONE = "service.relight.model_range.ModelRange._facing",
 """Functions that threads of the CPU call side by side, and one thread on CUDA."""
 PRODUCT_SIDE = 2048
@@ -155,20 +157,23 @@ def count_graphs_once() -> None:
     patch.object(devices.Repeated, "run", run).start()
 
 
-def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int = FEW_PATCHES) -> dict[str, float]:
-    """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU."""
+def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES) -> dict[str, float]:
+    """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU.
+    `patches`: of bounced light; None: as many of them and of blocks as the product takes."""
     devices.names()
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        if patches is not None:
+            stack.enter_context(patch.object(interreflection, "PATCHES", patches))
+            stack.enter_context(patch.object(settling, "BLOCKS", FEW_PATCHES))
         device_ways.distant(folder, side)
         run = work.run(frames)
         if counted:
             emulated_device.install()
             count_graphs_once()
             shrink_limits(side * side / PIXELS)
-            with patch.object(interreflection, "PATCHES", patches), patch.object(settling, "BLOCKS", FEW_PATCHES):
-                before = emulated_device.counts.copy()
-                run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
+            before = emulated_device.counts.copy()
+            run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())
             return {name: emulated_device.counts[name] - before[name] for name in emulated_device.COUNTED}
         run(folder, folder / "warm", "cpu", device_ways.Counting())  # compiles what is not cached
         shutil.rmtree(folder / "capture" / ".relit")  # decoding is part of the work
@@ -196,14 +201,18 @@ def at_full_size(name: str) -> dict[str, float]:
             few, more = runs[sides[0], work.tried[0]], _run(name, sides[0], work.tried[0], counted=True, patches=MORE_PATCHES)
             for quantity in ("up", "down", "touched"):
                 found[quantity] += (more[quantity] - few[quantity]) / (MORE_PATCHES - FEW_PATCHES) * (interreflection.PATCHES - FEW_PATCHES)
+    if work.frames is None:
+        few, own = (_run(name, BOUNDED_SIDE, work.tried[0], counted=False, patches=patches) for patches in (FEW_PATCHES, None))
+        for quantity, seconds in own.items():
+            found[quantity] += max(0.0, seconds - few[quantity])
     return found
 
 
-def _run(name: str, side: int, frames: int, *, counted: bool, patches: int = FEW_PATCHES) -> dict[str, float]:
+def _run(name: str, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES) -> dict[str, float]:
     """Return what `measure` does in a process of its own, with one thread of BLAS as the program has it: more would wait for each other,
     which takes processor time."""
     command = [sys.executable, "-m", "benchmarks.device_estimate", name, str(side), str(frames), "counted" if counted else "timed",
-               str(patches)]
+               str(patches or "own")]
     return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True,
                                           env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}).stdout))
 
@@ -239,7 +248,7 @@ def estimate_rows(device: Published = H200) -> list[str]:
             f"{SOURCES} Counts are those of scenes of {counted} pixels squared on the emulated device, "
             f"seconds of {' and '.join(map(str, TIMED_SIDES))} pixels squared, continued in a line to the full size. For the counts all "
             "limits of memory are made small in the same ratio, so that launches and waits are as many as at the full size; a CUDA graph "
-            "is one launch. Bytes for patches of bounced light, which are 20 000 at most, are counted apart.", "",
+            f"is one launch. Bytes and seconds for patches of bounced light, {interreflection.PATCHES} at most, are counted apart.", "",
             *("| " + " | ".join(cells) + " |" for cells in zip(ROWS, *columns, strict=True))]
 
 
@@ -262,7 +271,8 @@ def _column(work: Work, asked: dict[str, float], speed: float, device: Published
 def main() -> None:
     """Run one small scene, for at_full_size."""
     name, side, frames, kind, patches = sys.argv[1:]
-    print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted", patches=int(patches))))
+    print(json.dumps(measure(WORKS[name], int(side), int(frames), counted=kind == "counted",
+                             patches=None if patches == "own" else int(patches))))
 
 
 if __name__ == "__main__":

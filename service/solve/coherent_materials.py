@@ -27,12 +27,13 @@ DARKEST = 0.02
 """Albedo below which colours count as black: differences there are noise."""
 
 
-def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int]) -> None:
+def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int], device: str) -> None:
     """Replace roughness and F0 of a solution by those that neighbouring pixels agree on; pixels with two materials keep theirs.
 
     Args:
         sigma: [pixels] standard error of the normals as each pixel's own readings show it, degrees.
         shape: rows and columns of the image.
+        device: as Warp spells it.
     """
     if solution.roughness is None or solution.specular is None:
         return
@@ -62,6 +63,6 @@ def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, 
         together = known[one] & known[other] & (parts[one] == parts[other])
         links.append((STRENGTH / np.hypot(*step) * together * np.exp(-0.5 * unlike)).astype(np.float32))
     neutral = (specular == specular[:1]).all()  # no coloured metal: one plane stands for three
-    found = least_variation(np.concatenate([image(solution.roughness), specular[:1] if neutral else specular]), trust, links)
+    found = least_variation(np.concatenate([image(solution.roughness), specular[:1] if neutral else specular]), trust, links, device=device)
     for target, planes in ((solution.roughness, found[:1]), (solution.specular, found[1:])):
         target.reshape(-1, *shape)[:, *box] = np.where(known, planes, target.reshape(-1, *shape)[:, *box])

@@ -128,7 +128,7 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
     if solution.unseen is not None and solution.height is not None:
         _judge_by_surface(solution, estimated, opened.capture.camera)
     if request.materials is Materials.COHERENT:
-        agree_on_materials(solution, sigma, shape)
+        agree_on_materials(solution, sigma, shape, given.device)
     refine_status(solution, given.stack, max_sigma=MAX_SIGMA if request.max_sigma is None else request.max_sigma,
                   least_confidence=request.least_confidence or 0.0)
     return _Judged(solution, placement, estimated, guessed_part(sigma, estimated))

@@ -23,18 +23,18 @@ def chain_minimum(values, trust, links):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_chain_of_pixels_reaches_the_least_cost(seed):
+def test_a_chain_of_pixels_reaches_the_least_cost(device, seed):
     """Tolerance: 250 steps are not the limit, and 2 % of the cost is far less than the noise of what pixels say."""
     rng = np.random.default_rng(seed)
     values, trust, link = rng.random(40), rng.uniform(0.1, 2, 40), rng.uniform(0, 1, 39)
     links = [link[None].astype(np.float32), *(np.zeros(np.zeros((1, 40))[between(step)[0]].shape, np.float32) for step in STEPS[1:])]
-    found = least_variation(values[None, None], trust[None], links)[0, 0]
+    found = least_variation(values[None, None], trust[None], links, device=device)[0, 0]
     cost = (trust * np.abs(found - values)).sum() + (link * np.abs(np.diff(found))).sum()
     least = chain_minimum(values, trust, link)
     assert least <= cost * 1.0001 and cost < 1.02 * least
 
 
-def test_speckle_goes_and_borders_and_slopes_stay():
+def test_speckle_goes_and_borders_and_slopes_stay(device):
     """Pixels that are hardly trusted say anything; a step between trusted pixels and a slope of them are no speckle."""
     rng = np.random.default_rng(0)
     step = np.where(np.arange(COLS) < COLS // 2, 0.2, 0.6) * np.ones((ROWS, 1))
@@ -42,16 +42,17 @@ def test_speckle_goes_and_borders_and_slopes_stay():
     doubtful = rng.random((ROWS, COLS)) < 0.2
     for truth in (step, slope):
         said = np.where(doubtful, rng.random((ROWS, COLS)), truth)
-        found = least_variation(said[None], np.where(doubtful, 0.02, 1.2), linked((ROWS, COLS), 0.3))[0]
+        found = least_variation(said[None], np.where(doubtful, 0.02, 1.2), linked((ROWS, COLS), 0.3), device=device)[0]
         assert np.abs(said - truth)[doubtful].mean() > 0.2
         assert np.abs(found - truth).mean() < 0.02
 
 
-def test_pixels_without_links_and_other_planes_change_nothing():
+def test_pixels_without_links_and_other_planes_change_nothing(device):
     rng = np.random.default_rng(1)
     values, trust = rng.random((3, ROWS, COLS)), rng.random((ROWS, COLS))
-    np.testing.assert_array_equal(least_variation(values, trust, linked((ROWS, COLS), 0.0)), values.astype(np.float32))
+    np.testing.assert_array_equal(least_variation(values, trust, linked((ROWS, COLS), 0.0), device=device), values.astype(np.float32))
     links = linked((ROWS, COLS), 0.5)
-    np.testing.assert_array_equal(least_variation(values, trust, links)[1], least_variation(values[1:2], trust, links)[0])
+    np.testing.assert_array_equal(least_variation(values, trust, links, device=device)[1],
+                                  least_variation(values[1:2], trust, links, device=device)[0])
     with pytest.raises(ArrayError, match="one link for each pair"):
-        least_variation(values, trust, links[:3])
+        least_variation(values, trust, links[:3], device=device)
