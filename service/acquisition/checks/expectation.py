@@ -158,9 +158,10 @@ def comparable(shot: Shot, other: Shot) -> bool:
 
 def same_kind(shot: Shot, other: Shot) -> bool:
     """Return whether the picture of a shot says what that of another one should be."""
-    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.projected:
+    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.grey is not None:
         return False
-    return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)
+    return shot.lamp is not None or (shot.pattern == other.pattern and bool(np.array_equal(shot.levels, other.levels))
+                                     and shot.light == other.light)
 
 
 def prediction_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray | None:

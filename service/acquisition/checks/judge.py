@@ -152,7 +152,7 @@ class Judge:
             affected = [key for key in kept if key != worst and self._leans_on(key, worst, kept)]
         for key in list(found):
             seen = self._seen[key]
-            if seen.shot.levels.any():
+            if seen.shot.levels.any() or seen.shot.projected:
                 others = self._others(seen, [other for other in keys if other not in found])
                 if faults := self._faults(seen, others):
                     found[key] = faults[0]
@@ -198,7 +198,7 @@ class Judge:
     def _faults(self, seen: Seen, others: list[Seen]) -> list[Fault]:
         """Return the fault that a picture shows against others, if it shows one."""
         shot, sample = seen.shot, seen.sample
-        if not shot.levels.any() or not others:
+        if not (shot.levels.any() or shot.projected) or not others:
             return []
         used = self._expectation.weights(seen, others)
         usual = np.mean([each.sample.blocks for each in others], axis=0)

@@ -108,7 +108,8 @@ class Plan(Strict):
     settle_s: NotNegative = 0.1
     """The time between a change of the lamps or the pattern and the picture."""
     tracking_every: Count | None = None
-    """A picture under full light is taken before every so many pictures of lamps, and after the last; None: none."""
+    """A picture under full light is taken before every so many pictures of lamps, one of white before every so many patterns, and each
+    after the last; None: none."""
 
 
 _WHITE_CARD = "put a white card in the place of the object, and let it fill the picture"

@@ -167,12 +167,14 @@ def test_each_lamp_alone_at_each_exposure_with_tracking_between():
     assert np.allclose(olat[0].light.direction, DIRECTIONS[2]) and np.allclose(olat[0].light.irradiance, 0.5)
     assert [shot.name.endswith(TRACKING) for shot in found] == [True, False, False, False, False, True, False, False, True]
     assert [shot.prompt for shot in found] == ["wait"] + 8 * [None]
+    assert {shot.exposure_s for shot in found if shot.lamp is None} == {0.1}  # as all frames of a capture have one, or none has
     assert len({shot.key for shot in found}) == len(found)
 
 
 @pytest.mark.parametrize(("sequences", "words"), [
     ([{"take": "olat", "lights": ["L9"]}], "no lamp L9"), ([{"take": "patterns", "code": "gray"}], "--projector"),
-    ([{"take": "flat"}, {"take": "flat"}], "several flat")])
+    ([{"take": "flat"}, {"take": "flat"}], "several flat"),
+    ([{"take": "dark"}, {"take": "olat", "exposures_s": [0.1]}], "none for dark")])
 def test_what_cannot_be_taken_is_refused(sequences, words):
     with pytest.raises(RequestError, match=words):
         shots(*sequences)
