@@ -115,8 +115,8 @@ def _refuse_some_exposures(shots: Sequence[Shot]) -> None:
         frames = [shot for shot in shots if shot.folder == folder and (shot.light is not None or shot.pattern is not None)]
         without = [shot.name for shot in frames if shot.exposure_s is None]
         if 0 < len(without) < len(frames):
-            raise RequestError(f"the plan has exposures_s for some pictures of a capture and none for {without[0]}: give them to all of its "
-                               "sequences or to none")
+            raise RequestError(f"the plan has exposures_s for some pictures of a capture and none for {without[0]}: give them to all of "
+                               "its sequences or to none")
 
 
 def _sequence(sequence: AnySequence, rig: Rig, projector: tuple[int, int] | None, where: str) -> Iterator[Shot]:

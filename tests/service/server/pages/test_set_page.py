@@ -229,6 +229,44 @@ def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(br
 
 
 @pytest.mark.long
+def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tmp_path):
+    """A watched folder sets no exposure times, which its sentence says, and so the plan is judged."""
+    with stage(tmp_path) as (server, captures), opened(browser, server, bypass_csp=True) as page:
+        page.get_by_label("Capture", exact=True).fill("some")
+        page.get_by_label("Plan").fill("olat")
+        page.get_by_text("Exposures, tracking, lamps").click()
+        times, tracking, lamps = (page.get_by_label(name) for name in ("Exposure times", "A tracking picture", "Lamps one by one"))
+        lamps.fill(f"3-{LAMPS + 1}")
+        page.get_by_role("button", name="Take the capture").click()
+        page.wait_for_function("() => !document.getElementById('lights').validity.valid")
+        lamps.fill("3-4, 6")
+        for name in ("lamp 5:", "lamp 6:"):  # the sixth and the seventh
+            page.locator("#dome circle").filter(has_text=name).click()
+        assert lamps.input_value() == "3-4, 7"
+        tracking.fill("2")
+        assert_accessible(page)
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text="6 of 6 pictures").wait_for()
+        lines = [json.loads(line) for line in (captures / "some" / "acquisition.jsonl").read_text().splitlines()]
+        taken = [line["shot"][5:] for line in lines if line.get("event") == "taken"]
+        assert taken == ["tracking", "light_003", "light_004", "tracking", "light_007", "tracking"]
+
+        page.get_by_label("Capture", exact=True).fill("other")
+        lamps.fill("1")
+        tracking.fill("")
+        times.fill("0.05, 0.2")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#problem", has_text="exposures_s").wait_for()  # a watched folder sets none without {exposure_s}
+        plan = json.loads((captures / ".plans" / "other.json").read_text())
+        assert plan["sequences"][0]["exposures_s"] == [0.05, 0.2] and plan["sequences"][0]["lights"] == ["lamp 0"]
+
+        page.get_by_label("Capture", exact=True).fill("some")
+        page.get_by_label("Capture", exact=True).press("Tab")
+        page.wait_for_function("() => document.getElementById('lights').value === '3-4, 7'")
+        assert (tracking.input_value(), times.input_value()) == ("2", "")
+
+
+@pytest.mark.long
 def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
     """A camera that sees the window of the projector pixel by pixel."""
     size, watched, released = (64, 48), tmp_path / "watched", tmp_path / "released"
