@@ -195,8 +195,9 @@ class RemoteControl:
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
         live, version = self._live, self._version()
         return {"name": self._name, "chosen": self._chosen.model_dump(include=set(PlanChoices.model_fields)), "running": running,
-                "metering": self._metering and running, "prompt": self._prompt, "code": self._code(), "projector": self._address if running else None,
-                "shots": shots, "files": found, "lines": list(self._lines), "folder": str(self._capture),
+                "metering": self._metering and running, "prompt": self._prompt,
+                "code": self._code(), "projector": self._address if running else None, "shots": shots,
+                "files": found, "lines": list(self._lines), "folder": str(self._capture),
                 "version": version, "calibrating": self._calibrating if running else None,
                 "calibrations": {step: version is not None and self._calibrated.get((self._name, step)) == self._taken_at()
                                  for step in self._calibrations()},

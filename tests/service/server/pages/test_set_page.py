@@ -5,12 +5,14 @@ import os
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
+from ctypes.util import find_library
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from service.acquisition.cameras.aravis_camera import LIBRARY
 from stage.capture.capture import Capture
 from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
@@ -295,6 +297,25 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
         page.get_by_role("button", name="Solve").click()
         page.get_by_role("link", name="Its maps").wait_for()
         assert "The patterns are decoded." in page.locator("#now").inner_text()
+
+
+@pytest.mark.long
+def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_path):
+    """The camera that Aravis feigns shows a ramp that moves, whatever lamps shine."""
+    if find_library(LIBRARY) is None:
+        pytest.skip("the library Aravis is not installed")
+    rig = write_rig_file(tmp_path / "rig.json", make_scene(size=8, lights=LAMPS).directions, host=loopback(), name="the little dome")
+    with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", "aravis:Fake_1") as server, \
+            opened(browser, server) as page:
+        page.get_by_role("button", name="Live view").click()
+        page.locator("#seen-words", has_text="% clipped").wait_for()
+        page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
+        page.get_by_label("Plan").fill("dark")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text="1 of 1 pictures").wait_for()
+        assert not page.locator("#seen").is_visible()
+        settings = json.loads((server.data / "set" / "capture" / "report.json").read_text())["camera_settings"]
+        assert settings["DeviceVendorName"] == "Aravis"
 
 
 @pytest.mark.long
