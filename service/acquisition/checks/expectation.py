@@ -83,21 +83,26 @@ class Seen(NamedTuple):
 class Expectation:
     """Says what pictures under the lamps of a rig should be."""
 
-    def __init__(self, directions: np.ndarray) -> None:
-        """Take the directions of the lamps, [lamps, 3]."""
-        self.directions = directions
+    def __init__(self, directions: np.ndarray, light: np.ndarray) -> None:
+        """Take the directions of the lamps, [lamps, 3], and the irradiance that each gives, [lamps], in any unit."""
+        self.directions, self._light = directions, light
 
     def weights(self, seen: Seen, others: list[Seen]) -> list[tuple[np.float32, Seen]] | None:
         """Return the weights of those pictures whose sum is expected under a lamp, or None."""
         if seen.shot.lamp is None:
             return [(np.float32(1 / len(others)), each) for each in others] or None
+        shares = self.shares(seen, others)
+        if shares is None:
+            return None
+        light = self._light[seen.shot.lamp] / self._light[[each.shot.lamp for each in others]]
+        return [(np.float32(share * factor), each) for share, factor, each in zip(shares, light, others, strict=True)
+                if abs(share) > LEAST_WEIGHT]
+
+    def shares(self, seen: Seen, others: list[Seen]) -> np.ndarray | None:
+        """Return the weights of the pictures under other lamps, as if all gave equal light, [others]; None where they say nothing."""
         wanted, directions = self.directions[seen.shot.lamp], self.towards(others)
         weights = prediction_weights(wanted, directions)
-        if weights is None:
-            weights = rough_weights(wanted, directions)
-        if weights is None:
-            return None
-        return [(np.float32(weight), each) for weight, each in zip(weights, others, strict=True) if abs(weight) > LEAST_WEIGHT]
+        return rough_weights(wanted, directions) if weights is None else weights
 
     def misfit(self, seen: Seen, others: list[Seen]) -> float:
         """Return how far a picture is from what is expected of it, 0 to 1."""

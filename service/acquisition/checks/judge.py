@@ -72,7 +72,8 @@ class Judge:
     """Judges pictures against those that were taken before."""
 
     def __init__(self, rig: Rig) -> None:
-        self._expectation = Expectation(rig.directions)
+        light = [np.sum([primary.irradiance for primary in lamp.primaries]) for lamp in rig.lights]
+        self._expectation = Expectation(rig.directions, np.array(light))
         self._held = {index for index, lamp in enumerate(rig.lights) if lamp.address is not None and lamp.address.protocol == "manual"}
         self._place: tuple[int, int] | None = None
         self._seen: dict[str, Seen] = {}
@@ -247,9 +248,8 @@ class Judge:
 
     def _surrounded(self, seen: Seen, others: list[Seen]) -> bool:
         """Return whether lamps all around that of a picture say what it should be."""
-        used = self._expectation.weights(seen, others)
-        return (used is not None and sum(abs(float(weight)) for weight, _ in used) < INSIDE_GAIN
-                and self._expectation.interpolated(seen, others))
+        shares = self._expectation.shares(seen, others)
+        return shares is not None and float(np.abs(shares).sum()) < INSIDE_GAIN and self._expectation.interpolated(seen, others)
 
     def _bright_fault(self, seen: Seen, used: list[tuple[np.float32, Seen]], usual: np.ndarray, dark: np.ndarray | float, should: float
                       ) -> Fault | None:

@@ -34,6 +34,17 @@ def test_each_fault_is_named_over_random_seeds(scene, seeds):
         assert found == made, seed
 
 
+def test_lamps_of_unequal_light_are_judged_by_what_the_rig_says_of_it():
+    """Unsaid, one of them looks like ambient light."""
+    scene = relief(5)
+    light = np.random.default_rng(2).uniform(0.4, 2.4, len(scene.directions))
+    uneven = scene._replace(radiance=(scene.radiance * light[:, None, None, None] / 2.4).astype(np.float32))
+    assert named(uneven, 1, ())[1] != {}
+    assert named(uneven._replace(light=light), 1, ())[1] == {}
+    made, found = named(uneven._replace(light=light), 3, KINDS)
+    assert found == made
+
+
 def test_the_highlight_of_a_glossy_ball_has_not_moved():
     """A highlight moves with the lamp, and lies in part where each of the lamps around has its own, as a prediction says."""
     directions = fibonacci_sphere(160)
