@@ -94,7 +94,7 @@ class Expectation:
         shares = self.shares(seen, others)
         if shares is None:
             return None
-        light = self._light[seen.shot.lamp] / self._light[[each.shot.lamp for each in others]]
+        light = self._light[seen.shot.lamp] / self._light[_lamps(others)]
         return [(np.float32(share * factor), each) for share, factor, each in zip(shares, light, others, strict=True)
                 if abs(share) > LEAST_WEIGHT]
 
@@ -116,7 +116,12 @@ class Expectation:
 
     def towards(self, pictures: list[Seen]) -> np.ndarray:
         """Return the directions of the lamps of pictures, [pictures, 3]."""
-        return np.asarray(self.directions[np.array([each.shot.lamp for each in pictures], dtype=np.intp)])
+        return np.asarray(self.directions[_lamps(pictures)])
+
+
+def _lamps(pictures: list[Seen]) -> np.ndarray:
+    """Return the indices of the lamps of pictures, [pictures]."""
+    return np.array([each.shot.lamp for each in pictures], dtype=np.intp)
 
 
 def expected_blocks(used: list[tuple[np.float32, Seen]]) -> np.ndarray:
