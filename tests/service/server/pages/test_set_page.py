@@ -188,6 +188,8 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         assert_accessible(page)
         page.get_by_role("button", name="0006_light_004", exact=True).click()
         page.locator("#picture[data-shown*='0006_light_004']").wait_for()
+        page.evaluate("() => scrollTo(0, 0)")
+        keep(page, "set_fault", tmp_path)
 
         page.get_by_role("button", name="Colour chart: Correct the colours").press("Enter")
         page.locator("#problem", has_text="no chart is found").wait_for()
