@@ -65,7 +65,7 @@ samples: $(VENV)/installed-dev
 screenshots: $(VENV)/installed-dev
 	RELIT_TEST_SCREENSHOTS=$(CURDIR)/docs $(BIN)/python -m pytest -q tests/service/server/pages/test_sample_pages.py tests/service/server/pages/test_twin_page.py \
 	  tests/service/server/pages/test_home_page.py tests/service/server/pages/test_machines_page.py \
-	  tests/service/server/pages/test_set_page.py tests/service/server/pages/test_published_page.py -k "shows_the_sample or to_an_asset"
+	  tests/service/server/pages/test_set_page.py tests/service/server/pages/test_published_page.py -k "shows_the_sample or to_an_asset or a_fault_is_named_and_mended"
 	$(BIN)/python -m docs.tools.chart_picture
 
 # the lock records versions and hashes, and no download address

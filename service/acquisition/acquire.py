@@ -112,9 +112,10 @@ class Acquisition:
                 self._recall()
                 self.journal.camera(self._camera.settings)
                 lights = Lights(self._request.rig or Path(), self.rig, self._ask)
-                self._open_projector()
                 self._adopt()
                 self._withdraw()
+                if any(shot.projected and shot.key not in self.journal.taken for shot in self.shots):
+                    self._open_projector()  # lamps before the first pattern find it black
                 if 0 < len(self.journal.taken) < len(self.shots):
                     self._compare(lights, stopping)
                 self._timings.stage("capture", len(self.shots))
@@ -136,16 +137,18 @@ class Acquisition:
                              tuple(self._own))
 
     def _open_projector(self) -> None:
-        """Serve the projector's page if a pattern is still to be shown, and wait for its window."""
+        """Serve the projector's page, and wait for its window."""
         request = self._request
-        if request.projector is not None and any(shot.projected and shot.key not in self.journal.taken for shot in self.shots):
-            self._projector = Projector(request.projector, request.projector_port, request.timeout, request.out / SPOOL)
-            self._tell(f"open {self._projector.address} in a browser on the projector's screen, and click into it")
-            self._projector.wait()
+        assert request.projector is not None
+        self._projector = Projector(request.projector, request.projector_port, request.timeout, request.out / SPOOL)
+        self._tell(f"open {self._projector.address} in a browser on the projector's screen, and click into it")
+        self._projector.wait()
 
     def _light(self, shot: Shot, lights: Lights) -> None:
         """Switch the lamps of a shot, and show its pattern; other shots find the projector black."""
         lights.set(shot.levels)
+        if shot.projected and self._projector is None:  # one that is compared, or in which all together have shown a fault
+            self._open_projector()
         if self._projector is not None:
             self._projector.show(self.patterns.image(shot, self._greys))
 

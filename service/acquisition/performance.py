@@ -69,7 +69,7 @@ def import_interleaved(request: InterleavedImport) -> Imported:
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise RequestError(f"{target}: is there already: give another folder for the sequence")
     rig = NO_LAMPS if request.rig is None else read_rig(request.rig)
-    shots = shots_of(read_plan(request.period), rig, request.projector)
+    shots = tuple(shot for shot in shots_of(read_plan(request.period), rig, request.projector) if shot.folder != TRACKING)  # of lamps alone
     period, closed = _period(shots, request.period)
     with folder_beside(target) as working, replacing_folder(target) as made:
         frames = _frames(request, working / "frames")

@@ -20,17 +20,18 @@ from service.acquisition.early_ingest import PREVIEW_FILE
 from service.acquisition.lights.lights import PLEASE, THEN_ENTER
 from service.acquisition.live_view import LiveView
 from service.acquisition.meter import PICTURE_FILE
-from service.acquisition.plans.plan import NAMED, Plan, needs_projector, read_plan
+from service.acquisition.plans.plan import NAMED, Plan, choices_of, needs_projector, plan_of
 from service.acquisition.plans.shots import FLAT, Shot, shots_of
 from service.errors import RequestError
 from service.relight.sheet import display, fit
 from service.reporting.provenance import REPORT_FILE
+from service.requests.acquire import PlanChoices
 from service.requests.patterns import PatternCode
 from stage.capture.light import OffLight
 from stage.capture.manifest import FILE_NAME
 from stage.colour.colour import linearise
 from stage.colour.colour_spaces import linear_space
-from stage.files import replacing
+from stage.files import replacing, write_text
 from stage.formats import images
 from stage.importers.layout import color_space_of
 from stage.rig.cues import rig_digest
@@ -40,8 +41,8 @@ NAME = r"\w[\w-]{0,63}"
 """A name of a capture, which is that of its folder."""
 CALIBRATIONS = {"ball": {"mirror-ball": "mirror-ball", "grey-ball": "grey-ball"}, "chart": {"chart": "chart"}}
 """For each step of what belongs to a capture, the kinds of `relit calibrate` by the folder of their pictures."""
-SPOOL = ".live"
-"""The folder of live pictures, in that of the captures."""
+SPOOL, PLANS = ".live", ".plans"
+"""The folders of live pictures and of plans, in that of the captures."""
 LINES = 40
 """The last lines of the process that are kept."""
 PICTURE_ROWS = 480
@@ -72,7 +73,7 @@ class RemoteControl:
         self._lines: deque[str] = deque(maxlen=LINES)
         self._prompt: str | None = None
         self._address: str | None = None
-        self._name, self._plan, self._metering = "", "", False
+        self._name, self._chosen, self._metering = "", PlanChoices(plan="olat"), False
         self._shots: tuple[Shot, ...] = ()
         self._live: LiveView | None = None
         self._calibrating: str | None = None
@@ -95,34 +96,30 @@ class RemoteControl:
                 raise RequestError(f"name: there is no capture {name!r}")
             if head["rig"] != rig_digest(self._rig):
                 raise RequestError(f"name: {name} was taken with another rig: start the service with it")
-            plan = Plan.model_validate(head["plan"])
-            names, left = [], plan.sequences
-            while left:
-                found = next((word for word in self._plans if left[:len(NAMED[word])] == NAMED[word]), None)
-                if found is None:
-                    raise RequestError(f"name: {name} was taken with a plan of its own: go on with relit capture")
-                names.append(found)
-                left = left[len(NAMED[found]):]
-            self._show(name, ",".join(names))
+            chosen = choices_of(Plan.model_validate(head["plan"]))
+            if chosen is None or not set(chosen.plan.split(",")) <= set(self._plans):
+                raise RequestError(f"name: {name} was taken with a plan of its own: go on with relit capture")
+            self._show(name, chosen)
 
-    def start(self, name: str, plan: str, *, preview: bool = False, retake: Sequence[str] = ()) -> None:
+    def start(self, name: str, chosen: PlanChoices, *, preview: bool = False, retake: Sequence[str] = ()) -> None:
         """Start a capture, go on with one, or meter the light.
         Raises RequestError if a capture is running, or a name or the plan cannot be used."""
         if re.fullmatch(NAME, name) is None:
             raise RequestError(f"name: {name!r} is no name of a capture: give letters, digits, - and _")
-        if unknown := [word for word in plan.split(",") if word not in self._plans]:
+        if unknown := [word for word in chosen.plan.split(",") if word not in self._plans]:
             why = f"is none of {', '.join(self._plans)}"
             if unknown[0] in NAMED:
                 why = "shows patterns: start the service with --projector 1280x800"
             raise RequestError(f"plan: {unknown[0]!r} {why}")
         with self._lock:
             self._refuse_beside_another()
-            self._show(name, plan)
+            self._show(name, chosen)
             self._metering = preview
-            words = [plan, *self._words, "--out", str(self._capture), *(["--preview", "--no-live"] if preview else []),
+            plan = self._folder / PLANS / f"{name}.json"
+            write_text(plan, plan_of(chosen).model_dump_json(by_alias=True))
+            words = [str(plan), *self._words, "--out", str(self._capture), *(["--preview", "--no-live"] if preview else []),
                      *(word for shot in retake for word in ("--retake", shot))]
             self._darken()
-            self._folder.mkdir(parents=True, exist_ok=True)
             if self._terminal >= 0:
                 os.close(self._terminal)
             self._terminal, terminal = os.openpty()  # the program asks a person where its input is a terminal
@@ -197,9 +194,10 @@ class RemoteControl:
                   "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
         live, version = self._live, self._version()
-        return {"name": self._name, "plan": self._plan, "running": running, "metering": self._metering and running, "prompt": self._prompt,
-                "code": self._code(), "projector": self._address if running else None,
-                "shots": shots, "files": found, "lines": list(self._lines), "folder": str(self._capture),
+        return {"name": self._name, "chosen": self._chosen.model_dump(include=set(PlanChoices.model_fields)), "running": running,
+                "metering": self._metering and running, "prompt": self._prompt,
+                "code": self._code(), "projector": self._address if running else None, "shots": shots,
+                "files": found, "lines": list(self._lines), "folder": str(self._capture),
                 "version": version, "calibrating": self._calibrating if running else None,
                 "calibrations": {step: version is not None and self._calibrated.get((self._name, step)) == self._taken_at()
                                  for step in self._calibrations()},
@@ -227,9 +225,9 @@ class RemoteControl:
     def _capture(self) -> Path:
         return self._folder / self._name
 
-    def _show(self, name: str, plan: str) -> None:
-        self._shots = shots_of(read_plan(plan), self._rig, self._projector)
-        self._name, self._plan, self._metering = name, plan, False
+    def _show(self, name: str, chosen: PlanChoices) -> None:
+        self._shots = shots_of(plan_of(chosen), self._rig, self._projector)
+        self._name, self._chosen, self._metering = name, chosen, False
         self._lines.clear()
         self._process = self._prompt = self._address = None
 

@@ -25,7 +25,7 @@ from stage.errors import CalibrationError, ManifestError
 from stage.formats.camera_raw import path_is_raw
 from stage.stack.correction import Correction
 
-PATCHES = {ChartKind.CLASSIC: 24, ChartKind.SG: 140}
+PATCHES = {ChartKind.CLASSIC: 24, ChartKind.PASSPORT: 24, ChartKind.SG: 140}
 SURE = 0.9
 """The part of the patches that have the colours of the chart where no other place is looked for."""
 LEAST = 0.6

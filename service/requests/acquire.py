@@ -9,7 +9,7 @@ from service.requests.base.base import Choice, Commas, DeviceRequest, Role, Spel
 from service.requests.base.review import ReviewOptions
 from service.requests.patterns import Side
 from stage.colour.colour_spaces import ColorSpaceName
-from stage.model import FirstFault, Line, Positive
+from stage.model import Count, FirstFault, Line, Positive, Strict
 
 
 class Then(Choice):
@@ -17,6 +17,19 @@ class Then(Choice):
 
     SOLVE = "solve", "its maps, in the folder maps of the capture"
     EXPORT = "export", "of these an asset, asset.usdz in the capture"
+
+
+class PlanChoices(Strict):
+    """A plan as it is chosen without a file."""
+
+    plan: Line
+    """The names of its sequences, with commas between."""
+    exposures_s: Annotated[tuple[Positive, ...], FirstFault] = ()
+    """The exposure times of each picture of the capture itself; none: the one that the camera has."""
+    tracking_every: Count | None = None
+    """Number of pictures between tracking pictures; None: there are none."""
+    lights: Annotated[tuple[Line, ...], Field(min_length=1), FirstFault] | None = None
+    """The names of the lamps that are lit one by one; None: all lamps of the rig."""
 
 
 class AcquireRequest(ReviewOptions, DeviceRequest):

@@ -14,7 +14,8 @@ from stage.model import Finite
 class ChartKind(Choice):
     """The colour charts that are found in images."""
 
-    CLASSIC = "classic", "24 patches, those on a page of a ColorChecker Passport too"
+    CLASSIC = "classic", "24 patches"
+    PASSPORT = "passport", "the 24 patches of a ColorChecker Passport, which are those of the classic chart"
     SG = "sg", "the 140 patches of a ColorChecker Digital SG"
 
 

@@ -127,6 +127,7 @@ folder, environment.HEIGHT = Path(given["folder"]), 128
 settings(capture=given["capture"], out=str(folder), asset=str(folder / "asset.usda"))
 bpy.ops.relit.import_asset()
 scene = bpy.context.scene
+found["no card"] = refused(bpy.ops.relit.compare_render)
 found["captured"] = [scene.world is None, scene.relit.light]
 settings(light="ENVIRONMENT")
 render(folder / "environment.exr", 256, bounces=0)
@@ -150,6 +151,11 @@ bpy.ops.relit.show_frames(filepath=str(folder / "frames" / "frame.0001.exr"))
 card, = [each for each in scene.objects if "relit_card" in each]
 bpy.context.view_layer.update()
 found["beside"] = [tuple(world_to_camera_view(scene, scene.camera, card.matrix_world @ each.co))[:2] for each in card.data.vertices]
+for _ in range(2):
+    bpy.ops.relit.compare_render()
+    editors = [each for each in bpy.context.window_manager.windows[0].screen.areas if each.type == "IMAGE_EDITOR"]
+    found["editors"] = [[each.spaces.active.image.type, each.spaces.active.image.name, each.spaces.active.image_user.frame_start]
+                        for each in sorted(editors, key=lambda each: each.x)]
 found["other kinds"] = []
 for name in ("asset.usdz", "asset.glb"):
     settings(asset=str(folder / name))
@@ -204,6 +210,9 @@ def test_a_world_is_the_environment_and_is_written_as_it_was(a_ball, tmp_path):
         card = picture(tmp_path / f"card{number}.exr")
         np.testing.assert_allclose(card[1:-1, 1:-1], np.broadcast_to([number / 4, 0.5, 2, 1], (30, 30, 4)), rtol=1e-3)
     np.testing.assert_allclose(found["beside"], [(1.05, 0), (2.05, 0), (2.05, 1), (1.05, 1)], atol=1e-4)
+    assert "there are no frames yet" in found["no card"]
+    (kind, *_), (_, name, first) = found["editors"]  # Blender's render at the left, and at the right the frames of the card
+    assert (kind, name, first) == ("RENDER_RESULT", "frame.0001.exr", 1)
     assert found["other kinds"] == [["CAPTURED", 1], ["CAPTURED", 1]]  # the rig of asset.usda lies beside them too
     assert "has no mesh 'lod1'" in found["no variants"] and "different cameras" in found["another capture"]
 

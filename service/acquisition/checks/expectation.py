@@ -83,21 +83,26 @@ class Seen(NamedTuple):
 class Expectation:
     """Says what pictures under the lamps of a rig should be."""
 
-    def __init__(self, directions: np.ndarray) -> None:
-        """Take the directions of the lamps, [lamps, 3]."""
-        self.directions = directions
+    def __init__(self, directions: np.ndarray, light: np.ndarray) -> None:
+        """Take the directions of the lamps, [lamps, 3], and the irradiance that each gives, [lamps], in any unit."""
+        self.directions, self._light = directions, light
 
     def weights(self, seen: Seen, others: list[Seen]) -> list[tuple[np.float32, Seen]] | None:
         """Return the weights of those pictures whose sum is expected under a lamp, or None."""
         if seen.shot.lamp is None:
             return [(np.float32(1 / len(others)), each) for each in others] or None
+        shares = self.shares(seen, others)
+        if shares is None:
+            return None
+        light = self._light[seen.shot.lamp] / self._light[_lamps(others)]
+        return [(np.float32(share * factor), each) for share, factor, each in zip(shares, light, others, strict=True)
+                if abs(share) > LEAST_WEIGHT]
+
+    def shares(self, seen: Seen, others: list[Seen]) -> np.ndarray | None:
+        """Return the weights of the pictures under other lamps, as if all gave equal light, [others]; None where they say nothing."""
         wanted, directions = self.directions[seen.shot.lamp], self.towards(others)
         weights = prediction_weights(wanted, directions)
-        if weights is None:
-            weights = rough_weights(wanted, directions)
-        if weights is None:
-            return None
-        return [(np.float32(weight), each) for weight, each in zip(weights, others, strict=True) if abs(weight) > LEAST_WEIGHT]
+        return rough_weights(wanted, directions) if weights is None else weights
 
     def misfit(self, seen: Seen, others: list[Seen]) -> float:
         """Return how far a picture is from what is expected of it, 0 to 1."""
@@ -111,7 +116,12 @@ class Expectation:
 
     def towards(self, pictures: list[Seen]) -> np.ndarray:
         """Return the directions of the lamps of pictures, [pictures, 3]."""
-        return np.asarray(self.directions[np.array([each.shot.lamp for each in pictures], dtype=np.intp)])
+        return np.asarray(self.directions[_lamps(pictures)])
+
+
+def _lamps(pictures: list[Seen]) -> np.ndarray:
+    """Return the indices of the lamps of pictures, [pictures]."""
+    return np.array([each.shot.lamp for each in pictures], dtype=np.intp)
 
 
 def expected_blocks(used: list[tuple[np.float32, Seen]]) -> np.ndarray:
@@ -158,9 +168,10 @@ def comparable(shot: Shot, other: Shot) -> bool:
 
 def same_kind(shot: Shot, other: Shot) -> bool:
     """Return whether the picture of a shot says what that of another one should be."""
-    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.projected:
+    if not comparable(shot, other) or (shot.lamp is None) != (other.lamp is None) or shot.grey is not None:
         return False
-    return shot.lamp is not None or (bool(np.array_equal(shot.levels, other.levels)) and shot.light == other.light)
+    return shot.lamp is not None or (shot.pattern == other.pattern and bool(np.array_equal(shot.levels, other.levels))
+                                     and shot.light == other.light)
 
 
 def prediction_weights(wanted: np.ndarray, directions: np.ndarray) -> np.ndarray | None:

@@ -72,7 +72,8 @@ class Judge:
     """Judges pictures against those that were taken before."""
 
     def __init__(self, rig: Rig) -> None:
-        self._expectation = Expectation(rig.directions)
+        light = [np.sum([primary.irradiance for primary in lamp.primaries]) for lamp in rig.lights]
+        self._expectation = Expectation(rig.directions, np.array(light))
         self._held = {index for index, lamp in enumerate(rig.lights) if lamp.address is not None and lamp.address.protocol == "manual"}
         self._place: tuple[int, int] | None = None
         self._seen: dict[str, Seen] = {}
@@ -152,7 +153,7 @@ class Judge:
             affected = [key for key in kept if key != worst and self._leans_on(key, worst, kept)]
         for key in list(found):
             seen = self._seen[key]
-            if seen.shot.levels.any():
+            if seen.shot.levels.any() or seen.shot.projected:
                 others = self._others(seen, [other for other in keys if other not in found])
                 if faults := self._faults(seen, others):
                     found[key] = faults[0]
@@ -198,7 +199,7 @@ class Judge:
     def _faults(self, seen: Seen, others: list[Seen]) -> list[Fault]:
         """Return the fault that a picture shows against others, if it shows one."""
         shot, sample = seen.shot, seen.sample
-        if not shot.levels.any() or not others:
+        if not (shot.levels.any() or shot.projected) or not others:
             return []
         used = self._expectation.weights(seen, others)
         usual = np.mean([each.sample.blocks for each in others], axis=0)
@@ -247,9 +248,8 @@ class Judge:
 
     def _surrounded(self, seen: Seen, others: list[Seen]) -> bool:
         """Return whether lamps all around that of a picture say what it should be."""
-        used = self._expectation.weights(seen, others)
-        return (used is not None and sum(abs(float(weight)) for weight, _ in used) < INSIDE_GAIN
-                and self._expectation.interpolated(seen, others))
+        shares = self._expectation.shares(seen, others)
+        return shares is not None and float(np.abs(shares).sum()) < INSIDE_GAIN and self._expectation.interpolated(seen, others)
 
     def _bright_fault(self, seen: Seen, used: list[tuple[np.float32, Seen]], usual: np.ndarray, dark: np.ndarray | float, should: float
                       ) -> Fault | None:

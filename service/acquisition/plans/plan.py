@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from service.errors import RequestError
+from service.requests.acquire import PlanChoices
 from service.requests.patterns import PatternAxis, PatternCode
 from stage.capture.light import Polarization
 from stage.model import Count, FirstFault, Fraction, NotNegative, Positive, Strict, Text
@@ -108,7 +109,8 @@ class Plan(Strict):
     settle_s: NotNegative = 0.1
     """The time between a change of the lamps or the pattern and the picture."""
     tracking_every: Count | None = None
-    """A picture under full light is taken before every so many pictures of lamps, and after the last; None: none."""
+    """A picture under full light is taken before every so many pictures of lamps, one of white before every so many patterns, and each
+    after the last; None: none."""
 
 
 _WHITE_CARD = "put a white card in the place of the object, and let it fill the picture"
@@ -127,6 +129,8 @@ NAMED: dict[str, tuple[AnySequence, ...]] = {
     **{str(code): (PatternSequence(take="patterns", code=code),) for code in PatternCode},
 }
 """The sequences that a name stands for."""
+_EXPOSED = OlatSequence | GradientSequence | DarkSequence | PatternSequence
+"""The sequences of which the frames of one capture come."""
 
 
 def needs_projector(sequences: Iterable[AnySequence]) -> bool:
@@ -144,3 +148,31 @@ def read_plan(given: str) -> Plan:
     if unknown:
         raise RequestError(f"the plan {given}: {unknown[0]} is neither a file nor one of {', '.join(NAMED)}")
     return Plan(schema="relit.plan/1", sequences=tuple(sequence for name in names for sequence in NAMED[name]))
+
+
+def plan_of(chosen: PlanChoices) -> Plan:
+    """Return the plan that was chosen: exposure times are those of all pictures that make one capture.
+    Raises RequestError if a name is none of a sequence."""
+    changed = []
+    for sequence in read_plan(chosen.plan).sequences:
+        exposed = {"exposures_s": chosen.exposures_s} if isinstance(sequence, _EXPOSED) else {}
+        lit = {"lights": chosen.lights} if isinstance(sequence, OlatSequence) else {}
+        changed.append(sequence.model_copy(update={**exposed, **lit}))
+    return Plan(schema="relit.plan/1", sequences=tuple(changed), tracking_every=chosen.tracking_every)
+
+
+def choices_of(plan: Plan) -> PlanChoices | None:
+    """Return the choices of which a plan is made; None: it has something of its own."""
+    names: list[str] = []
+    exposures: tuple[float, ...] = next((each.exposures_s for each in plan.sequences if isinstance(each, _EXPOSED)), ())
+    lights = next((each.lights for each in plan.sequences if isinstance(each, OlatSequence)), None)
+    left = [each.model_copy(update={"exposures_s": (), **({"lights": None} if isinstance(each, OlatSequence) else {})})
+            for each in plan.sequences]
+    while left:
+        name = next((name for name, named in NAMED.items() if tuple(left[:len(named)]) == named), None)
+        if name is None:
+            return None
+        names.append(name)
+        left = left[len(NAMED[name]):]
+    chosen = PlanChoices(plan=",".join(names), exposures_s=exposures, tracking_every=plan.tracking_every, lights=lights)
+    return chosen if plan_of(chosen) == plan else None

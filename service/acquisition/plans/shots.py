@@ -23,6 +23,7 @@ from service.depth.patterns.projection import patterns_of
 from service.errors import RequestError
 from service.requests.patterns import PatternsRequest
 from stage.capture.light import DistantLight, FullLight, GradientLight, Light, OffLight, PointLight
+from stage.patterns.base import UniformPattern
 from stage.patterns.codes import Pattern
 from stage.rig.rig import DMX, Rig
 
@@ -30,7 +31,7 @@ AXES = ("x", "y", "z")
 FLAT = "flat"
 """The name of the flat image."""
 TRACKING = "tracking"
-"""The end of the names of pictures under full light, which show whether something moved."""
+"""The end of the names of pictures under full light, which show whether something moved; of white ones between patterns also the folder."""
 
 
 SEEN = 4
@@ -79,7 +80,7 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
     if not rig.lights and not all(needs_projector([sequence]) for sequence in plan.sequences):
         raise RequestError("the plan has pictures under lamps: give the file of the lamps, --rig rig.json")
     found: list[Shot] = []
-    since = 0  # shots of lamps since the first tracking frame
+    tracked: dict[str, tuple[Shot, int]] = {}  # the first tracking shot of lamps and that of patterns, and the shots since, by the folder
     shown: set[Pattern] = set()  # codes share white and black, of which a capture has one each
     for number, sequence in enumerate(plan.sequences):
         before = len(found)
@@ -88,22 +89,34 @@ def shots_of(plan: Plan, rig: Rig, projector: tuple[int, int] | None) -> tuple[S
                 continue
             if shot.pattern is not None:
                 shown.add(shot.pattern)
-            if plan.tracking_every is not None and isinstance(sequence, OlatSequence | GradientSequence):
-                if since % plan.tracking_every == 0:
-                    found.append(_tracking(rig, sequence))
-                since += 1
             times = sequence.exposures_s or (None,)
+            if plan.tracking_every is not None and isinstance(sequence, OlatSequence | GradientSequence | PatternSequence):
+                tracking = _tracking(rig, sequence)._replace(exposure_s=min(sequence.exposures_s, default=None))
+                first, since = tracked.get(tracking.folder, (tracking, 0))
+                if since % plan.tracking_every == 0:
+                    found.append(tracking)
+                tracked[tracking.folder] = first, since + 1
             found += [shot._replace(exposure_s=time, may_clip=time is not None and time > min(filter(None, times))) for time in times]
         if len(found) > before:
             found[before] = found[before]._replace(prompt=sequence.prompt)
-    if since:
-        found.append(found[next(index for index, shot in enumerate(found) if shot.name == TRACKING)]._replace(prompt=None))
-    first = next((index for index, shot in enumerate(found) if shot.pattern is not None), len(found))
-    if any(shot.grey is not None for shot in found[first:]):
+    found += [tracking for tracking, _ in tracked.values()]
+    _refuse_some_exposures(found)
+    patterns = next((index for index, shot in enumerate(found) if shot.pattern is not None), len(found))
+    if any(shot.grey is not None for shot in found[patterns:]):
         raise RequestError("the plan measures the projector's response after patterns that are shown through it: put it before them")
     if sum(shot.name == FLAT for shot in found) > 1:
         raise RequestError("the plan has several flat images: a capture has one, so give one sequence flat with one exposure")
     return tuple(_named(found))
+
+
+def _refuse_some_exposures(shots: Sequence[Shot]) -> None:
+    """Refuse a plan whose captures would have exposure times for some of their frames alone."""
+    for folder in {shot.folder for shot in shots}:
+        frames = [shot for shot in shots if shot.folder == folder and (shot.light is not None or shot.pattern is not None)]
+        without = [shot.name for shot in frames if shot.exposure_s is None]
+        if 0 < len(without) < len(frames):
+            raise RequestError(f"the plan has exposures_s for some pictures of a capture and none for {without[0]}: give them to all of "
+                               "its sequences or to none")
 
 
 def _sequence(sequence: AnySequence, rig: Rig, projector: tuple[int, int] | None, where: str) -> Iterator[Shot]:
@@ -166,8 +179,10 @@ def _light_of(rig: Rig, index: int, level: float) -> Light:
     return PointLight.model_validate({"type": "point", "position_m": lamp.position_m, "intensity": (squared * irradiance).tolist()})
 
 
-def _tracking(rig: Rig, sequence: OlatSequence | GradientSequence) -> Shot:
-    """Return a shot under full light, at the exposure of a sequence, which shows whether something moved."""
+def _tracking(rig: Rig, sequence: OlatSequence | GradientSequence | PatternSequence) -> Shot:
+    """Return a shot under full light, as a sequence has it, which shows whether something moved; white of a projector is no frame."""
+    if isinstance(sequence, PatternSequence):
+        return Shot(TRACKING, TRACKING, np.zeros(len(rig.emitters)), pattern=UniformPattern(code="white"))
     levels = even_levels(rig, sequence.level) if isinstance(sequence, OlatSequence) else np.ones(len(rig.emitters))
     return Shot(TRACKING, "", levels, light=FullLight(type="full"))
 

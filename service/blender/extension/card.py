@@ -59,6 +59,41 @@ def show(root: bpy.types.Object, files: dict[int, Path], place: str) -> bpy.type
     return card
 
 
+def compare(root: bpy.types.Object, window: bpy.types.Window) -> None:
+    """Show the frames of the latest card of a capture and Blender's own render in two Image Editors of a window, side by side.
+
+    Editors that the window has are taken first; what it lacks is split off its largest area. Raise Failure where there is no card or no
+    render."""
+    cards = [each for each in root.children if "relit_card" in each]
+    rendered = next((each for each in bpy.data.images if each.type == "RENDER_RESULT"), None)
+    if not cards:
+        raise Failure("there are no frames yet: relight a frame range, or show frames that are there")
+    if rendered is None:
+        raise Failure("Blender has rendered nothing yet: render the scene, and compare then")
+    texture = next(node for node in cards[-1].data.materials[0].node_tree.nodes if node.type == "TEX_IMAGE")
+    for area, image in zip(_editors(window), (rendered, texture.image), strict=True):
+        space = area.spaces.active
+        space.image = image
+        if image.source == "SEQUENCE":
+            for name in ("frame_start", "frame_offset", "frame_duration"):
+                setattr(space.image_user, name, getattr(texture.image_user, name))
+            space.image_user.use_auto_refresh = True
+
+
+def _editors(window: bpy.types.Window) -> list[bpy.types.Area]:
+    """Return two Image Editors of a window, from left to right."""
+    while len(found := [each for each in window.screen.areas if each.type == "IMAGE_EDITOR"]) < 2:
+        area = found[0] if found else max(window.screen.areas, key=lambda each: each.width * each.height)
+        before = {each.as_pointer() for each in window.screen.areas}
+        with bpy.context.temp_override(window=window, screen=window.screen, area=area):
+            bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5)
+        made = next((each for each in window.screen.areas if each.as_pointer() not in before), None)
+        if made is None:
+            raise Failure("the window has no room for two Image Editors: open them, and compare then")
+        made.type = "IMAGE_EDITOR"
+    return sorted(found[:2], key=lambda each: each.x)
+
+
 def _material(files: dict[int, Path]) -> bpy.types.Material:
     """Return a material that emits the frames; where they are premultiplied, it shows what is behind them."""
     image = bpy.data.images.load(str(files[min(files)]), check_existing=True)

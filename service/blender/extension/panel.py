@@ -31,7 +31,8 @@ class RELIT_PT_capture(bpy.types.Panel):
         captured = ("light_index",) if given.light == "CAPTURED" else ()
         _part(layout, "Light", given, ("root", "light", *captured), ())
         guided = ("guided",) if given.method == "RELIGHT" else ()
-        _part(layout, "Frames", given, ("method", *guided, "place"), (relighting.RELIT_OT_relight, relighting.RELIT_OT_show_frames))
+        _part(layout, "Frames", given, ("method", *guided, "place"),
+              (relighting.RELIT_OT_relight, relighting.RELIT_OT_show_frames, relighting.RELIT_OT_compare_render))
 
 
 def _part(layout: bpy.types.UILayout, title: str, given: settings.Settings, names: tuple[str, ...], operators: tuple[type, ...]) -> None:
@@ -61,4 +62,4 @@ def _error(layout: bpy.types.UILayout, sentence: str) -> None:
 
 
 CLASSES = (preferences.Preferences, settings.Settings, solving.RELIT_OT_solve, solving.RELIT_OT_cancel, importing.RELIT_OT_import_asset,
-           relighting.RELIT_OT_relight, relighting.RELIT_OT_show_frames, RELIT_PT_capture)
+           relighting.RELIT_OT_relight, relighting.RELIT_OT_show_frames, relighting.RELIT_OT_compare_render, RELIT_PT_capture)

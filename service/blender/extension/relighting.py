@@ -92,6 +92,17 @@ class RELIT_OT_show_frames(RelitOperator):
         card.show(_root(given), card.files_of(Path(bpy.path.abspath(self.filepath))), given.place)
 
 
+class RELIT_OT_compare_render(RelitOperator):
+    """Show relit frames of the capture and Blender's own render side by side."""
+
+    bl_idname = "relit.compare_render"
+    bl_label = "Compare with Render"
+
+    def act(self, context: bpy.types.Context) -> None:
+        """Fill two Image Editors."""
+        card.compare(_root(context.scene.relit), context.window or context.window_manager.windows[0])
+
+
 def sampled(context: bpy.types.Context, frames: range, root: bpy.types.Object, method: str) -> tuple[dict, list[dict]]:
     """Return the lights of the scene over a frame range: as light keys, or as near lights of each frame."""
     scene = context.scene

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Protocol
 
 from fastapi import APIRouter, Depends, Request, Response
 
+from service.requests.acquire import PlanChoices
 from service.server.api.context import require_admin
 from service.server.api.problems import ApiError
 from stage.model import Line, Strict
@@ -21,7 +22,7 @@ class Stage(Protocol):
     def open(self, name: str) -> None:
         """Show a capture that was taken before."""
 
-    def start(self, name: str, plan: str, *, preview: bool, retake: Sequence[str]) -> None:
+    def start(self, name: str, chosen: PlanChoices, *, preview: bool, retake: Sequence[str]) -> None:
         """Start a capture."""
 
     def calibrate(self, step: str) -> None:
@@ -49,11 +50,10 @@ class Stage(Protocol):
         """Write the picture of a shot."""
 
 
-class Run(Strict):
+class Run(PlanChoices):
     """A capture that is to be started."""
 
     name: Line
-    plan: Line
     preview: bool = False
     retake: tuple[Line, ...] = ()
 
@@ -100,7 +100,7 @@ def state(stage: Given) -> dict[str, Any]:
 @router.post("/run", status_code=204)
 def run(stage: Given, given: Run) -> None:
     """Start a capture."""
-    stage.start(given.name, given.plan, preview=given.preview, retake=given.retake)
+    stage.start(given.name, given, preview=given.preview, retake=given.retake)
 
 
 @router.post("/open", status_code=204)

@@ -41,6 +41,7 @@ class Scene(NamedTuple):
 
     radiance: np.ndarray  # [lamps, rows, cols, 3] float32, full scale 1
     directions: np.ndarray  # [lamps, 3]
+    light: np.ndarray | None = None  # [lamps], the irradiance that the rig says of each; None: 1
 
 
 @cache
@@ -86,9 +87,10 @@ def rig_of(scene: Scene) -> Rig:
     """Return a rig of the lamps, whose brightness is driven."""
     return Rig.model_validate({"schema": "relit.rig/1", "name": "test", "color_space": "lin_rec709_scene", "lights": [
         {"name": f"L{index}", "type": "distant", "direction": (towards / np.linalg.norm(towards)).tolist(),
-         "primaries": [{"name": "white", "irradiance": [1, 1, 1]}],
+         "primaries": [{"name": "white", "irradiance": [light, light, light]}],
          "address": {"protocol": "sacn", "universe": 1, "channels": {"white": index + 1}}}
-        for index, towards in enumerate(scene.directions)]})
+        for index, (towards, light) in enumerate(zip(
+            scene.directions, np.ones(len(scene.directions)) if scene.light is None else scene.light, strict=True))]})
 
 
 def shots_on(rig: Rig, tracking_every: int = 24) -> tuple[Shot, ...]:

@@ -72,6 +72,8 @@ def reflex(monkeypatch):
 @pytest.mark.parametrize(("error", "words"), [
     ("GP_ERROR_MODEL_NOT_FOUND", "no camera is found: switch it on, and check the cable"),
     ("GP_ERROR_IO_USB_CLAIM", "another program uses the camera: end it"),
+    ("GP_ERROR_IO_LOCK", "another program uses the camera: end it"),
+    ("GP_ERROR_NO_MEMORY", "the card of the camera is full: empty it"),
     ("GP_ERROR_IO_INIT", "the USB device may not be opened: give your user the right to use it"),
     ("GP_ERROR_CAMERA_BUSY", "the camera is busy: wait until it has stored its pictures"),
     ("GP_ERROR_IO", "the camera does not answer: check the cable and the battery")])

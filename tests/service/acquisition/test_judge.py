@@ -34,6 +34,17 @@ def test_each_fault_is_named_over_random_seeds(scene, seeds):
         assert found == made, seed
 
 
+def test_lamps_of_unequal_light_are_judged_by_what_the_rig_says_of_it():
+    """Unsaid, one of them looks like ambient light."""
+    scene = relief(5)
+    light = np.random.default_rng(2).uniform(0.4, 2.4, len(scene.directions))
+    uneven = scene._replace(radiance=(scene.radiance * light[:, None, None, None] / 2.4).astype(np.float32))
+    assert named(uneven, 1, ())[1] != {}
+    assert named(uneven._replace(light=light), 1, ())[1] == {}
+    made, found = named(uneven._replace(light=light), 3, KINDS)
+    assert found == made
+
+
 def test_the_highlight_of_a_glossy_ball_has_not_moved():
     """A highlight moves with the lamp, and lies in part where each of the lamps around has its own, as a prediction says."""
     directions = fibonacci_sphere(160)
@@ -167,12 +178,14 @@ def test_each_lamp_alone_at_each_exposure_with_tracking_between():
     assert np.allclose(olat[0].light.direction, DIRECTIONS[2]) and np.allclose(olat[0].light.irradiance, 0.5)
     assert [shot.name.endswith(TRACKING) for shot in found] == [True, False, False, False, False, True, False, False, True]
     assert [shot.prompt for shot in found] == ["wait"] + 8 * [None]
+    assert {shot.exposure_s for shot in found if shot.lamp is None} == {0.1}  # as all frames of a capture have one, or none has
     assert len({shot.key for shot in found}) == len(found)
 
 
 @pytest.mark.parametrize(("sequences", "words"), [
     ([{"take": "olat", "lights": ["L9"]}], "no lamp L9"), ([{"take": "patterns", "code": "gray"}], "--projector"),
-    ([{"take": "flat"}, {"take": "flat"}], "several flat")])
+    ([{"take": "flat"}, {"take": "flat"}], "several flat"),
+    ([{"take": "dark"}, {"take": "olat", "exposures_s": [0.1]}], "none for dark")])
 def test_what_cannot_be_taken_is_refused(sequences, words):
     with pytest.raises(RequestError, match=words):
         shots(*sequences)

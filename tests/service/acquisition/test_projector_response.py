@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from service.acquisition.acquire import acquire, refuse_to_ask
+from service.acquisition.checks.expectation import FaultKind
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from stage.capture.capture import Capture
@@ -32,10 +33,11 @@ class ProjectedScene:
     """A page that shows what the projector asks for, and a camera that sees it pixel by pixel."""
 
     def __init__(self, folder) -> None:
-        self.folder, self.shown, self.taken = folder, np.zeros(SIZE[::-1]), 0
+        self.folder, self.shown, self.taken, self.opened, self.shift = folder, np.zeros(SIZE[::-1]), 0, 0, 0
         self.random = np.random.default_rng(2)
 
     def tell(self, what: str) -> None:
+        self.opened += 1
         address = next(word for word in what.split() if word.startswith("http"))
         threading.Thread(target=self._page, args=[urlsplit(address).netloc], daemon=True).start()
 
@@ -62,7 +64,7 @@ class ProjectedScene:
     def release(self) -> None:
         self.taken += 1
         seen = self.shown if self.shown.ndim == 3 else self.shown[..., None]
-        pixels = AMBIENT + ALBEDO * light_of(seen) + self.random.normal(0, 1e-3, (*SIZE[::-1], 1))
+        pixels = AMBIENT + np.roll(ALBEDO, self.shift, axis=1) * light_of(seen) + self.random.normal(0, 1e-3, (*SIZE[::-1], 1))
         write_exr(self.folder / f"{self.taken:04d}.exr", np.repeat(np.maximum(pixels, 0), 3, axis=2).astype(np.float32))
 
 
@@ -120,6 +122,39 @@ def test_a_capture_goes_on_with_the_response_that_it_measured(tmp_path, scene):
     assert farthest_from_linear(tmp_path / "capture") < 0.01
     with pytest.raises(RequestError, match="begin a new capture"):
         acquire(request(tmp_path, "projector-response,phase", retake=("projector-response/0002_grey",)), refuse_to_ask, scene.tell)
+
+
+def test_white_pictures_between_patterns_show_what_moved_and_what_was_taken_is_shown_again(tmp_path, scene, monkeypatch):
+    """The decoded capture has the patterns alone."""
+    (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0, "tracking_every": 5, "sequences": [
+        {"take": "patterns", "code": "phase"}]}))
+
+    def run(**changes):
+        return acquire(request(tmp_path, str(tmp_path / "plan.json"), **changes), refuse_to_ask, scene.tell)
+
+    still = run(out=tmp_path / "still")
+    frames = Capture.open(tmp_path / "still").manifest.frames
+    white = sorted((tmp_path / "still" / "tracking").glob("*.exr"))
+    assert (still.faults, still.retaken, still.there) == ((), (), len(frames) + len(white))
+    assert [int(path.name[:4]) for path in white] == [*range(1, still.there, 6), still.there] and len(white) == 4
+    assert len({frame.pattern for frame in frames}) == len(frames)
+
+    opened = scene.opened
+    key = frames[3].image.removesuffix(".exr")
+    before = images.read_pixels(tmp_path / "still" / f"{key}.exr")
+    assert run(out=tmp_path / "still", retake=(key,)).faults == ()
+    assert scene.opened == opened + 1
+    assert np.abs(images.read_pixels(tmp_path / "still" / f"{key}.exr") - before).max() < 0.01  # noise of .001; the pattern is .8
+
+    release, first = scene.release, scene.taken
+
+    def moving() -> None:
+        scene.shift = 3 * (scene.taken - first >= 10)
+        release()
+    monkeypatch.setattr(scene, "release", moving)
+    moved = run(out=tmp_path / "moved", retakes=0)
+    sides = [{(f"tracking/{path.stem}", FaultKind.MOVED) for path in side} for side in (white[:2], white[2:])]
+    assert {(fault.shot, fault.kind) for fault in moved.faults} in sides  # of two and two, nothing tells which are out of place
 
 
 def test_what_contradicts_itself_is_refused(tmp_path, scene):

@@ -41,17 +41,24 @@ def test_without_retakes_each_fault_is_named_and_stays(twin):
 
 
 @pytest.mark.long
-def test_the_commands_of_the_page_take_and_solve_the_owl_without_a_picture_taken_again(tmp_path):
-    """As docs/set.md has them, but for the crop of what is solved; the twin's page has its port, and its lamps those of sACN."""
+@pytest.mark.parametrize(("document", "pictures"), [("docs/set.md", 97), ("README.md", 96)])
+def test_the_commands_of_the_documents_take_and_solve_the_owl_without_a_picture_taken_again(tmp_path, document, pictures):
+    """As they have them, but for the crop of what is solved, for which --then stands alone; the twin's page has its port, and its lamps
+    those of sACN."""
     if shutil.which("curl") is None:
         pytest.skip("no curl")
-    page = (ROOT / "docs" / "set.md").read_text(encoding="utf-8")
-    block = next(block for block in page.split("```")[1::2] if "relit twin rig.json" in block)
+    page = (ROOT / document).read_text(encoding="utf-8")
+    block = next(block for block in page.split("```")[1::2] if "samples/owl --pictures watched" in block)
     program = f"{sys.executable} -m service.cli.main "
     lines = [line.split("#")[0].strip().replace("relit ", program, 1) for line in block.strip().splitlines()]
     (tmp_path / "samples").symlink_to(ROOT / "samples")
     place = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
-    rig, twin, capture, solve = map(shlex.split, lines)
+    rig, twin, capture, *then = map(shlex.split, lines)
+    if "--then" in capture:
+        steps = capture[capture.index("--then") + 1]
+        del capture[capture.index("--then"):]
+        commands = {"solve": "solve capture --out maps", "export": "export maps --out asset.usdz"}
+        then = [shlex.split(program + commands[step]) for step in steps.split(",")]
     subprocess.run(rig, check=True, **place)
     stage = subprocess.Popen(twin, stdout=subprocess.PIPE, **place)
     try:
@@ -61,6 +68,9 @@ def test_the_commands_of_the_page_take_and_solve_the_owl_without_a_picture_taken
         stage.kill()
         stage.wait()
     report = json.loads((tmp_path / "capture" / "report.json").read_text())
-    assert (report["pictures"], report["retaken"], report["faults"]) == (97, [], [])
-    subprocess.run([*solve, "--crop", CROP], check=True, **place)
+    assert (report["pictures"], report["retaken"], report["faults"]) == (pictures, [], [])
+    subprocess.run([*then[0], "--crop", CROP], check=True, **place)
+    for command in then[1:]:
+        subprocess.run(command, check=True, **place)
     assert (tmp_path / "maps" / "maps.exr").stat().st_size > 0
+    assert (tmp_path / "asset.usdz").exists() == (document == "README.md")

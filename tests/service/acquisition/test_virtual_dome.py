@@ -28,7 +28,7 @@ from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render, write_capture, write_exr
 from tests.scenes.patched_rigs import loopback
 from tests.scenes.rigs import write_rig
-from tests.service.acquisition.scenes import BRIGHT, VISIBLE, owl_on_stage, relief
+from tests.service.acquisition.scenes import BRIGHT, ROOT, VISIBLE, owl_on_stage, relief
 from tests.service.acquisition.test_cameras import virtual_camera
 from tests.service.owl import OWL, block_mean
 from tests.service.waiting import until
@@ -182,6 +182,32 @@ def test_lamps_over_dmx_are_dark_after_an_error_and_after_ctrl_c(tmp_path, monke
             assert acquire(given, refuse_to_ask).there == 3
         until(lambda: not lit().size, "a lamp stays lit")
     assert seen == [0, 1, 2]
+
+
+@pytest.mark.long
+def test_the_commands_take_the_pictures_of_a_virtual_camera(tmp_path):
+    """As docs/set.md has them; a picture that came before its lamp would be one of another lamp, or doubled, and is taken again."""
+    lamps, card, host = 9, tmp_path / "card", loopback()
+    scene, light = make_scene(size=SIZE, lights=lamps), np.ones((lamps, 3))
+    scene = scene._replace(irradiance=light, images=render(scene.normal, scene.albedo, scene.directions, light))
+    write_capture(tmp_path / "scene", scene)
+    write_rig(tmp_path / "rig.json", scene.directions, {"white": (1.0, 1.0, 1.0)}, host=host)
+    (tmp_path / "plan.json").write_text(json.dumps({"schema": "relit.plan/1", "settle_s": 0.5, "sequences": [{"take": "olat"}]}))
+    program = [sys.executable, "-m", "service.cli.main"]
+    twin = subprocess.Popen([*program, "twin", tmp_path / "rig.json", tmp_path / "scene", "--interface", host, "--port", "0", "--pictures",
+                             card, "--picture-format", "card", "--cache", tmp_path], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        assert twin.stdout.readline().startswith("twin ")
+        until(lambda: any(card.glob("*")), "the card has no picture")
+        subprocess.run([*program, "capture", tmp_path / "plan.json", "--rig", tmp_path / "rig.json", "--camera", "gphoto2", "--out",
+                        tmp_path / "capture"], check=True, cwd=ROOT, env=virtual_camera(card))
+    finally:
+        twin.kill()
+        twin.wait()
+    pictures = [tmp_path / "capture" / frame.image for frame in Capture.open(tmp_path / "capture").manifest.frames]
+    codes = np.array([images.read_pixels(path) for path in pictures], dtype=np.float64)
+    seen = np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    assert [np.abs(scene.images - each).mean(axis=(1, 2, 3)).argmin() for each in seen] == list(range(lamps))
 
 
 def test_a_card_cannot_lose_a_picture(tmp_path, relit):

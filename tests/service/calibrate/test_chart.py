@@ -8,7 +8,7 @@ import pytest
 
 from service.calibrate.chart import calibrate_chart
 from service.calibrate.solvers.cielab import delta_e_2000
-from service.requests.chart import ChartRequest
+from service.requests.chart import ChartKind, ChartRequest
 from stage.capture.capture import Capture
 from stage.colour.colour import rgb_matrix
 from stage.stack.correction import Correction
@@ -234,6 +234,24 @@ def test_polarised_frames_and_lamps_of_other_colours_have_a_matrix_each(relit, t
     assert "shows the chart in such light" in relit("calibrate", "chart", folder, "--apply-to", other).refused("parallel-polarised light")
 
 
+def test_lamps_of_several_primaries_have_a_matrix_each_and_a_narrow_one_is_refused(relit, tmp_path):
+    """White, red and green, and broad amber LEDs; under deep red alone patches differ in fewer than three colours."""
+    colours = {"white": (1.0, 1.0, 1.0), "red and green": (0.9, 0.7, 0.15), "amber": (1.0, 0.6, 0.25), "deep red": (1.0, 0.02, 0.004)}
+    plain = picture(seen(), POSE)
+    shown = {name: noisy(picture(seen(light), POSE).pixels, number, 0.002) for number, (name, light) in enumerate(colours.items())}
+    broad = list(colours)[:3]
+    folder = shoot(tmp_path / "broad", [shown[name] for name in broad], [lamp(colours[name]) for name in broad])
+    assert relit("calibrate", "chart", folder).out.count("24 of 24 patches") == 3
+    manifest = Capture.open(folder).manifest
+    for frame, name in zip(manifest.frames, broad, strict=True):
+        assert difference(frame.color_matrix or manifest.color_matrix, colours[name]).mean() < 0.5, name
+    folder = shoot(tmp_path / "narrow", [shown["deep red"]], [lamp(colours["deep red"])])
+    before = (folder / "capture.json").read_bytes()
+    corners = ",".join(map(str, plain.corners.round(1).ravel()))
+    relit("calibrate", "chart", folder, "--corners", corners).refused("needs light with red, green and blue")
+    assert (folder / "capture.json").read_bytes() == before
+
+
 @pytest.mark.parametrize("gap", [0.79, 0.94])
 def test_charts_with_other_gaps_are_found(gap, tmp_path):
     shown = picture(seen(), POSE, patch=47 * gap)
@@ -245,7 +263,7 @@ def test_charts_with_other_gaps_are_found(gap, tmp_path):
 def test_the_24_patches_of_an_open_passport_are_found_beside_its_other_page(pose, tmp_path):
     page = [each._replace(colour=EXPOSURE * CAMERA @ each.colour) for each in other_page()]
     shown = picture(seen(), pose._replace(y=pose.y + 70, distance=800), patch=47 * PASSPORT_PATCH, beside=page)
-    found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)])))
+    found = calibrate_chart(ChartRequest(capture=shoot(tmp_path / "cap", [noisy(shown.pixels)]), chart=ChartKind.PASSPORT))
     assert np.abs(found.corners - shown.corners).max() < 0.5 and np.nanmean(found.kinds[0].colors.after) < 1
     assert difference(Capture.open(tmp_path / "cap").manifest.color_matrix).mean() < 0.6
 

@@ -59,7 +59,7 @@ def test_logc4_in_and_acescg_out(relit, logged, tmp_path):
 
 
 @pytest.mark.parametrize(("place", "space"), [
-    (STUDIO, "ARRI LogC4"), ("ocio://cg-config-latest", "ACEScct"), ("minimal", "house gamma")])
+    (STUDIO, "ARRI LogC4"), (STUDIO, "S-Log3 S-Gamut3.Cine"), ("ocio://cg-config-latest", "ACEScct"), ("minimal", "house gamma")])
 def test_frames_are_what_the_processor_of_opencolorio_makes_of_the_images(relit, logged, tmp_path, place, space):
     """In one piece from the codes to ACEScg, by each configuration; and solved without the halves of files, within 1e-5 of the value.
 

@@ -50,10 +50,11 @@ export function mountDome(parent, frames, choose) {
  * Show the lamps of a rig.
  * @param {HTMLElement} parent Takes the diagram.
  * @param {{name: string, direction: number[]}[]} lamps With the direction to each.
+ * @param {(function(number): void) | null} choose Called with the index of a lamp that was clicked.
  * @returns {function({colours: number[][], levels: number[][], words?: string[]}): void} Colours the lamps by linear red, green and blue, 0 to 1; the levels of
  *   the primaries of each lamp, 0 to 1, are said of it, or words.
  */
-export function mountLamps(parent, lamps) {
+export function mountLamps(parent, lamps, choose = null) {
   const places = lamps.map((lamp) => placeOf(lamp.direction));
   const size = 2 * Math.max(1, ...places.map(([x, y]) => Math.hypot(x, y))) + 0.3;
   const svg = shape("svg", { viewBox: `${-size / 2} ${-size / 2} ${size} ${size}`, role: "img", "aria-label": "Lamps, seen from the camera" });
@@ -61,7 +62,10 @@ export function mountLamps(parent, lamps) {
   const radius = Math.min(0.06, 0.8 / Math.sqrt(lamps.length));
   const dots = places.map(([x, y]) => shape("circle", { cx: x, cy: y, r: radius, stroke: "var(--soft)", "stroke-width": 0.006 }));
   const titles = dots.map(() => shape("title", {}));
-  dots.forEach((dot, index) => dot.append(titles[index]));
+  dots.forEach((dot, index) => {
+    dot.append(titles[index]);
+    if (choose !== null) dot.addEventListener("click", () => choose(index));
+  });
   svg.append(...dots);
   parent.replaceChildren(svg);
   return ({ colours, levels, words = null }) => colours.forEach((colour, index) => {

@@ -106,12 +106,15 @@ def count_bytes(page, *left_out: str) -> list[int]:
 
 
 def keep(page, name: str, folder: Path) -> None:
-    """Keep what a page shows as a picture of the documentation, or in a folder of the test; of 256 colours, so that it is small."""
+    """Keep what a page shows as a picture of the documentation, or in a folder of the test; of few colours, so that it is small."""
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     assert np.asarray(picture).std() > 1  # it is not empty
     path = (Path(PICTURES) if PICTURES else folder) / f"page_{name}.png"
-    picture.quantize(256, method=Image.Quantize.MEDIANCUT).save(path, optimize=True)
-    assert path.stat().st_size < 150_000
+    for colours in (256, 128):
+        picture.quantize(colours, method=Image.Quantize.MEDIANCUT).save(path, optimize=True)
+        if path.stat().st_size < 150_000:
+            return
+    raise AssertionError(f"{path} is large: {path.stat().st_size} bytes")
 
 
 class Solved:

@@ -14,7 +14,9 @@ from service.depth.depth import depth
 from service.errors import RequestError
 from service.requests.acquire import AcquireRequest
 from service.requests.depth import DepthRequest
-from stage.formats import exr
+from stage.capture.capture import Capture
+from stage.formats import exr, images
+from stage.patterns.codes import draw
 from tests.service.server.pages.conftest import new_context
 
 RELEASED = "released"
@@ -22,8 +24,8 @@ EXPOSURE = 0.8
 """White does not clip."""
 
 
-def capture_shown(page, request: AcquireRequest, watched: Path):
-    """Return what a capture returns whose camera sees the page: a picture of it for each release."""
+def capture_shown(page, request: AcquireRequest, watched: Path, *, clicked: bool = False):
+    """Return what a capture returns whose camera sees the page, which fills the screen once it is clicked: a picture for each release."""
     told, addresses = threading.Event(), []
 
     def tell(what: str) -> None:
@@ -42,6 +44,9 @@ def capture_shown(page, request: AcquireRequest, watched: Path):
     thread.start()
     assert told.wait(20)
     page.goto(addresses[0])
+    if clicked:
+        page.mouse.click(1, 1)
+        page.wait_for_function("() => document.fullscreenElement !== null")
     taken = 0
     while thread.is_alive():
         thread.join(0.005)
@@ -85,6 +90,21 @@ def test_gray_code_and_phases_are_shown_acknowledged_and_decoded(browser, tmp_pa
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
     assert np.abs(u - columns)[mask].max() <= 0.1  # 8 bits over periods of some 20 pixels
     assert np.abs(v - rows)[mask].max() <= 1e-3  # stripes of one pixel
+
+
+@pytest.mark.long
+def test_each_pixel_of_a_pattern_is_one_of_a_screen_of_high_density(browser, tmp_path, watched):
+    """Two pixels of the screen for each of the page's, which is full screen; stripes of one pixel are exact."""
+    size = 160, 96
+    request = request_of(tmp_path, watched, {"sequences": [{"take": "patterns", "code": "gray", "axis": "both"}]}, size)
+    page = new_context(browser, viewport={"width": size[0] // 2, "height": size[1] // 2}, device_scale_factor=2).new_page()
+    result = capture_shown(page, request, watched, clicked=True)
+    page.context.close()
+    frames = Capture.open(request.out).manifest.frames
+    assert (result.there, result.faults) == (len(frames), ())
+    for frame in frames:
+        seen = images.read_pixels(request.out / frame.image)[..., 0]
+        assert np.array_equal(seen > EXPOSURE / 2, draw(frame.pattern, size) > 0.5), frame.pattern
 
 
 def test_a_window_of_another_size_is_refused(browser, tmp_path, watched):

@@ -5,12 +5,14 @@ import os
 import subprocess
 import sys
 from contextlib import contextmanager, suppress
+from ctypes.util import find_library
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from service.acquisition.cameras.aravis_camera import LIBRARY
 from stage.capture.capture import Capture
 from tests.scenes.captures import make_scene, write_capture
 from tests.scenes.patched_rigs import loopback, write_rig_file
@@ -186,6 +188,8 @@ def test_a_fault_is_named_and_mended(browser, tmp_path):
         assert_accessible(page)
         page.get_by_role("button", name="0006_light_004", exact=True).click()
         page.locator("#picture[data-shown*='0006_light_004']").wait_for()
+        page.evaluate("() => scrollTo(0, 0)")
+        keep(page, "set_fault", tmp_path)
 
         page.get_by_role("button", name="Colour chart: Correct the colours").press("Enter")
         page.locator("#problem", has_text="no chart is found").wait_for()
@@ -229,6 +233,44 @@ def test_what_is_missing_is_added_or_taken_alone_and_a_capture_is_shown_again(br
 
 
 @pytest.mark.long
+def test_brackets_tracking_pictures_and_lamps_are_chosen_on_the_page(browser, tmp_path):
+    """A watched folder sets no exposure times, which its sentence says, and so the plan is judged."""
+    with stage(tmp_path) as (server, captures), opened(browser, server, bypass_csp=True) as page:
+        page.get_by_label("Capture", exact=True).fill("some")
+        page.get_by_label("Plan").fill("olat")
+        page.get_by_text("Exposures, tracking, lamps").click()
+        times, tracking, lamps = (page.get_by_label(name) for name in ("Exposure times", "A tracking picture", "Lamps one by one"))
+        lamps.fill(f"3-{LAMPS + 1}")
+        page.get_by_role("button", name="Take the capture").click()
+        page.wait_for_function("() => !document.getElementById('lights').validity.valid")
+        lamps.fill("3-4, 6")
+        for name in ("lamp 5:", "lamp 6:"):  # the sixth and the seventh
+            page.locator("#dome circle").filter(has_text=name).click()
+        assert lamps.input_value() == "3-4, 7"
+        tracking.fill("2")
+        assert_accessible(page)
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text="6 of 6 pictures").wait_for()
+        lines = [json.loads(line) for line in (captures / "some" / "acquisition.jsonl").read_text().splitlines()]
+        taken = [line["shot"][5:] for line in lines if line.get("event") == "taken"]
+        assert taken == ["tracking", "light_003", "light_004", "tracking", "light_007", "tracking"]
+
+        page.get_by_label("Capture", exact=True).fill("other")
+        lamps.fill("1")
+        tracking.fill("")
+        times.fill("0.05, 0.2")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#problem", has_text="exposures_s").wait_for()  # a watched folder sets none without {exposure_s}
+        plan = json.loads((captures / ".plans" / "other.json").read_text())
+        assert plan["sequences"][0]["exposures_s"] == [0.05, 0.2] and plan["sequences"][0]["lights"] == ["lamp 0"]
+
+        page.get_by_label("Capture", exact=True).fill("some")
+        page.get_by_label("Capture", exact=True).press("Tab")
+        page.wait_for_function("() => document.getElementById('lights').value === '3-4, 7'")
+        assert (tracking.input_value(), times.input_value()) == ("2", "")
+
+
+@pytest.mark.long
 def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
     """A camera that sees the window of the projector pixel by pixel."""
     size, watched, released = (64, 48), tmp_path / "watched", tmp_path / "released"
@@ -257,6 +299,25 @@ def test_patterns_of_a_projector_whose_page_is_shown(browser, tmp_path):
         page.get_by_role("button", name="Solve").click()
         page.get_by_role("link", name="Its maps").wait_for()
         assert "The patterns are decoded." in page.locator("#now").inner_text()
+
+
+@pytest.mark.long
+def test_the_live_view_and_a_capture_of_a_machine_vision_camera(browser, tmp_path):
+    """The camera that Aravis feigns shows a ramp that moves, whatever lamps shine."""
+    if find_library(LIBRARY) is None:
+        pytest.skip("the library Aravis is not installed")
+    rig = write_rig_file(tmp_path / "rig.json", make_scene(size=8, lights=LAMPS).directions, host=loopback(), name="the little dome")
+    with serving(tmp_path / "data", "--anonymous", "--device", "none", "--set", rig, "--camera", "aravis:Fake_1") as server, \
+            opened(browser, server) as page:
+        page.get_by_role("button", name="Live view").click()
+        page.locator("#seen-words", has_text="% clipped").wait_for()
+        page.wait_for_function("() => document.getElementById('seen-picture').naturalWidth > 0")
+        page.get_by_label("Plan").fill("dark")
+        page.get_by_role("button", name="Take the capture").click()
+        page.locator("#now", has_text="1 of 1 pictures").wait_for()
+        assert not page.locator("#seen").is_visible()
+        settings = json.loads((server.data / "set" / "capture" / "report.json").read_text())["camera_settings"]
+        assert settings["DeviceVendorName"] == "Aravis"
 
 
 @pytest.mark.long

@@ -134,7 +134,7 @@ export function mountOutcome(patterns, changed) {
       version = now;
       viewer?.destroy();
       viewer = capture = solved = null;
-      kind = state.plan.split(",").some((word) => patterns.includes(word)) ? "depth" : "solve";
+      kind = state.chosen.plan.split(",").some((word) => patterns.includes(word)) ? "depth" : "solve";
       byId("turning").replaceChildren();
       byId("state").textContent = byId("jobs").textContent = "";
       show(byId("preview"), preview !== undefined);

@@ -17,7 +17,7 @@ byId("rig").textContent = rig.name;
 document.title = `Set: ${rig.name} · Relit`;
 show(byId("live"), rig.live);
 let state = null;
-mountForm(rig.plans, paint);
+mountForm(rig, paint);
 const showSteps = mountSteps(rig.patterns, paint);
 const showShots = mountShots(rig.lamps);
 const showLive = mountLive();

@@ -3,11 +3,12 @@
 import { mountLamps } from "../dome.js";
 import { byId, element, show } from "../element.js";
 import { showPicture } from "./picture.js";
-import { start } from "./plan_form.js";
+import { chosenLamps, start, toggleLamp } from "./plan_form.js";
 
 const MISSING = [0.08, 0.08, 0.08];
 const THERE = [1, 1, 1];
 const FAULTY = [1, 0.02, 0.02];
+const CHOSEN = [0.1, 0.3, 1];
 
 /** Show the picture of a shot. */
 function look(shot) {
@@ -33,7 +34,7 @@ function row(shot, lamps, running) {
 
 /** Return a function that shows the pictures; rows that have not changed stay, and with them the focus of the keyboard. */
 export function mountShots(lamps) {
-  const colour = mountLamps(byId("dome"), lamps);
+  const colour = mountLamps(byId("dome"), lamps, toggleLamp);
   const body = byId("shots");
   let followed = null; // the picture that was shown because it was the last one
   return (state) => {
@@ -47,7 +48,8 @@ export function mountShots(lamps) {
       return made;
     }));
     const ofLamp = lamps.map((_, index) => state.shots.find((shot) => shot.lamp === index && shot.step === "object") ?? state.shots.find((shot) => shot.lamp === index));
-    colour({ colours: ofLamp.map((shot) => (!shot?.taken ? MISSING : shot.faults.length ? FAULTY : THERE)), levels: [],
+    const chosen = chosenLamps() ?? [];
+    colour({ colours: ofLamp.map((shot, index) => (!shot?.taken ? chosen.includes(index) ? CHOSEN : MISSING : shot.faults.length ? FAULTY : THERE)), levels: [],
       words: ofLamp.map((shot) => (shot === undefined ? "not in the plan" : wordsOf(shot))) });
     const taken = state.shots.filter((shot) => shot.taken);
     const shown = byId("picture").alt;
