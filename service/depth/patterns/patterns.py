@@ -19,6 +19,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import contradiction
+from service.depth.patterns.lag import find_lag
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
@@ -99,6 +100,7 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
             for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
                 coordinates.put(band, mask[band], decoded)
                 timings.advance(band.stop)
+            warnings += _widen_lagging(planes, codes, coordinates, noise)[0]
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
         moved = _moved(planes, mask, capture, codes.collected, noise)
@@ -232,6 +234,8 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
         for name in maps:
             maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
+    lagging, wider = _widen_lagging(planes, codes, coordinates, noise)
+    maps["sigma"] *= wider
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
             missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
@@ -248,10 +252,26 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              projector_u=None if u is None else u.coordinate, projector_v=None if v is None else v.coordinate,
                              sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
                              amplitude=coordinates.amplitude, facts=facts)
+    solution.warnings += lagging
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
     if u is not None and v is not None:
         _widen(solution, u, v, capture, projector)
     return solution, right
+
+
+def _widen_lagging(planes: Planes, codes: PatternCodes, coordinates: Coordinates, noise: NoiseModel) -> tuple[list[str], np.ndarray]:
+    """Add to the deviations of places what light below surfaces makes; return what is said of it, and the factor by which that widens the
+    depth's, [rows, cols]."""
+    said, wider = [], np.ones_like(coordinates.amplitude)
+    for decoder, axis in ((codes.columns, coordinates.columns), (codes.rows, coordinates.rows)):
+        found = None if decoder is None or axis is None else find_lag(planes, axis, decoder, codes.collected, noise)
+        if found is not None:
+            assert axis is not None and decoder is not None
+            sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, found.sigma), 0)
+            wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
+            axis.sigma[:] = sigma
+            said.append(found.sentence(decoder.axis))
+    return said, wider
 
 
 def _widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, capture: Capture, projector: Projector) -> None:
