@@ -188,6 +188,34 @@ def _slstudio_phase(projector: tuple[int, int], axes: tuple[str, ...], parts: tu
     return entries
 
 
+def _columns_alone(axes: tuple[str, ...]) -> None:
+    """Refuse rows of codecs that project columns alone."""
+    if axes != ("column",):
+        raise ManifestError("--axis: SLStudio's micro and modulated patterns code columns alone")
+
+
+SLSTUDIO_MICRO = (75.02, 70.0, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80.0)
+"""Periods of SLStudio's CodecPhaseShiftMicro in projector pixels, whatever the projector: three shifts of the first, one of each other."""
+
+
+def _slstudio_micro(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """SLStudio's CodecPhaseShiftMicro: the first wave moves back from step to step, and every second of the others is inverted."""
+    _columns_alone(axes)
+    first, *others = SLSTUDIO_MICRO
+    return [*PhaseStack(axes=axes, periods_px=(first,), steps=3, advancing=False).entries(),
+            *({"code": "phase", "axis": "column", "period_px": period, "step": 0 if number % 2 else 2, "steps": 4}
+              for number, period in enumerate(others))]
+
+
+def _slstudio_modulated(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """SLStudio's CodecPhaseShiftModulated: three shifts of eight waves, each at three of sixteen waves across, then three of one wave."""
+    _columns_alone(axes)
+    width, height = projector
+    return [*({"code": "modulated", "axis": "column", "period_px": width / 8, "step": step, "steps": 3, "carrier_period_px": height / 16,
+               "carrier_step": carrier, "carrier_steps": 3} for step in range(3) for carrier in range(3)),
+            *PhaseStack(axes=axes, periods_px=(float(width),), steps=3).entries()]
+
+
 def _opencv_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
     """OpenCV's GrayCodePattern, and the programs after it: pairs of the columns, pairs of the rows, white, black."""
     return GrayStack(sequence=(*(f"{axis}s" for axis in axes), "white", "black")).entries(projector)
@@ -199,9 +227,11 @@ CODECS: dict[str, Callable[[tuple[int, int], tuple[str, ...]], list[Entry]]] = {
     "slstudio-phase-2x3": lambda projector, axes: _slstudio_phase(projector, axes, (16, 1), 3),
     "slstudio-phase-3": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 3),
     "slstudio-phase-4": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 4),
+    "slstudio-micro": _slstudio_micro,
+    "slstudio-modulated": _slstudio_modulated,
 }
 """The orders of scanning programs: of the projector's size and the axes, the patterns in the order of the images."""
-HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4")
+HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4", "slstudio-micro", "slstudio-modulated")
 """Codecs whose waves have their phase 0 at the centre of the first pixel: their coordinates are 0.5 smaller than those of the manifest, as
 those of their calibration are, whose principal point then stays as it is."""
 

@@ -176,6 +176,8 @@ class Codec(Choice):
     SLSTUDIO_PHASE_2X3 = "slstudio-phase-2x3", "three steps of 16 periods, three of one"
     SLSTUDIO_PHASE_3 = "slstudio-phase-3", "three steps of one period"
     SLSTUDIO_PHASE_4 = "slstudio-phase-4", "four steps of one period"
+    SLSTUDIO_MICRO = "slstudio-micro", "three steps of one of ten short periods, one of each other"
+    SLSTUDIO_MODULATED = "slstudio-modulated", "three steps of eight periods at three of a carrier, three of one period"
 
 
 class ScannerImport(ImportRequest):

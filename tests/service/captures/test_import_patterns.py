@@ -138,18 +138,26 @@ def test_a_phase_with_a_gray_code(relit, tmp_path):
     assert maps.mask[LIT].mean() > 0.97 and error(maps).max() < 0.2 * COLUMN_M
 
 
-@pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3"])
+@pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3", "slstudio-micro", "slstudio-modulated"])
 def test_slstudio(relit, tmp_path, codec):
     """frameSeq_0.bmp … as its scan worker writes them, with its calibration.xml; waves begin at the centre of the first column."""
     calibration = write_calibration(tmp_path / "calibration.xml", SLSTUDIO, **SIZES)
     if codec == "slstudio-gray":
         levels = [WHITE, BLACK, *(gray(U, bit) for bit in range(6, -1, -1))]
+    elif codec == "slstudio-micro":
+        levels = [*(wave(U - 0.5, 75.02, step / 3) for step in range(3)),
+                  *(wave(U - 0.5, period, turns) for period, turns in zip((70, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80),
+                                                                          (0.5, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0.5), strict=True))]
+    elif codec == "slstudio-modulated":
+        levels = [*(wave(U - 0.5, PROJECTOR.width / 8, -step / 3) * wave(V - 0.5, PROJECTOR.height / 16, -across / 3)
+                    for step in range(3) for across in range(3)),
+                  *(wave(U - 0.5, PROJECTOR.width, -step / 3) for step in range(3))]
     else:
         levels = [wave(U - 0.5, PROJECTOR.width / parts, -step / 3) for parts in (16, 1) for step in range(3)]
     write_stack(tmp_path, levels, "frameSeq_{}.bmp")
     maps, _ = depth_of(relit, tmp_path, "scanner", "--calibration", calibration, "--codec", codec, "--unit-m", "0.001")
     assert maps.mask[LIT].mean() > 0.9
-    assert np.median(error(maps)) < (0.05 if "phase" in codec else 0.5) * COLUMN_M  # half a column of the waves would be 0.5
+    assert np.median(error(maps)) < (0.5 if codec == "slstudio-gray" else 0.05) * COLUMN_M  # half a column of the waves would be 0.5
 
 
 @pytest.mark.parametrize(("words", "message"), [
@@ -163,6 +171,7 @@ def test_slstudio(relit, tmp_path, codec):
     (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--gray-images", "x*", "--gray-stripe", "8"), "names 0 images"),
     (("phase", "--projector", SIZE, "--periods", "16", "--steps", "5", "--calibration", "RIG"),
      "is of a camera of 96x72 px, this one has 9x8"),
+    (("scanner", "--codec", "slstudio-micro", "--unit-m", "1", "--calibration", "RIG", "--axis", "both"), "code columns alone"),
     (("scanner", "--codec", "slstudio-gray", "--unit-m", "1", "--calibration", "NOSIZE"), "does not say how many pixels the projector has"),
 ])
 def test_faults_are_named_and_nothing_is_written(relit, tmp_path, words, message):
