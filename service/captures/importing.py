@@ -24,6 +24,7 @@ from service.requests.imports.patterns import (
     PhaseShift,
     RigOptions,
     ScannerImport,
+    StereoImport,
     WaveOrigin,
 )
 from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
@@ -205,10 +206,17 @@ def _selection(request: ImageOptions) -> "Selection":
     return Selection(images=request.images, mask=request.mask, ambient=request.ambient)
 
 
+def _stereo(request: StereoImport) -> Imported:
+    from stage.importers.stereo import import_pair
+
+    return import_pair(request.source, request.right, request.destination, calibration=request.calibration, extrinsics=request.extrinsics,
+                       unit_m=request.unit_m, color_space=request.color_space)
+
+
 _IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
     DiligentImport: _diligent, LpImport: _lp, RelightlabImport: _relightlab, OlatImport: _olat, PhotosImport: _photos,
     NearLightsImport: _near_lights, OpencvGrayImport: _opencv_gray, GrayImport: _gray, PhaseImport: _phase, ScannerImport: _scanner,
-    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser}
+    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser, StereoImport: _stereo}
 
 
 def propose(folder: Path) -> dict[str, Any]:

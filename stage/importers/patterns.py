@@ -16,10 +16,10 @@ from stage.importers.opencv_file import camera_from_projector, lens, pick, read_
 from stage.importers.pattern_order import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
 
-CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc")
-CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc")
-PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2", "Kp")
-PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2", "kp")
+CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc", "left_camera_matrix", "K_left")
+CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc", "left_distortion", "D_left")
+PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2", "Kp", "right_camera_matrix", "K_right")
+PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2", "kp", "right_distortion", "D_right")
 ROTATION, TRANSLATION = ("R", "rotation", "roatation", "Rp"), ("T", "translation", "t", "Tp")
 """The names under which calibration files hold these matrices and vectors, in order of preference; one common tool misspells, and those
 with a small p or c at the end are SLStudio's."""
@@ -29,24 +29,28 @@ PIXEL_CENTRE = 0.5
 """The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
 
-def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
-    """Return the camera and the projector of the manifest from an OpenCV calibration file."""
+def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float, *,
+                         second: str = "projector", extrinsics: Path | None = None) -> dict[str, Any]:
+    """Return the camera and the projector of the manifest from an OpenCV calibration file.
+    `second`: what stands in the place of the projector, for messages. `extrinsics`: file of R and T; None: the same."""
     found = read_matrices(path)
+    if extrinsics is not None:
+        found |= {name: value for name, value in read_matrices(extrinsics).items() if name in (*ROTATION, *TRANSLATION)}
     rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
     translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
     pose = camera_from_projector(rotation, translation)
     entries = {}
-    for what, matrix, coefficients, sides, size in (
-            ("camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
-            ("projector", PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
+    for entry, what, matrix, coefficients, sides, size in (
+            ("camera", "camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
+            ("projector", second, PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
         given = _size(found, sides)
         if given is not None and given != tuple(size):
             raise ManifestError(f"{path}: is of a {what} of {given[0]}x{given[1]} px, this one has {size[0]}x{size[1]}")
         k = pick(found, matrix, path, f"matrix of the {what}", shape=(3, 3))
         known = any(name in found for name in coefficients)
         glass = lens(pick(found, coefficients, path, "distortion"), path, what) if known else Distortion(model="brown_conrady")
-        entries[what] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
-                         "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
+        entries[entry] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
+                          "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
     return {"camera": {"projection": "perspective", **entries["camera"]},
             "projector": {**entries["projector"], "camera_from_projector": pose.tolist()}}
 
