@@ -94,15 +94,17 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
         warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
+        declared = not any(sentence.startswith("frames:") for sentence in warnings)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
             timings.stage("decode", mask.shape[0])
             for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
                 coordinates.put(band, mask[band], decoded)
                 timings.advance(band.stop)
-            warnings += _widen_lagging(planes, codes, coordinates, noise)[0]
+            warnings += _widen_lagging(planes, codes, coordinates, noise)[0] if declared else []
         else:
-            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
+            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
+                                     declared=declared)
         moved = _moved(planes, mask, capture, codes.collected, noise)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
@@ -212,8 +214,10 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
 
 
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
-           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
-    """Return the depth of each pixel and its probability to be right; fill the coordinates."""
+           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
+           declared: bool) -> tuple[DepthSolution, np.ndarray]:
+    """Return the depth of each pixel and its probability to be right; fill the coordinates.
+    `declared`: whether the frames are what the manifest declares, as far as a sample has told."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
@@ -234,7 +238,7 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
         for name in maps:
             maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
-    lagging, wider = _widen_lagging(planes, codes, coordinates, noise)
+    lagging, wider = _widen_lagging(planes, codes, coordinates, noise) if declared else ([], np.float32(1))
     maps["sigma"] *= wider
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
