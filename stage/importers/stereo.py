@@ -34,8 +34,8 @@ def import_pair(left: Path, right: Path, destination: Path | None, *, calibratio
     if destination is None and folder not in (left.resolve().parent, left.resolve()):
         raise ManifestError(f"{left}: does not lie beside {right}: name a folder for the capture")
     names = [[path.relative_to(folder).as_posix() for path in side] for side in shown]
-    sizes = [image_resolution(side[0]) for side in shown]
-    rig = camera_and_projector(calibration, *sizes, unit_m, second="second camera", extrinsics=extrinsics)
+    first, second = (image_resolution(side[0]) for side in shown)
+    rig = camera_and_projector(calibration, first, second, unit_m, second="second camera", extrinsics=extrinsics)
     pose = np.array(rig["projector"].pop("camera_from_projector"))
     space = color_space or color_space_of(shown[0][0])
     data: dict[str, Any] = {

@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from kernels.structured.pattern_frames import NoiseModel
 from kernels.structured.phase import weights
-from service.depth.patterns.coordinates import AxisMaps
+from service.depth.patterns.coordinates import AxisMaps, Coordinates
 from service.depth.patterns.decoders import AxisDecoder
 from stage.colour.colour import GREY_WEIGHTS
 from stage.patterns.binary import BinaryCode
@@ -77,6 +77,22 @@ class Lags(NamedTuple):
         if not found.size or found.size < CLEAR_SHARE * size.size or abs(np.sign(found).mean()) < 2 * ONE_WAY - 1:
             return None
         return float(np.median(np.abs(found))), found.size / size.size
+
+
+def widen_lagging(planes: Planes, coordinates: Coordinates, decoders: Sequence[AxisDecoder | None], collected: Collected,
+                  noise: NoiseModel) -> tuple[list[str], np.ndarray]:
+    """Add to the deviations of places what light below surfaces makes; return what is said of it, and the factor by which that widens the
+    depth's, [rows, cols]. `decoders`: of columns and of rows."""
+    said, wider = [], np.ones_like(coordinates.amplitude)
+    for decoder, axis in zip(decoders, (coordinates.columns, coordinates.rows), strict=True):
+        found = None if decoder is None or axis is None else find_lag(planes, axis, decoder, collected, noise)
+        if found is not None:
+            assert axis is not None and decoder is not None
+            sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, found.sigma), 0)
+            wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
+            axis.sigma[:] = sigma
+            said.append(found.sentence(decoder.axis))
+    return said, wider
 
 
 def find_lag(planes: Planes, axis: AxisMaps, decoder: AxisDecoder, collected: Collected, noise: NoiseModel) -> LagFinding | None:

@@ -19,7 +19,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import contradiction
-from service.depth.patterns.lag import find_lag
+from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
@@ -101,7 +101,8 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
             for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
                 coordinates.put(band, mask[band], decoded)
                 timings.advance(band.stop)
-            warnings += _widen_lagging(planes, codes, coordinates, noise)[0] if declared else []
+            if declared:
+                warnings += widen_lagging(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)[0]
         else:
             solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
                                      declared=declared)
@@ -238,8 +239,10 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
         for name in maps:
             maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
-    lagging, wider = _widen_lagging(planes, codes, coordinates, noise) if declared else ([], np.float32(1))
-    maps["sigma"] *= wider
+    lagging: list[str] = []
+    if declared:
+        lagging, wider = widen_lagging(planes, coordinates, (columns, rows), codes.collected, noise)
+        maps["sigma"] *= wider
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
             missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
@@ -261,21 +264,6 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
     if u is not None and v is not None:
         _widen(solution, u, v, capture, projector)
     return solution, right
-
-
-def _widen_lagging(planes: Planes, codes: PatternCodes, coordinates: Coordinates, noise: NoiseModel) -> tuple[list[str], np.ndarray]:
-    """Add to the deviations of places what light below surfaces makes; return what is said of it, and the factor by which that widens the
-    depth's, [rows, cols]."""
-    said, wider = [], np.ones_like(coordinates.amplitude)
-    for decoder, axis in ((codes.columns, coordinates.columns), (codes.rows, coordinates.rows)):
-        found = None if decoder is None or axis is None else find_lag(planes, axis, decoder, codes.collected, noise)
-        if found is not None:
-            assert axis is not None and decoder is not None
-            sigma = np.where(axis.sigma > 0, np.hypot(axis.sigma, found.sigma), 0)
-            wider = np.maximum(wider, sigma / np.maximum(axis.sigma, 1e-12))
-            axis.sigma[:] = sigma
-            said.append(found.sentence(decoder.axis))
-    return said, wider
 
 
 def _widen(solution: DepthSolution, u: AxisMaps, v: AxisMaps, capture: Capture, projector: Projector) -> None:
