@@ -38,6 +38,9 @@ texture and edges make lags of both directions."""
 EDGE_TIMES, DIMMED_TIMES = 2.0, 0.7
 """What the lag of stripes, and the width of light that dims a wave as much as it is dimmed, count as a standard deviation of the place:
 between what is right for light that runs near and far."""
+LARGEST_PART, OWN_SIGMAS = 1 / 6, 3.0
+"""Lag of a pixel by itself, as a part of the shortest period, and its standard deviations beyond, above which the pixel is left out: its
+periods are counted wrongly."""
 NEAR_PART, FAR_PART = 0.25, 0.5
 """Distances of pixels from the edge of a stripe, as parts of the finest stripe, that tell where the edge crosses the mean of white and
 black, and where half of the light has come."""
@@ -175,9 +178,11 @@ def _wave_sums(grey: np.ndarray, place: np.ndarray, phase: PhaseCode, noise: Noi
     fitted = np.linalg.solve(across @ others + 1e-9 * np.eye(4), across @ np.stack([wanted, readings], axis=2))
     rest = wanted - (others @ fitted[:, :, :1])[:, :, 0]
     amplitude, level = fitted[:, 1, 1], np.maximum(fitted[:, 0, 1], 0)
+    along = amplitude * (rest * readings).sum(axis=1)
     weight = amplitude**2 * (rest**2).sum(axis=1)
-    return np.stack([amplitude * (rest * readings).sum(axis=1), weight, weight * (noise.read**2 + noise.gain * level),
-                     amplitude * fitted[:, 3, 1], amplitude**2])
+    variance = weight * (noise.read**2 + noise.gain * level)
+    largest = LARGEST_PART * min(phase.periods_px) * weight + OWN_SIGMAS * np.sqrt(variance)
+    return np.where(np.abs(along) <= largest, np.stack([along, weight, variance, amplitude * fitted[:, 3, 1], amplitude**2]), 0)
 
 
 def _wave_lag(means: np.ndarray, count: np.ndarray, phase: PhaseCode) -> Lags:
