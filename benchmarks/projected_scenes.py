@@ -91,6 +91,8 @@ class World:
     """Part of the light that runs below the surface, to one side, before it leaves it."""
     scatter_px: float = 6.0
     """Mean distance of that, projector pixels."""
+    flights: int = 1
+    """Number of straight ways of that light between two turns: 1 leaves most of it near, more move all of it aside."""
     read_noise: float = 0.003
     electrons: float = 10000.0
     """At full scale."""
@@ -241,7 +243,8 @@ def images(world: World, light: Light, patterns: Sequence[Pattern]) -> np.ndarra
         light_of, then = (draw(each, world.rig.projector).astype(np.float64) ** world.gamma for each in (pattern, following))
         shown = _focus((1 - world.mixed) * light_of + world.mixed * then, world.blur_px)
         if world.scattered:
-            kernel = np.exp(-np.arange(8 * world.scatter_px * FINE) / (world.scatter_px * FINE))
+            away = np.arange(8 * world.scatter_px * FINE) / (world.scatter_px * FINE)
+            kernel = away ** (world.flights - 1) * np.exp(-away * world.flights)
             below = convolve1d(shown, kernel / kernel.sum(), axis=1, mode="nearest", origin=-(len(kernel) // 2))
             shown = (1 - world.scattered) * shown + world.scattered * below
         recorded = np.bincount(light.pixel, light.weight * shown[row, column], width * height) * world.light

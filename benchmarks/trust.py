@@ -42,6 +42,8 @@ HEAD = """# How far confidence can be trusted
 - *Far out*: part of solved pixels that are off by more than five σ (normals: and by more than five degrees).
 - *Error, all and best half*: mean error of the solved pixels, and of the half of them with the highest confidence.
 - *Model*: whether the scene is one that the method's model describes.
+- No sentence and no σ tells of a light source of a time-of-flight camera that stands aside and is not declared: it makes all frequencies
+  wrong by the same length, so that nothing in the frames contradicts it.
 
 """
 COLUMNS = ("| scene | model | pixels | solved | \\|e\\| / σ | far out | error, all | best half | confidence, median |\n"

@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,9 @@ PROJECTORS = {"": (0.0, 0.0, 1.0), ", projector declared 1° aside": (1.0, 0.0, 
               ", focal length declared 4 % longer": (0.0, 0.0, 1.04)}
 """Yaw and roll in degrees and the factor of the focal length by which the projector is declared wrongly."""
 GAMMA = 2.2
+BELOW: dict[str, dict[str, Any]] = {"30 % of the light": {"scattered": 0.3}, "90 % of the light": {"scattered": 0.9},
+                                    "70 % of the light 2 px far, scattered twice,": {"scattered": 0.7, "scatter_px": 2.0, "flights": 2}}
+"""Parts of the light that run below the surface, 6 px far where nothing else is said."""
 NOISES = {"": (0.003, 10000.0), ", weak light": (0.006, 2500.0)}
 """Read noise as a part of full scale, and electrons at full scale."""
 
@@ -85,11 +89,9 @@ def trials(data: Path | None) -> Iterator[Trial]:
     for name, part in (("phase 16, 4 steps, Gray", 0.2), ("phase 16/18/21, 3 steps", 0.3)):
         yield _run(f"{name}, {part:g} of the next pattern in each frame", False, World(shapes=SHELF, mixed=part), CODES[name], light)
 
-
-    for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray"):
-        for part in (0.3, 0.9):
-            yield _run(f"{name}, {100 * part:.0f} % of the light below the surface", False, World(shapes=SHELF, scattered=part),
-                       CODES[name], light)
+    for name in ("phase 16/18/21, 4 steps", "phase 16, 4 steps, Gray", "micro"):
+        for words, below in BELOW.items():
+            yield _run(f"{name}, {words} below the surface", False, World(shapes=SHELF, **below), CODES[name], light)
 
 
 def _turn(first: int, second: int, degrees: float) -> np.ndarray:

@@ -4,6 +4,7 @@ Uploaded files that are no capture get a proposal first: what they seem to be, a
 untrusted files: `service.captures.check_process` calls them in a process of its own.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.requests.base.base import Role
 from service.requests.base.import_choices import ImportChoices
-from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions
+from service.requests.imports.base import ImageOptions, ImportRequest, LensOptions, LightScale
 from service.requests.imports.layouts import LAYOUTS, options_of_layout, request_of, taken_apart, unsettled
 from service.requests.imports.lights import DiligentImport, LpImport, NearLightsImport, OlatImport, PhotosImport, RelightlabImport, Sense
 from service.requests.imports.patterns import (
@@ -24,11 +25,13 @@ from service.requests.imports.patterns import (
     PhaseShift,
     RigOptions,
     ScannerImport,
+    StereoImport,
     WaveOrigin,
 )
 from service.requests.imports.tof import ArrayOptions, HistogramImport, KinectImport, Signal, TofImport
 from service.requests.patterns import PatternAxis
-from stage.capture.manifest import read_manifest, write_manifest
+from stage.capture.light import DistantLight
+from stage.capture.manifest import Frame, read_manifest, write_manifest
 from stage.errors import ManifestError
 from stage.importers.guess import guess
 from stage.importers.layout import Imported
@@ -47,9 +50,20 @@ def import_files(request: ImportRequest, assumed: tuple[str, ...] = ()) -> Impor
     imported = _IMPORTS[type(request)](request)
     manifest = read_manifest(imported.path)
     more = tuple(sentence for sentence in assumed if sentence not in manifest.assumed)
-    if more:
-        write_manifest(manifest.model_copy(update={"assumed": (*manifest.assumed, *more)}), imported.path)
+    changed: dict[str, Any] = {"assumed": (*manifest.assumed, *more)} if more else {}
+    if isinstance(request, LightScale) and request.scale is not None:
+        changed |= {"irradiance_scale": "absolute", "frames": tuple(_lit_by(each, math.pi * request.scale) for each in manifest.frames)}
+    if changed:
+        write_manifest(manifest.model_copy(update=changed), imported.path)
     return imported
+
+
+def _lit_by(frame: Frame, factor: float) -> Frame:
+    """Return a frame whose far light is so many times as strong."""
+    if not isinstance(frame.light, DistantLight):
+        return frame
+    light = frame.light.model_copy(update={"irradiance": tuple(factor * value for value in frame.light.irradiance)})
+    return frame.model_copy(update={"light": light})
 
 
 def _diligent(request: DiligentImport) -> Imported:
@@ -205,10 +219,17 @@ def _selection(request: ImageOptions) -> "Selection":
     return Selection(images=request.images, mask=request.mask, ambient=request.ambient)
 
 
+def _stereo(request: StereoImport) -> Imported:
+    from stage.importers.stereo import import_pair
+
+    return import_pair(request.source, request.right, request.destination, calibration=request.calibration, extrinsics=request.extrinsics,
+                       unit_m=request.unit_m, color_space=request.color_space)
+
+
 _IMPORTS: dict[type[ImportRequest], Callable[[Any], Imported]] = {
     DiligentImport: _diligent, LpImport: _lp, RelightlabImport: _relightlab, OlatImport: _olat, PhotosImport: _photos,
     NearLightsImport: _near_lights, OpencvGrayImport: _opencv_gray, GrayImport: _gray, PhaseImport: _phase, ScannerImport: _scanner,
-    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser}
+    TofImport: _tof, HistogramImport: _histogram, KinectImport: _kinect, LaserImport: _laser, StereoImport: _stereo}
 
 
 def propose(folder: Path) -> dict[str, Any]:

@@ -142,7 +142,7 @@ def _parameters(models: list[type[Options]], without: frozenset[Role], own: list
     places: list[tuple[tuple[bool, bool, int], inspect.Parameter]] = []
     for (option, model), *others in found.values():
         required = 1 + len(others) == len(models) and all(each.field.is_required() for each, _ in [(option, model), *others])
-        place = (False, False, 0) if option.spelling.argument else (True, not required, ORDER.index(option.role))
+        place = (False, not required, 0) if option.spelling.argument else (True, not required, ORDER.index(option.role))
         places.append((place, _parameter(option, required, words(option, model))))
     places += [((True, parameter.default is not inspect.Parameter.empty, ORDER.index(Role.RUN)), parameter) for parameter in own]
     return [parameter for _, parameter in sorted(places, key=lambda entry: entry[0])]

@@ -153,7 +153,8 @@ def write_capture(data: dict[str, Any], table: Path, destination: Path, *, folde
         target = destination / name
         if target.exists() and inputs.read_bytes(target) != content:
             raise ManifestError(f"{target}: is there already and is another array: choose another folder")
-    names = [frame.image for frame in manifest.frames if frame.image not in made]
+    names = [name for frame in manifest.frames for name in (frame.image, *(frame.stereo.images if frame.stereo is not None else ()))
+             if name not in made]
     place_images(folder or table.parent, destination, [*names, *([manifest.mask] if manifest.mask else [])])
     for name, content in made.items():
         with replacing(destination / name) as temporary:

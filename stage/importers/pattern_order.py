@@ -112,8 +112,8 @@ def describe(entries: Sequence[Entry]) -> str:
         match entry["code"]:
             case "gray":
                 text = f"Gray code of {entry['axis']}s, {entry['bits']} bits"
-            case "phase":
-                text = f"phase of {entry['axis']}s, {entry['steps']} steps"
+            case "phase" | "modulated":
+                text = f"{'modulated ' if entry['code'] == 'modulated' else ''}phase of {entry['axis']}s, {entry['steps']} steps"
             case other:
                 text = other
         if text not in words:

@@ -16,10 +16,10 @@ from stage.importers.opencv_file import camera_from_projector, lens, pick, read_
 from stage.importers.pattern_order import Entry, GrayStack, PhaseStack, describe, gray_entries
 from stage.importers.video import VideoFrames
 
-CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc")
-CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc")
-PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2", "Kp")
-PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2", "kp")
+CAMERA_MATRIX = ("cam_K", "cam_int", "camera_matrix", "cameraMatrix1", "M1", "K1", "mtx1", "Kc", "left_camera_matrix", "K_left")
+CAMERA_LENS = ("cam_kc", "cam_dist", "distortion_coefficients", "distCoeffs1", "D1", "dist1", "kc", "left_distortion", "D_left")
+PROJECTOR_MATRIX = ("proj_K", "proj_int", "projector_matrix", "cameraMatrix2", "M2", "K2", "mtx2", "Kp", "right_camera_matrix", "K_right")
+PROJECTOR_LENS = ("proj_kc", "proj_dist", "projector_distortion", "distCoeffs2", "D2", "dist2", "kp", "right_distortion", "D_right")
 ROTATION, TRANSLATION = ("R", "rotation", "roatation", "Rp"), ("T", "translation", "t", "Tp")
 """The names under which calibration files hold these matrices and vectors, in order of preference; one common tool misspells, and those
 with a small p or c at the end are SLStudio's."""
@@ -29,24 +29,28 @@ PIXEL_CENTRE = 0.5
 """The image coordinate of the centre of the first pixel, which is 0 in OpenCV."""
 
 
-def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float) -> dict[str, Any]:
-    """Return the camera and the projector of the manifest from an OpenCV calibration file."""
+def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tuple[int, int], unit_m: float, *,
+                         second: str = "projector", extrinsics: Path | None = None) -> dict[str, Any]:
+    """Return the camera and the projector of the manifest from an OpenCV calibration file.
+    `second`: what stands in the place of the projector, for messages. `extrinsics`: file of R and T; None: the same."""
     found = read_matrices(path)
+    if extrinsics is not None:
+        found |= {name: value for name, value in read_matrices(extrinsics).items() if name in (*ROTATION, *TRANSLATION)}
     rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
     translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
     pose = camera_from_projector(rotation, translation)
     entries = {}
-    for what, matrix, coefficients, sides, size in (
-            ("camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
-            ("projector", PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
+    for entry, what, matrix, coefficients, sides, size in (
+            ("camera", "camera", CAMERA_MATRIX, CAMERA_LENS, CAMERA_SIZE, resolution),
+            ("projector", second, PROJECTOR_MATRIX, PROJECTOR_LENS, PROJECTOR_SIZE, projector)):
         given = _size(found, sides)
         if given is not None and given != tuple(size):
             raise ManifestError(f"{path}: is of a {what} of {given[0]}x{given[1]} px, this one has {size[0]}x{size[1]}")
         k = pick(found, matrix, path, f"matrix of the {what}", shape=(3, 3))
         known = any(name in found for name in coefficients)
         glass = lens(pick(found, coefficients, path, "distortion"), path, what) if known else Distortion(model="brown_conrady")
-        entries[what] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
-                         "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
+        entries[entry] = {"resolution": list(size), "focal_px": [k[0, 0], k[1, 1]],
+                          "principal_px": [k[0, 2] + PIXEL_CENTRE, k[1, 2] + PIXEL_CENTRE], "distortion": glass.model_dump()}
     return {"camera": {"projection": "perspective", **entries["camera"]},
             "projector": {**entries["projector"], "camera_from_projector": pose.tolist()}}
 
@@ -188,6 +192,34 @@ def _slstudio_phase(projector: tuple[int, int], axes: tuple[str, ...], parts: tu
     return entries
 
 
+def _columns_alone(axes: tuple[str, ...]) -> None:
+    """Refuse rows of codecs that project columns alone."""
+    if axes != ("column",):
+        raise ManifestError("--axis: SLStudio's micro and modulated patterns code columns alone")
+
+
+SLSTUDIO_MICRO = (75.02, 70.0, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80.0)
+"""Periods of SLStudio's CodecPhaseShiftMicro in projector pixels, whatever the projector: three shifts of the first, one of each other."""
+
+
+def _slstudio_micro(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """SLStudio's CodecPhaseShiftMicro: the first wave moves back from step to step, and every second of the others is inverted."""
+    _columns_alone(axes)
+    first, *others = SLSTUDIO_MICRO
+    return [*PhaseStack(axes=axes, periods_px=(first,), steps=3, advancing=False).entries(),
+            *({"code": "phase", "axis": "column", "period_px": period, "step": 0 if number % 2 else 2, "steps": 4}
+              for number, period in enumerate(others))]
+
+
+def _slstudio_modulated(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
+    """SLStudio's CodecPhaseShiftModulated: three shifts of eight waves, each at three of sixteen waves across, then three of one wave."""
+    _columns_alone(axes)
+    width, height = projector
+    return [*({"code": "modulated", "axis": "column", "period_px": width / 8, "step": step, "steps": 3, "carrier_period_px": height / 16,
+               "carrier_step": carrier, "carrier_steps": 3} for step in range(3) for carrier in range(3)),
+            *PhaseStack(axes=axes, periods_px=(float(width),), steps=3).entries()]
+
+
 def _opencv_gray(projector: tuple[int, int], axes: tuple[str, ...]) -> list[Entry]:
     """OpenCV's GrayCodePattern, and the programs after it: pairs of the columns, pairs of the rows, white, black."""
     return GrayStack(sequence=(*(f"{axis}s" for axis in axes), "white", "black")).entries(projector)
@@ -199,9 +231,11 @@ CODECS: dict[str, Callable[[tuple[int, int], tuple[str, ...]], list[Entry]]] = {
     "slstudio-phase-2x3": lambda projector, axes: _slstudio_phase(projector, axes, (16, 1), 3),
     "slstudio-phase-3": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 3),
     "slstudio-phase-4": lambda projector, axes: _slstudio_phase(projector, axes, (1,), 4),
+    "slstudio-micro": _slstudio_micro,
+    "slstudio-modulated": _slstudio_modulated,
 }
 """The orders of scanning programs: of the projector's size and the axes, the patterns in the order of the images."""
-HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4")
+HALF_PIXEL = ("slstudio-phase-2x3", "slstudio-phase-3", "slstudio-phase-4", "slstudio-micro", "slstudio-modulated")
 """Codecs whose waves have their phase 0 at the centre of the first pixel: their coordinates are 0.5 smaller than those of the manifest, as
 those of their calibration are, whose principal point then stays as it is."""
 

@@ -13,6 +13,7 @@ from service.cli.request_commands import local_command
 from service.requests.imports.base import ImportRequest
 from service.requests.imports.interleaved import InterleavedImport
 from service.requests.imports.layouts import LAYOUTS, request_of, taken_apart
+from service.requests.imports.patterns import StereoImport
 from service.requests.imports.scans import ScansImport
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def register(app: typer.Typer) -> None:
     layouts = make_group("import", help="Write a capture.json for files that are laid out another way; docs/importing.md shows each.")
     for name, model in LAYOUTS.items():
         local_command(layouts, name, _import_as(model))
+    local_command(layouts, "stereo", _import_as(StereoImport))  # of two folders: no layout of one that is uploaded
     local_command(layouts, "scans", _scans)
     local_command(layouts, "interleaved", _interleaved)
     layouts.command("guess")(_guess)

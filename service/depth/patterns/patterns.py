@@ -19,6 +19,7 @@ from service.depth.patterns.codes import choose_decoder
 from service.depth.patterns.coordinates import AxisMaps, Coordinates, DecodedSolution
 from service.depth.patterns.decoders import AxisDecoder, PatternProjector
 from service.depth.patterns.epipolar import contradiction
+from service.depth.patterns.lag import widen_lagging
 from service.depth.patterns.levels import check_levels
 from service.depth.patterns.moved import SAID, EvenSums
 from service.depth.patterns.pattern_checks import check_declaration, check_unevenness, find_exponent, response_sentence, sample_of
@@ -93,14 +94,18 @@ def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, de
         reads = 1 if series is None else len(series.times_s)
         noise = NoiseModel(request.read_noise * full * reads**0.5, request.photon_gain * full)  # joined frames add up their read noise
         warnings, codes = _checked(planes, mask, codes, shown, projector, capture, frames, noise, device, request)
+        declared = not any(sentence.startswith("frames:") for sentence in warnings)
         coordinates = Coordinates.empty(mask.shape, columns=codes.columns is not None, rows=codes.rows is not None)
         if projector is None:
             timings.stage("decode", mask.shape[0])
             for band, decoded in decoded_bands(planes, (codes.columns, codes.rows), noise, device):
                 coordinates.put(band, mask[band], decoded)
                 timings.advance(band.stop)
+            if declared:
+                warnings += widen_lagging(planes, coordinates, (codes.columns, codes.rows), codes.collected, noise)[0]
         else:
-            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings)
+            solution, right = _bands(planes, mask, codes, coordinates, projector, capture, noise, device, request, timings,
+                                     declared=declared)
         moved = _moved(planes, mask, capture, codes.collected, noise)
         if planes.exposure is not None:
             coordinates.amplitude /= planes.exposure
@@ -210,8 +215,10 @@ def read_codes(capture: Capture, frames: list[Frame], projector: PatternProjecto
 
 
 def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: Coordinates, projector: Projector, capture: Capture,
-           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings) -> tuple[DepthSolution, np.ndarray]:
-    """Return the depth of each pixel and its probability to be right; fill the coordinates."""
+           noise: NoiseModel, device: str, request: DepthRequest, timings: Timings, *,
+           declared: bool) -> tuple[DepthSolution, np.ndarray]:
+    """Return the depth of each pixel and its probability to be right; fill the coordinates.
+    `declared`: whether the frames are what the manifest declares, as far as a sample has told."""
     shape = mask.shape
     columns, rows = codes.columns, codes.rows
     model = projector_model(projector)
@@ -232,6 +239,10 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
         for name in maps:
             maps[name][band] = np.where(kept, getattr(found, name).numpy()[:part.size].reshape(part.shape), 0)
         timings.advance(band.stop)
+    lagging: list[str] = []
+    if declared:
+        lagging, wider = widen_lagging(planes, coordinates, (columns, rows), codes.collected, noise)
+        maps["sigma"] *= wider
     for index, axis in enumerate((coordinates.columns, coordinates.rows)):
         if axis is not None:
             missing = np.isin(status, SOLVED) & ~axis.solved  # solved from the other axis alone: where the point lies in the projector
@@ -248,6 +259,7 @@ def _bands(planes: Planes, mask: np.ndarray, codes: PatternCodes, coordinates: C
                              projector_u=None if u is None else u.coordinate, projector_v=None if v is None else v.coordinate,
                              sigma_u=None if u is None else u.sigma, sigma_v=None if v is None else v.sigma,
                              amplitude=coordinates.amplitude, facts=facts)
+    solution.warnings += lagging
     right = doubt_pixels(solution, maps["residual"] if both else None, capture.camera, projector, device)
     if u is not None and v is not None:
         _widen(solution, u, v, capture, projector)

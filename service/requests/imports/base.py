@@ -88,4 +88,12 @@ class AxisWay(Choice):
     AWAY = "away"
 
 
+class LightScale(Options):
+    """The scale of far lights whose strengths are known but for a factor."""
+
+    scale: Positive | None = None
+    """Radiance in the linear images of a white, matt surface that faces a light of strength 1; None: unknown, and so is the scale of
+    albedo."""
+
+
 Axes = Annotated[tuple[AxisWay, AxisWay, AxisWay], Commas, Spelling(metavar="X,Y,Z")]

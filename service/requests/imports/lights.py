@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from service.requests.base.base import Choice, Role, Spelling
-from service.requests.imports.base import Axes, CameraOptions, EncodingOptions, ImageOptions, ImportRequest
+from service.requests.imports.base import Axes, CameraOptions, EncodingOptions, ImageOptions, ImportRequest, LightScale
 from stage.model import Line, Positive
 
 
@@ -12,7 +12,7 @@ class DiligentImport(ImportRequest):
     """An object's folder of the DiLiGenT benchmark."""
 
 
-class LpImport(CameraOptions, EncodingOptions, ImportRequest):
+class LpImport(CameraOptions, EncodingOptions, LightScale, ImportRequest):
     """An RTI light list (.lp) with its images; SRC may be the .lp file."""
 
 
@@ -30,7 +30,7 @@ class Run(Choice):
     COLUMNS = "columns"
 
 
-class OlatImport(CameraOptions, ImageOptions, ImportRequest):
+class OlatImport(CameraOptions, ImageOptions, LightScale, ImportRequest):
     """Images under one far light each, with a table of the lights: .csv, .txt, .json, .mat or .npy."""
 
     axes: Axes

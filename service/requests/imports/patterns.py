@@ -6,7 +6,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from service.requests.base.base import Choice, Commas, Options, Role, Spelling, WidthHeight
-from service.requests.imports.base import Axes, ImageOptions, ImportRequest, LensOptions
+from service.requests.imports.base import Axes, EncodingOptions, ImageOptions, ImportRequest, LensOptions
 from service.requests.patterns import PatternAxis
 from stage.colour.colour_spaces import ColorSpaceName
 from stage.model import Count, Finite, Line, Positive, Resolution
@@ -176,6 +176,8 @@ class Codec(Choice):
     SLSTUDIO_PHASE_2X3 = "slstudio-phase-2x3", "three steps of 16 periods, three of one"
     SLSTUDIO_PHASE_3 = "slstudio-phase-3", "three steps of one period"
     SLSTUDIO_PHASE_4 = "slstudio-phase-4", "four steps of one period"
+    SLSTUDIO_MICRO = "slstudio-micro", "three steps of one of ten short periods, one of each other"
+    SLSTUDIO_MODULATED = "slstudio-modulated", "three steps of eight periods at three of a carrier, three of one period"
 
 
 class ScannerImport(ImportRequest):
@@ -193,3 +195,20 @@ class ScannerImport(ImportRequest):
     """Width and height of the projector in pixels; None: as the calibration says."""
     images: Annotated[Line | None, Spelling(metavar="GLOB")] = None
     """Names of the frames, taken in natural order; None: every image but the mask."""
+
+
+class StereoImport(EncodingOptions, ImportRequest):
+    """Images of two cameras at the same moments, under projected texture or without, and the calibration of both."""
+
+    source: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="LEFT")]
+    """Folder of the images of the first camera, whose pixels get depths, or one image."""
+    right: Annotated[Path, Role.INPUT, Spelling(argument=True, metavar="RIGHT")]
+    """The same of the second camera; images belong together in natural order."""
+    destination: Annotated[Path | None, Role.OUTPUT, Spelling(argument=True, metavar="DST")] = None
+    """Folder for the capture, which gets links to the files; None: the folder that holds both."""
+    calibration: Annotated[Path, Role.INPUT]
+    """OpenCV file (.yml, .xml, .json) of stereoCalibrate with the first camera first: matrices, distortions, R and T."""
+    extrinsics: Annotated[Path | None, Role.INPUT] = None
+    """File of R and T where `calibration` lacks them, as OpenCV's sample writes them; None: they are in `calibration`."""
+    unit_m: Positive = 1.0
+    """Metres in one unit of T, such as 0.001 for millimetres."""

@@ -1,15 +1,20 @@
 """Stacks of projected patterns in the orders and with the calibrations of other programs: from files to true depth in two commands."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
 from stage.capture.capture import Capture
 from stage.formats import exr
+from stage.importers.opencv_file import read_matrices
 from stage.results.depth_maps import DepthMaps
 from tests.reference.projector import FLIP
+from tests.scenes import stereo
 from tests.scenes.captures import files_in, write_image
 from tests.scenes.depth import AMBIENT, CAMERA, POSE, PROJECTOR, make_scene
+from tests.scenes.stereo import Plane, Sphere
 
 SCENE = make_scene()
 LIT = (SCENE.uv > 0).all(axis=-1) & (SCENE.uv < (PROJECTOR.width, PROJECTOR.height)).all(axis=-1) & ~SCENE.shaded
@@ -36,13 +41,13 @@ def write_stack(folder, levels, name="frame_{}.png", first=0):
         write_image(folder / name.format(number), np.rint(image * full).astype(kind))
 
 
-def write_calibration(path, names, unit_m=0.001, **sizes):
+def write_calibration(path, names, unit_m=0.001, *, devices=(CAMERA, PROJECTOR), pose=POSE, **sizes):
     """What cv2.stereoCalibrate gives for this rig, with the camera first, by the names of a program; translations in millimetres."""
-    rotation = FLIP @ POSE[:3, :3].T @ FLIP
-    values = [part for device in (CAMERA, PROJECTOR) for part in (
+    rotation = FLIP @ pose[:3, :3].T @ FLIP
+    values = [part for device in devices for part in (
         np.array([[device.focal, 0, device.principal[0] - 0.5], [0, device.focal, device.principal[1] - 0.5], [0, 0, 1]]),
         np.array([[*device.k[:2], *device.p, device.k[2]]]))]
-    values += [rotation, (-rotation @ FLIP @ POSE[:3, 3] / unit_m)[:, None]]
+    values += [rotation, (-rotation @ FLIP @ pose[:3, 3] / unit_m)[:, None]]
     path.parent.mkdir(parents=True, exist_ok=True)
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in zip(names, values, strict=True):
@@ -138,18 +143,26 @@ def test_a_phase_with_a_gray_code(relit, tmp_path):
     assert maps.mask[LIT].mean() > 0.97 and error(maps).max() < 0.2 * COLUMN_M
 
 
-@pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3"])
+@pytest.mark.parametrize("codec", ["slstudio-gray", "slstudio-phase-2x3", "slstudio-micro", "slstudio-modulated"])
 def test_slstudio(relit, tmp_path, codec):
     """frameSeq_0.bmp … as its scan worker writes them, with its calibration.xml; waves begin at the centre of the first column."""
     calibration = write_calibration(tmp_path / "calibration.xml", SLSTUDIO, **SIZES)
     if codec == "slstudio-gray":
         levels = [WHITE, BLACK, *(gray(U, bit) for bit in range(6, -1, -1))]
+    elif codec == "slstudio-micro":
+        levels = [*(wave(U - 0.5, 75.02, step / 3) for step in range(3)),
+                  *(wave(U - 0.5, period, turns) for period, turns in zip((70, 71.32, 72.47, 73.72, 76.23, 77.35, 78.4, 79.22, 80),
+                                                                          (0.5, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0.5), strict=True))]
+    elif codec == "slstudio-modulated":
+        levels = [*(wave(U - 0.5, PROJECTOR.width / 8, -step / 3) * wave(V - 0.5, PROJECTOR.height / 16, -across / 3)
+                    for step in range(3) for across in range(3)),
+                  *(wave(U - 0.5, PROJECTOR.width, -step / 3) for step in range(3))]
     else:
         levels = [wave(U - 0.5, PROJECTOR.width / parts, -step / 3) for parts in (16, 1) for step in range(3)]
     write_stack(tmp_path, levels, "frameSeq_{}.bmp")
     maps, _ = depth_of(relit, tmp_path, "scanner", "--calibration", calibration, "--codec", codec, "--unit-m", "0.001")
     assert maps.mask[LIT].mean() > 0.9
-    assert np.median(error(maps)) < (0.05 if "phase" in codec else 0.5) * COLUMN_M  # half a column of the waves would be 0.5
+    assert np.median(error(maps)) < (0.5 if codec == "slstudio-gray" else 0.05) * COLUMN_M  # half a column of the waves would be 0.5
 
 
 @pytest.mark.parametrize(("words", "message"), [
@@ -163,6 +176,7 @@ def test_slstudio(relit, tmp_path, codec):
     (("phase", "--projector", SIZE, "--periods", "16", "--steps", "4", "--gray-images", "x*", "--gray-stripe", "8"), "names 0 images"),
     (("phase", "--projector", SIZE, "--periods", "16", "--steps", "5", "--calibration", "RIG"),
      "is of a camera of 96x72 px, this one has 9x8"),
+    (("scanner", "--codec", "slstudio-micro", "--unit-m", "1", "--calibration", "RIG", "--axis", "both"), "code columns alone"),
     (("scanner", "--codec", "slstudio-gray", "--unit-m", "1", "--calibration", "NOSIZE"), "does not say how many pixels the projector has"),
 ])
 def test_faults_are_named_and_nothing_is_written(relit, tmp_path, words, message):
@@ -184,3 +198,59 @@ def test_without_a_calibration_the_columns_are_decoded_all_the_same(relit, tmp_p
     channels, _ = exr.read(tmp_path / "out" / "depth.exr")
     mask = channels["mask.Y"] > 0.5
     assert mask[LIT].mean() > 0.97 and np.abs(channels["projector.U"] - U)[mask].max() < 0.05
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Both views of a tilted plane and a sphere under dots, whether the second camera sees the place, and what is recorded."""
+    parts, dots = (Plane((0.02, 0.0, -1.15), (-0.3, 0.22, 1.0)), Sphere((0.08, -0.04, -0.95), 0.11)), [stereo.dots(100, cell=3)]
+    left, right = (stereo.render(parts, dots, *camera, side=2) for camera in ((stereo.CAMERA,), (stereo.OTHER, stereo.POSE)))
+    random = np.random.default_rng(0)
+    return left, stereo.visible_to(parts, left.points, stereo.POSE), [stereo.recorded(view.images[0], random) for view in (left, right)]
+
+
+@pytest.mark.parametrize("kind", ["one file", "two files", "JSON"])
+def test_two_cameras(relit, tmp_path, pair, kind):
+    """Two folders and what cv2.stereoCalibrate found: true depth in two commands, whatever the images are called."""
+    left, visible, recorded = pair
+    for folder, image in zip(("cam0", "cam1"), recorded, strict=True):
+        write_image(tmp_path / folder / f"{folder}_frame.png", image)
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV, devices=(stereo.CAMERA, stereo.OTHER), pose=stereo.POSE)
+    words = ["--calibration", rig]
+    if kind != "one file":
+        found = read_matrices(rig)
+        if kind == "JSON":
+            words[1] = tmp_path / "rig.json"
+            words[1].write_text(json.dumps({name: matrix.tolist() for name, matrix in found.items()}))
+        else:  # as OpenCV's sample stereo_calib writes them
+            for name, own in (("intrinsics.yml", OPENCV[:4]), ("extrinsics.yml", OPENCV[4:])):
+                file = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+                for key in own:
+                    file.write(key, found[key])
+                file.release()
+            words = ["--calibration", tmp_path / "intrinsics.yml", "--extrinsics", tmp_path / "extrinsics.yml"]
+    out = relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam1", tmp_path / "pair", *words, "--unit-m", "0.001").well()
+    assert f"{np.linalg.norm(stereo.POSE[:3, 3]):.4g} m from the first camera" in out
+    manifest = Capture.open(tmp_path / "pair").manifest
+    other, truth = manifest.other_cameras[0], stereo.OTHER
+    np.testing.assert_allclose(other.camera_from_other, stereo.POSE, atol=1e-12)
+    np.testing.assert_allclose((*other.focal_px, *other.principal_px), (truth.focal, truth.focal, *truth.principal), atol=1e-9)
+    if kind != "one file":  # alike from here on
+        return
+    relit("depth", tmp_path / "pair", "--out", tmp_path / "out").well()
+    maps = DepthMaps.read(tmp_path / "out" / "depth.exr")
+    off = np.abs(maps.depth - left.depth)[maps.mask & visible]  # a pixel of disparity is 19 to 27 mm at 1 to 1.2 m
+    assert maps.mask[visible].mean() > 0.7 and np.median(off) < 0.006 and (off > 0.03).mean() < 0.02
+
+
+@pytest.mark.parametrize(("left", "right", "message"), [
+    (("a/0.png", "a/1.png"), ("b/0.png",), "has 1 images and"), (("c/a/0.png",), ("b/0.png",), "does not lie beside"),
+    (("a/0.png",), ("b/0.txt",), "holds no images")])
+def test_pairs_that_are_none(relit, tmp_path, left, right, message):
+    for name in (*left, *right):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image((tmp_path / name).with_suffix(".png"), np.zeros((8, 9), np.uint8)).rename(tmp_path / name)
+    rig = write_calibration(tmp_path / "rig.yml", OPENCV)
+    before = files_in(tmp_path)
+    relit("import", "stereo", (tmp_path / left[0]).parent, (tmp_path / right[0]).parent, "--calibration", rig).refused(message)
+    assert files_in(tmp_path) == before

@@ -10,7 +10,7 @@ from service.captures.info import front_lights
 from stage.capture.capture import Capture
 from stage.results.maps import SurfaceMaps
 from tests.scenes import near_lights
-from tests.scenes.captures import make_scene, write_exr, write_image
+from tests.scenes.captures import make_scene, render, write_exr, write_image
 
 
 def degrees_between(a, b):
@@ -31,6 +31,24 @@ def test_a_table_of_lights_in_other_axes_gives_the_true_normals(relit, tmp_path)
     assert relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").code == 0
     maps = SurfaceMaps.read(tmp_path / "maps" / "maps.exr")
     assert degrees_between(maps.normal, scene.normal)[scene.mask].max() < 0.1  # half rounding of the stack
+
+
+@pytest.mark.parametrize("layout", ["lp", "olat"])
+def test_the_scale_of_the_lights_gives_that_of_albedo(relit, tmp_path, layout):
+    """`--scale` is the reading of a white surface that faces a light: albedo is then the true one, and relative without it."""
+    scene, reading = make_scene(24, 8), 0.37
+    folder = tmp_path / "statue"
+    for number, image in enumerate(render(scene.normal, scene.albedo, scene.directions, np.full((8, 3), np.pi * reading))):
+        write_exr(folder / f"{number}.exr", image)
+    write_image(folder / "mask.png", scene.mask.astype(np.uint8) * 255)
+    rows = [f"{number}.exr {x:.9g} {y:.9g} {z:.9g}" for number, (x, y, z) in enumerate(scene.directions)]
+    (folder / "dome.lp").write_text("\n".join(["8", *rows]) + "\n")
+    words = ["--axes", "right,up,towards", "--vectors", "to-light"] if layout == "olat" else []
+    relit("import", layout, folder, *words, "--scale", reading).well()
+    assert Capture.open(folder).manifest.irradiance_scale == "absolute"
+    relit("solve", folder, "--out", tmp_path / "maps", "--method", "robust").well()
+    albedo = SurfaceMaps.read(tmp_path / "maps" / "maps.exr").diffuse_albedo
+    assert np.abs(albedo - scene.albedo)[scene.mask].max() < 2e-3  # half rounding of the stack and of the layers
 
 
 def test_axes_are_asked_for_and_never_guessed(relit, tmp_path):
