@@ -2,7 +2,8 @@
 
 A pixel sees a highlight under a light or two, or under none, and cannot tell a faint wide lobe from a bright narrow one; another
 pixel of the same material can. Candidates are materials that pixels found for themselves; the one that lowers the total cost most
-is taken, then the one that lowers it most beside the first, and so on while it pays. F0 of a dielectric follows from its refractive index
+is taken, then the one that lowers it most beside the first, and so on while it pays; a surface without a lobe comes first where no lobe
+pays. F0 of a dielectric follows from its refractive index
 alone, which differs little between paints, plastics and skin, while a pixel trades F0 for roughness: so all dielectrics of the object have
 one F0 unless F0 of their own pay.
 
@@ -12,7 +13,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 
 import numpy as np
 
-from kernels.photometric.material.material import fit_given, fit_material, is_dielectric
+from kernels.photometric.material.material import MATT, fit_given, fit_material, is_dielectric
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.hypotheses import Diffuse
 
@@ -36,13 +37,15 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
     """
     own = fit_material(samples, normal, shape=shape)
     chosen = evenly(len(normal), CANDIDATES)
-    candidates = np.concatenate([own.specular[chosen], own.roughness[chosen, None]], axis=1)
+    candidates = np.vstack([MATT, np.column_stack([own.specular[chosen], own.roughness[chosen]])])
     costs = np.stack([fit_given(samples, normal, candidate, shape=shape).cost for candidate in candidates])
     materials: list[int] = []
     best = np.full(costs.shape[1], np.inf)
     while len(materials) < MOST:
         totals = np.minimum(costs, best).sum(axis=1)
         index = int(np.argmin(totals))
+        if not materials and totals[0] <= (1 + LEAST_GAIN) * totals[index]:
+            index = 0  # no lobe pays
         if materials and best.sum() - totals[index] < LEAST_GAIN * best.sum():
             break
         materials.append(index)
@@ -52,7 +55,7 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
 
 def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:
     """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough; `costs` is [materials, n]."""
-    dielectric = is_dielectric(materials)
+    dielectric = is_dielectric(materials) & (materials[:, 0] > 0)
     if dielectric.sum() < 2:
         return materials
     alike = materials[dielectric]
