@@ -38,8 +38,8 @@ real objects, which are not quite Lambertian; errors of 5 % take away 0.5 to 0.8
 LARGEST_LEFT = 0.05
 """Largest misfit that other intensities may leave, relative to |b|: bare metal leaves more under any intensities."""
 LARGEST_FALL = 0.1
-"""Largest standard deviation of the part of the logarithms that follows the angle to the viewer which may be the object's reflectance: rough
-dielectrics, which return light towards the lamp, ask for up to 0.05."""
+"""Largest standard deviation of the part of the logarithms that follows the angle to the viewer which may be the object's reflectance:
+rough dielectrics, which return light towards the lamp, ask for up to 0.05."""
 FALL_DEGREE = 2
 """Degree of the polynomial of the cosine to the viewer that this part is taken for."""
 LINEAR_GAIN = 0.8
@@ -115,7 +115,8 @@ def _declared(lights: DistantLights, why: str, gain: float | None = None) -> Cho
 def _factors(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return [lights] intensities over the declared ones, of geometric mean 1; 1 for lights that too few pixels show.
 
-    They are without a small part that follows the angle to the viewer, as diffuse reflection other than Lambert's asks for. The second are without the part that is linear in the direction, beyond what independent errors of the lights would have of it.
+    They are without a small part that follows the angle to the viewer, as diffuse reflection other than Lambert's asks for. The second
+    are without the part that is linear in the direction, beyond what independent errors of the lights would have of it.
     """
     found = fit_grey_intensities(readings, usable, directions, rounds=rounds)
     seen = np.isfinite(found)
