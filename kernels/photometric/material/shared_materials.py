@@ -2,9 +2,9 @@
 
 A pixel sees a highlight under a light or two, or under none, and cannot tell a faint wide lobe from a bright narrow one; another
 pixel of the same material can. Candidates are materials that pixels found for themselves; the one that lowers the total cost most
-is taken, then the one that lowers it most beside the first, and so on while it pays. F0 of a dielectric follows from its refractive index
-alone, which differs little between paints, plastics and skin, while a pixel trades F0 for roughness: so all dielectrics of the object have
-one F0 unless F0 of their own pay.
+is taken, then the one that lowers it most beside the first, and so on while it pays; a surface without a lobe comes first where no lobe
+pays. F0 of a dielectric follows from its refractive index alone, which differs little between paints, plastics and skin, while a pixel
+trades F0 for roughness: so all dielectrics of the object have one F0 unless F0 of their own pay.
 
 Source: materials as few and mixed per pixel, after Goldman et al., "Shape and spatially-varying BRDFs from photometric stereo",
 TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
@@ -12,7 +12,7 @@ TPAMI 2010; here lobes of Relit's BRDF with an albedo free in every pixel.
 
 import numpy as np
 
-from kernels.photometric.material.material import fit_given, fit_material, is_dielectric
+from kernels.photometric.material.material import MATT, fit_given, fit_material, is_dielectric
 from kernels.photometric.model.samples import Samples, evenly
 from kernels.photometric.search.hypotheses import Diffuse
 
@@ -22,6 +22,9 @@ MOST = 8
 """Largest number of shared materials."""
 LEAST_GAIN = 0.01
 """Fraction of the total cost that a further material must save, and each F0 beyond that which dielectrics have in common."""
+LOBE_GAIN = 0.05
+"""Fraction of the total cost that a lobe must save over none at all: in hollows, bounced light that is left in the readings passes for a
+faint lobe, which saves up to 0.03; lobes of rough dielectrics save 0.07 and more."""
 LEAST_F0 = 0.005
 """Least F0 that dielectrics have in common: that of a refractive index of 1.15, below every solid."""
 F0_GRID, F0_HALVINGS = 5, 4
@@ -36,14 +39,16 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
     """
     own = fit_material(samples, normal, shape=shape)
     chosen = evenly(len(normal), CANDIDATES)
-    candidates = np.concatenate([own.specular[chosen], own.roughness[chosen, None]], axis=1)
+    candidates = np.vstack([MATT, np.column_stack([own.specular[chosen], own.roughness[chosen]])])
     costs = np.stack([fit_given(samples, normal, candidate, shape=shape).cost for candidate in candidates])
     materials: list[int] = []
     best = np.full(costs.shape[1], np.inf)
     while len(materials) < MOST:
         totals = np.minimum(costs, best).sum(axis=1)
-        index = int(np.argmin(totals))
-        if materials and best.sum() - totals[index] < LEAST_GAIN * best.sum():
+        index = int(np.argmin(totals[1:])) + 1
+        if not materials and (1 - LOBE_GAIN) * totals[0] <= totals[index]:
+            index = 0
+        if materials and totals[index] > (1 - (LOBE_GAIN if materials == [0] else LEAST_GAIN)) * best.sum():
             break
         materials.append(index)
         best = np.minimum(best, costs[index])
@@ -53,6 +58,7 @@ def choose_materials(samples: Samples, normal: np.ndarray, *, shape: Diffuse) ->
 def _with_one_f0(samples: Samples, normal: np.ndarray, materials: np.ndarray, costs: np.ndarray, *, shape: Diffuse) -> np.ndarray:
     """Return the materials with one F0 for all dielectrics, or as they are where F0 of their own save enough; `costs` is [materials, n]."""
     dielectric = is_dielectric(materials)
+    dielectric[0] &= (materials[0] != MATT).any()  # which came first because the object is matt
     if dielectric.sum() < 2:
         return materials
     alike = materials[dielectric]

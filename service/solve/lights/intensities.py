@@ -37,10 +37,15 @@ LEAST_GAIN = 0.4
 real objects, which are not quite Lambertian; errors of 5 % take away 0.5 to 0.8, and 0.26 on a glossy object."""
 LARGEST_LEFT = 0.05
 """Largest misfit that other intensities may leave, relative to |b|: bare metal leaves more under any intensities."""
+LARGEST_FALL = 0.1
+"""Largest standard deviation of the part of the logarithms that follows the angle to the viewer which may be the object's reflectance:
+rough dielectrics, which return light towards the lamp, ask for up to 0.05."""
+FALL_DEGREE = 2
+"""Degree of the polynomial of the cosine to the viewer that this part is taken for."""
 LINEAR_GAIN = 0.8
 """Intensities without the part that the object tells only weakly are taken if they have this part of the gain of the others."""
 SURE = 2.5
-"""Least ratio of that gain to its standard error over squares of pixels."""
+"""Least ratio to its standard error of that gain, over squares of pixels, and of the part that follows the angle to the viewer."""
 NOISE = 0.02
 """Residual, relative to |b|, from which the cost of a reading grows only with its logarithm."""
 LEAST_LIT = 5
@@ -110,12 +115,17 @@ def _declared(lights: DistantLights, why: str, gain: float | None = None) -> Cho
 def _factors(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
     """Return [lights] intensities over the declared ones, of geometric mean 1; 1 for lights that too few pixels show.
 
-    The second are without the part that is linear in the direction, beyond what independent errors of the lights would have of it.
+    They are without a small part that follows the angle to the viewer, as diffuse reflection other than Lambert's asks for. The second
+    are without the part that is linear in the direction, beyond what independent errors of the lights would have of it.
     """
     found = fit_grey_intensities(readings, usable, directions, rounds=rounds)
     seen = np.isfinite(found)
     free, told = np.ones(len(found)), np.ones(len(found))
     logarithm = np.log(found[seen])
+    fall = np.polynomial.Polynomial.fit(directions[seen, 2], logarithm, FALL_DEGREE)(directions[seen, 2])
+    independent = SURE * (logarithm - fall).std() * np.sqrt(FALL_DEGREE / len(logarithm))  # what errors of single lights have of it
+    if independent < fall.std() <= LARGEST_FALL:
+        logarithm = logarithm - fall
     free[seen] = np.exp(logarithm - logarithm.mean())
     told[seen] = np.exp(logarithm - untold(logarithm, directions[seen], falling=False))
     return free, told

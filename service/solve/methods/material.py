@@ -220,7 +220,8 @@ class _Walk:
         spread = self._solvable[evenly(len(self._solvable), MATERIAL_PIXELS)]
         samples = self._pick(spread)
         light.keep(spread, samples)
-        normal = self.result.normal[:, spread].T
+        # the first search saw bounced light, and a lobe would explain what its normals do not
+        normal = find_normals(samples, self.result.normal[:, spread].T, shape=self._shape, sweep=QUICK).best.normal
         materials = choose_materials(samples, normal, shape=self._lobe)
         self.result.facts["shared_materials"] = [{"specular": material[:3].tolist(), "roughness": float(material[3])}
                                                  for material in materials.round(4).astype(float)]

@@ -118,6 +118,13 @@ def test_normals_are_free_of_the_bounce(by_declaration):
     assert np.median(right) < 0.4 * np.median(left)
 
 
+def test_bounced_light_is_no_gloss(by_declaration):
+    """The groove is matt; materials are fitted under normals that are found without the bounce."""
+    maps = by_declaration["relative"][0].maps
+    assert np.percentile(maps.specular, 90) < 0.005
+    assert np.percentile(maps.roughness, 10) > 0.95
+
+
 def test_maps_have_the_albedo_of_the_surface(by_declaration):
     """The factor is recorded, by which the maps guide the relighting of the images."""
     result, _, report = by_declaration["relative"]
