@@ -19,6 +19,14 @@ SHIFT = 0.05
 """Least shift of the brightness from the middle of the object, in its widths. A
 patch of light on one side of a ball gives a tenth or more."""
 
+KEEP_CONTEXT = """const get = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...given) {
+  const context = get.call(this, kind, ...given);
+  if (kind === "webgl2") globalThis.webgl = context;
+  return context;
+};"""
+"""Keeps the last context of WebGL, whose canvas is not on the page."""
+
 
 @pytest.fixture
 def page(small_page):
@@ -37,6 +45,7 @@ def opened(browser, server, exported):
     """A page with the asset as glTF, which is opened once; an error of a script fails the module. axe is injected into it."""
     page, errors = new_context(browser, base_url=server.url, viewport={"width": 640, "height": 480}, bypass_csp=True).new_page(), []
     page.on("pageerror", lambda error: errors.append(str(error)))
+    page.add_init_script(KEEP_CONTEXT)
     loaded = count_bytes(page)
     open_asset(page, exported["glb"])
     assert 1_000_000 < sum(loaded) < PAGE_BYTES  # with three.js
@@ -64,8 +73,8 @@ def open_asset(page, job: str) -> dict:
 
 def shown(page) -> np.ndarray:
     """[rows, cols, 4] uint8 what the view in 3D shows."""
-    rows = page.evaluate("() => document.querySelector('canvas.scene').height")
-    return pixels(page, "asset.picture().pixels").reshape(rows, -1, 4)
+    picture = pixels(page, "(globalThis.taken = asset.picture()).pixels")
+    return picture.reshape(page.evaluate("taken.rows"), -1, 4)
 
 
 def shift_of_light(page) -> np.ndarray:
@@ -212,7 +221,7 @@ def test_the_keyboard_turns_it_and_it_is_shown_again_when_the_graphics_processor
     asset.keyboard.press("0")
     assert np.array_equal(first, shown(asset))
     asset.evaluate("""() => {
-      globalThis.lost = document.querySelector('canvas.scene').getContext('webgl2').getExtension('WEBGL_lose_context');
+      globalThis.lost = webgl.getExtension('WEBGL_lose_context');
       lost.loseContext();
     }""")
     asset.get_by_text("The graphics processor has stopped").wait_for()
