@@ -34,8 +34,10 @@ SLOW_SCENE = """async () => {
   const [pen, speed] = [drawn.getContext("2d"), 400]; // pixels per ms: a whole picture takes 400 ms
   let [size, at, looks] = [null, 0, 0];
   const gl = { flush: () => {}, isContextLost: () => false, deleteSync: () => {}, SIGNALED: true,
-    fenceSync: () => performance.now() + size[0] * size[1] / speed, getSyncParameter: (time) => { looks += 1; return performance.now() >= time; } };
-  const renderer = { domElement: drawn, getContext: () => gl, getPixelRatio: () => 1, setViewport: (x, y, ...given) => { size = given; } };
+    fenceSync: () => performance.now() + size[0] * size[1] / speed,
+    getSyncParameter: (time) => { looks += 1; return performance.now() >= time; } };
+  const renderer = { domElement: drawn, getContext: () => gl, getPixelRatio: () => 1,
+    setViewport: (x, y, ...given) => { size = given; } };
   const loop = new SceneLoop(renderer, canvas, () => { pen.fillStyle = `rgb(${at} 0 0)`; pen.fillRect(0, 400 - size[1], ...size); });
   const shown = [];
   new MutationObserver(() => shown.push([Number(canvas.dataset.share), canvas.getContext("2d").getImageData(399, 399, 1, 1).data[0]]))
