@@ -144,6 +144,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
 
 
 captures, environments = _routes("capture", "a capture", CAPTURE), _routes("environment", "an environment", ENVIRONMENT)
+samples = APIRouter(prefix="/v1/samples", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
 
 
 @captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
@@ -155,14 +156,14 @@ def create_capture(service: ServiceDep, caller: Writer, response: Response, want
     return _create(service, caller, CAPTURE, wanted.name, folder, token, response)
 
 
-@captures.post("/sample", status_code=201, responses=responses(404, 409, 507), summary="Register the sample capture")
+@samples.post("/captures", status_code=201, responses=responses(404, 409, 507), summary="Register the sample capture")
 def register_sample(service: ServiceDep, caller: Writer, response: Response, token: IdempotencyKey = None) -> IntakeView:
     """Register the sample capture that comes with Relit, where it lies."""
     sample = _sample()
     return _create(service, caller, CAPTURE, sample.name, sample, token, response)
 
 
-@environments.post("/sample", status_code=201, responses=responses(404, 409, 507), summary="Register the sample environment")
+@samples.post("/environments", status_code=201, responses=responses(404, 409, 507), summary="Register the sample environment")
 def register_sample_environment(service: ServiceDep, caller: Writer, response: Response, token: IdempotencyKey = None) -> IntakeView:
     """Register the environment that comes with the sample capture, where it lies."""
     sky = _sample() / "environment.exr"

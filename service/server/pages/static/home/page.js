@@ -128,7 +128,7 @@ async function refresh(id) {
 }
 
 async function openSample() {
-  for (const list of ["captures", "environments"]) put(intakeItem(list, await post(`/v1/${list}/sample`, undefined, { "Idempotency-Key": `${sampleToken}-${list}` })));
+  for (const list of ["captures", "environments"]) put(intakeItem(list, await post(`/v1/samples/${list}`, undefined, { "Idempotency-Key": `${sampleToken}-${list}` })));
   draw();
 }
 
