@@ -27,7 +27,7 @@ LOADS = 3
 SHOWN = {"/": ".card canvas", "captures": "#captures a", "jobs": "#jobs tbody a", "machines": "#audit tbody tr",
          "capture": "#frames canvas", "job": "#stages tbody tr", "light": "canvas.picture[data-stride]",
          "object": "canvas.picture[data-stride]", "maps": "canvas.map",
-         "asset": "canvas.scene"}
+         "asset": "canvas.scene[data-share]"}
 """What a page is opened for."""
 TASKS = """globalThis.tasks = [];
 new PerformanceObserver((list) => tasks.push(...list.getEntries().map(({ duration }) => duration)))

@@ -6,14 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-import service
 from kernels import device as devices
-from service.errors import RequestError
 from service.export.export import export
 from service.relight.relight import relight
 from service.relight.sheet import BACKGROUND, display, exposure_of, read_frame, write_sheet
 from service.reporting.progress import Progress, Timings
-from service.requests.demo import DemoRequest
+from service.requests.demo import DemoRequest, sample_folder
 from service.requests.export import ExportRequest
 from service.requests.relight import RelightRequest
 from service.requests.solve import SolveRequest
@@ -25,7 +23,6 @@ from stage.results.maps import SurfaceMaps
 from stage.stack.correction import Correction
 from stage.stack.ingest import CACHE_FOLDER
 
-SAMPLE = "owl"
 FRAMES = "1-24"
 KEY_LIGHT = (0.45, 0.5, 0.74)
 """The preview shows the captured image whose light is nearest to this direction, above right of the camera."""
@@ -38,15 +35,6 @@ class DemoResult(NamedTuple):
     asset: Path
     frames: tuple[Path, ...]
     preview: Path
-
-
-def sample_folder() -> Path:
-    """Return the folder of the shipped sample, inside the installed package or in the checkout."""
-    package = Path(service.__file__).parent
-    for folder in (package / "samples" / SAMPLE, package.parent / "samples" / SAMPLE):
-        if (folder / "capture.json").exists():
-            return folder
-    raise RequestError(f"the sample capture {SAMPLE} is not installed: run the demo from a checkout of relit")
 
 
 def demo(request: DemoRequest, progress: Progress | None = None) -> DemoResult:

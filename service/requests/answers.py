@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.requests.base.identifiers import HookId, JobId, UploadId
 from service.requests.hooks import HookEvent
 from service.requests.jobs import StoredJob
+from service.requests.keys import Scope
 from service.requests.states import IntakeState, JobState
 
 Time = Annotated[datetime, Field(description="UTC.")]
@@ -237,6 +238,13 @@ class DiskView(View):
     """Bytes."""
     least_free: int
     """Bytes below which the service takes neither uploads nor jobs."""
+
+
+class ProjectView(View):
+    """The project of the key that asks, and what the key may do there."""
+
+    name: str
+    scope: Scope
 
 
 class MachinesView(View):

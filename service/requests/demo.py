@@ -5,7 +5,20 @@ from typing import Annotated
 
 from pydantic import Field
 
+import service
+from service.errors import RequestError
 from service.requests.base.base import DeviceRequest, Role
+
+SAMPLE = "owl"
+
+
+def sample_folder() -> Path:
+    """Return the folder of the shipped sample, inside the installed package or in the checkout."""
+    package = Path(service.__file__).resolve().parent
+    for folder in (package / "samples" / SAMPLE, package.parent / "samples" / SAMPLE):
+        if (folder / "capture.json").exists():
+            return folder
+    raise RequestError(f"the sample capture {SAMPLE} is not installed: run the demo from a checkout of relit")
 
 
 class DemoRequest(DeviceRequest):

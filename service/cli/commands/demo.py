@@ -7,7 +7,7 @@ import typer
 
 from service.cli.progress import ProgressBar, with_bar
 from service.cli.request_commands import local_command
-from service.requests.demo import BenchRequest, DemoRequest
+from service.requests.demo import BenchRequest, DemoRequest, sample_folder
 
 if TYPE_CHECKING:
     from service.demo.demo import DemoResult
@@ -43,7 +43,6 @@ def _demo(request: DemoRequest, serve: ServeOption = False) -> None:
 def open_service(data: Path, device: str | None, result: "DemoResult | None" = None) -> None:
     """Run a service for this machine alone in the folder `data`, with the sample in it and, if given, the result of the demo."""
     from service.cli.commands.server import settings_of
-    from service.demo.demo import sample_folder
     from service.server.process.sample import show_sample
     from service.server.process.serve import serve
 
@@ -55,7 +54,6 @@ def open_service(data: Path, device: str | None, result: "DemoResult | None" = N
 
 def _results(result: "DemoResult", device: str | None) -> "SampleResults":
     """Return the files of the demo, and of views of the sample, which are made here."""
-    from service.demo.demo import sample_folder
     from service.requests.captures import ViewRequest
     from service.server.process.sample import SampleResults
     from service.viewing.view_files import view

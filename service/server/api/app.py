@@ -58,7 +58,8 @@ def create_app(settings: Settings, database: Database, tracing: TracerProvider |
     app.state.metrics, app.state.readiness = Metrics(settings, database), operations.Readiness()
     problems.install(app)
     document.install(app)
-    for router in (intakes.captures, importing.router, intakes.environments, results.environments, uploads.router, uploads.listings,
+    for router in (intakes.captures, importing.router, intakes.environments, intakes.samples, results.environments, uploads.router,
+                   uploads.listings,
                    uploads.options, jobs.router, events.router, results.router, pictures.router, hooks.router, operations.router):
         app.include_router(router)
     pages.install(app)

@@ -9,10 +9,12 @@ import sqlalchemy as sa
 from fastapi import APIRouter, Body, Path, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.errors import RequestError
 from service.requests import states
 from service.requests.answers import IntakePage, IntakeView
 from service.requests.base.annotations import AnnotationPage, AnnotationView, NewAnnotation, page_of, view_of
 from service.requests.base.identifiers import CAPTURE, ENVIRONMENT, AnnotationId, CaptureId, new_id, pattern
+from service.requests.demo import sample_folder
 from service.requests.jobs import CheckJob
 from service.requests.keys import Scope
 from service.server.api.context import FOR_WORK, IdempotencyKey, Reader, Service, ServiceDep, Writer, require_space
@@ -142,6 +144,7 @@ def _routes(kind: str, a: str, prefix: str) -> APIRouter:
 
 
 captures, environments = _routes("capture", "a capture", CAPTURE), _routes("environment", "an environment", ENVIRONMENT)
+samples = APIRouter(prefix="/v1/samples", tags=["captures"], responses=responses(401, 403, 422, 429, 503))
 
 
 @captures.post("", status_code=201, responses=responses(404, 409, 507), summary="Create a capture")
@@ -151,6 +154,20 @@ def create_capture(service: ServiceDep, caller: Writer, response: Response, want
     """Create a capture, whose files are then uploaded; or register a folder of the server, which is checked at once."""
     folder = _registered(service, caller, "folder", wanted.folder, os.path.isdir)
     return _create(service, caller, CAPTURE, wanted.name, folder, token, response)
+
+
+@samples.post("/captures", status_code=201, responses=responses(404, 409, 507), summary="Register the sample capture")
+def register_sample(service: ServiceDep, caller: Writer, response: Response, token: IdempotencyKey = None) -> IntakeView:
+    """Register the sample capture that comes with Relit, where it lies."""
+    sample = _sample()
+    return _create(service, caller, CAPTURE, sample.name, sample, token, response)
+
+
+@samples.post("/environments", status_code=201, responses=responses(404, 409, 507), summary="Register the sample environment")
+def register_sample_environment(service: ServiceDep, caller: Writer, response: Response, token: IdempotencyKey = None) -> IntakeView:
+    """Register the environment that comes with the sample capture, where it lies."""
+    sky = _sample() / "environment.exr"
+    return _create(service, caller, ENVIRONMENT, sky.name, sky, token, response)
 
 
 @captures.get("/{capture}/annotations", responses=responses(404), summary="List the annotations of a capture", response_model_by_alias=True)
@@ -205,6 +222,13 @@ def create_environment(service: ServiceDep, caller: Writer, response: Response, 
     """Create an environment, whose one lat-long image is then uploaded; or register a file of the server, which is checked at once."""
     file = _registered(service, caller, "file", wanted.file, os.path.isfile)
     return _create(service, caller, ENVIRONMENT, wanted.name, file, token, response)
+
+
+def _sample() -> FilePath:
+    try:
+        return sample_folder()
+    except RequestError:
+        raise ApiError("not-found", "this server was installed without the sample capture") from None
 
 
 def _registered(service: Service, caller: Caller, field: str, given: str | None, exists: Callable[[FilePath], bool]) -> FilePath | None:

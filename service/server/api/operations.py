@@ -10,9 +10,9 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
-from service.requests.answers import AuditEntry, AuditPage, DiskView, MachinesView, WorkerView
+from service.requests.answers import AuditEntry, AuditPage, DiskView, MachinesView, ProjectView, WorkerView
 from service.requests.keys import Scope
-from service.server.api.context import Admin, Service, ServiceDep, authenticated, bearer, has_space, require_local
+from service.server.api.context import Admin, Reader, Service, ServiceDep, authenticated, bearer, has_space, require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import audit, jobs, workers
@@ -102,6 +102,12 @@ async def operator_of(service: ServiceDep, request: Request,
 def get_metrics(request: Request) -> Response:
     """Return requests, jobs by state, workers by device and more. A service that listens beyond this machine needs a key of scope admin."""
     return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE)
+
+
+@router.get("/v1/project", responses=responses(401, 403, 422, 429, 503), summary="See the project of the key")
+async def get_project(caller: Reader) -> ProjectView:
+    """Return the project of the key that asks, of which a key has one, and the scope of the key."""
+    return ProjectView(name=caller.project, scope=caller.scope)
 
 
 @router.get("/v1/machines", responses=responses(401, 403, 422, 429, 503), summary="Look at workers, queue and space")

@@ -7,6 +7,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from functools import cached_property
 from ipaddress import ip_address, ip_network
@@ -19,6 +20,7 @@ from pydantic_settings import BaseSettings, InitSettingsSource, NoDecode, Pydant
 
 from service.errors import RequestError
 from service.requests.base.identifiers import DEFAULT_PORT, PROJECT_PATTERN
+from service.requests.demo import sample_folder
 from service.requests.keys import Scope
 from stage.model import Count, Positive
 
@@ -224,8 +226,8 @@ class Settings(BaseSettings):
         return self
 
     def roots_of(self, project: str) -> tuple[Path, ...]:
-        """Return the folders below which a project may register captures and environments, that of the page /set among them."""
-        return (*self.roots, *(root.folder for root in self.project_roots if root.project == project), self.set_captures)
+        """Return the folders below which a project may register captures and environments, those of /set and the sample among them."""
+        return (*self.roots, *(root.folder for root in self.project_roots if root.project == project), self.set_captures, *_sample())
 
     def quota_of(self, project: str, quota: str) -> int | None:
         """Return the limit of one of QUOTAS for a project; None: there is none."""
@@ -319,3 +321,9 @@ def _of_file(file: Path) -> dict[str, Any]:
             near = get_close_matches(name, Settings.model_fields, 1, 0.6)
             raise RequestError(f"settings {file}: there is no setting {name}" + (f": is {near[0]} meant?" if near else ""))
     return found
+
+
+def _sample() -> tuple[Path, ...]:
+    with suppress(RequestError):
+        return (sample_folder(),)
+    return ()

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from service.errors import RequestError, sentence
+from service.requests.demo import sample_folder
 from service.server.base.settings import Settings, unknown_variables
 from service.server.database.engine import open_database
 from service.server.jobs.queue import prepare
@@ -108,9 +109,9 @@ def test_roots_of_projects(monkeypatch, tmp_path):
     monkeypatch.setenv("RELIT_ROOTS", "/shared")
     monkeypatch.setenv("RELIT_PROJECT_ROOTS", "larch=/l:birch=/b/../c:larch=/l=2")
     settings = Settings(data=tmp_path)
-    of_set = tmp_path / "set"  # the captures of the page /set
-    assert settings.roots_of("larch") == (Path("/shared"), Path("/l"), Path("/l=2"), of_set)
-    assert settings.roots_of("birch") == (Path("/shared"), Path("/c"), of_set) and settings.roots_of("oak") == (Path("/shared"), of_set)
+    always = tmp_path / "set", sample_folder()  # the captures of the page /set, and the sample
+    assert settings.roots_of("larch") == (Path("/shared"), Path("/l"), Path("/l=2"), *always)
+    assert settings.roots_of("birch") == (Path("/shared"), Path("/c"), *always) and settings.roots_of("oak") == (Path("/shared"), *always)
     for wrong in ("larch", "=/l", "larch=", "Larch=/l"):
         monkeypatch.setenv("RELIT_PROJECT_ROOTS", wrong)
         with pytest.raises(ValidationError) as error:

@@ -7,8 +7,10 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
+from service.requests.keys import Scope
 from tests.service.server.pages.axe import violations_in_both_schemes
 from tests.service.server.pages.conftest import keep, new_context
+from tests.service.server_process import serving
 from tests.service.waiting import until
 
 CAPTURES = 1000
@@ -44,6 +46,8 @@ def pretend(page, captures: list[dict], jobs: list[dict] = []) -> list[dict]:  #
             begin = next((at + 1 for at, each in enumerate(captures) if each["id"] == query.get("before", [""])[0]), 0)
             part = captures[begin : begin + int(query["limit"][0])]
             route.fulfill(json={"items": part, "next": part[-1]["id"] if begin + len(part) < len(captures) else None})
+        elif path == "/v1/project":
+            route.fulfill(json={"name": EVIL, "scope": "write"})
         elif path == "/v1/environments":
             route.fulfill(json={"items": [], "next": None})
         elif path == "/v1/jobs":
@@ -105,6 +109,24 @@ def test_nothing_yet_says_what_to_do(page):
     page.goto("/")
     page.get_by_role("heading", name="Nothing here yet").wait_for()
     assert page.get_by_text("Choose a folder").is_visible() and page.locator(".skeleton:visible").count() == 0
+    page.get_by_text(f"Project {EVIL}").wait_for()
+
+
+@pytest.mark.long
+def test_the_sample_is_opened_by_one_click_where_nothing_is_yet(browser, tmp_path):
+    """A key of scope write suffices; the folder of the sample is none that this operator allows for others."""
+    with serving(tmp_path / "empty", "--device", "cpu") as empty:
+        context = new_context(browser, base_url=empty.url)
+        context.add_init_script(f"sessionStorage.setItem('relit-key', '{empty.key(scope=Scope.WRITE)}')")
+        page = context.new_page()
+        page.goto("/")
+        page.get_by_role("button", name="Open the sample owl").click()
+        page.locator(".card", has_text="owl").locator("canvas").wait_for()  # it was checked, and has a view
+        page.get_by_text("Project larch").wait_for()
+        assert sorted(names(page)) == ["environment.exr", "owl"]
+        page.locator(".card a", has_text="owl").click()
+        page.locator("canvas.picture[data-ready]").wait_for()
+        context.close()
 
 
 @pytest.mark.long

@@ -25,7 +25,7 @@ ACTIONS = ("go", "go", "back", "back", "forward", "reload", "tab", "offline", "h
 CONTENT = {"light": "canvas.picture[data-ready]", "object": "canvas.picture[data-ready]", "maps": "canvas.map",
            "capture": "#frames canvas", "job": "#stages tbody tr",
            "jobs": "#jobs tbody a", "captures": "#captures tbody a", "home": ".card",
-           "machines": "#audit tbody tr", "asset": "canvas.scene", "photographs": "[data-shows=photographs] figure canvas"}
+           "machines": "#audit tbody tr", "asset": "canvas.scene[data-share='1']", "photographs": "[data-shows=photographs] figure canvas"}
 
 
 class Restartable:

@@ -29,8 +29,8 @@ def shown(server, material, sky) -> dict[str, str]:
 
 
 CONTENT = {"captures": "#captures a", "jobs": "#jobs tbody a", "job": "#stages tbody tr", "capture": "#frames canvas",
-           "light": "canvas.picture[data-ready]", "maps": "canvas.map", "asset": "canvas.scene", "compare": "canvas.map",
-           "frames": "canvas[data-ready]", "object": "figure canvas", "depth": "canvas.scene", "fault": ".fault-page",
+           "light": "canvas.picture[data-ready]", "maps": "canvas.map", "asset": "canvas.scene[data-share='1']", "compare": "canvas.map",
+           "frames": "canvas[data-ready]", "object": "figure canvas", "depth": "canvas.scene[data-share='1']", "fault": ".fault-page",
            "proposal": ".proposal button"}
 
 

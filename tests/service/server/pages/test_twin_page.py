@@ -44,6 +44,7 @@ def test_the_twin_shows_the_sample(browser, tmp_path):
         brightest = int(np.argmax(steps.reshape(-1, 3)[:, 0]))
         red, green, blue = (round(value / 2.55, 1) for value in steps.reshape(-1, 3)[brightest])
         page.locator("#dome title", has_text=f"lamp {brightest}: {red:.1f} %, {green:.1f} %, {blue:.1f} %").wait_for(state="attached")
+        assert page.evaluate("getComputedStyle(document.body).getPropertyValue('--paper')") != ""  # the colours of the pages are there
         keep(page, "twin", tmp_path)
         stop.set()
         player.join()

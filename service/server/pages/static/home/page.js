@@ -1,6 +1,6 @@
 /** The home page: all captures, sequences, assets and environments as cards, and the jobs above them. */
 
-import { attempt, load, read, Refusal, send } from "../api.js";
+import { attempt, load, newToken, post, read, Refusal, send } from "../api.js";
 import { mountDropZone } from "../upload/drop_zone.js";
 import { byId, show } from "../element.js";
 import { captureOf } from "../view_jobs.js";
@@ -19,6 +19,7 @@ let most = PAGE;
 let isLoaded = false;
 let mayPrepare = true;
 const wanted = { words: byId("search"), order: byId("order"), get kind() { return byId("bar").elements.namedItem("kind"); } };
+const sampleToken = newToken(); // two clicks register one sample
 const jobs = new Jobs(changed);
 const nameOf = (id) => items.get(id)?.name;
 
@@ -126,6 +127,15 @@ async function refresh(id) {
   }
 }
 
+async function openSample() {
+  for (const list of ["captures", "environments"]) put(intakeItem(list, await post(`/v1/samples/${list}`, undefined, { "Idempotency-Key": `${sampleToken}-${list}` })));
+  draw();
+}
+
+async function showProject() {
+  byId("project").textContent = `Project ${(await read("/v1/project")).name}`;
+}
+
 async function fill(list) {
   for await (const item of itemsOf(list)) put(item);
   draw();
@@ -147,11 +157,12 @@ byId("add").addEventListener("click", () => {
 addEventListener("dragenter", () => { openDropZone(); document.body.classList.add("dragging"); });
 for (const over of ["drop", "dragend"]) addEventListener(over, () => document.body.classList.remove("dragging"), true);
 addEventListener("dragleave", (event) => event.relatedTarget === null && document.body.classList.remove("dragging"));
+byId("sample").addEventListener("click", () => attempt(openSample));
 mountDropZone(fill);
 
 await load(async () => {
   await fill("captures");
-  await Promise.all([...LISTS.slice(1).map(fill), jobs.load()]);
+  await Promise.all([...LISTS.slice(1).map(fill), jobs.load(), showProject()]);
   isLoaded = true;
   draw();
   prepareNext();

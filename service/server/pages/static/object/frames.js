@@ -35,16 +35,32 @@ async function player(place, job, isChosen) {
   const strip = element("ol", { class: "filmstrip plain", tabindex: 0, "aria-label": "Filmstrip" });
   const files = element("details", {}, element("summary", {}, `${frames.length === 1 ? "The frame" : `All ${frames.length} frames`} as EXR`),
     element("ul", { class: "plain" }, ...frames.map((result) => element("li", {}, savingLink({ name: result.name, result }), ` ${bytes(result.size)}`))));
-  const pictures = [];
-  let [at, playing] = [0, null];
+  const pictures = []; // as the server sends them: decoded, all of them would take thirty times the memory
+  let [at, playing, isDecoding] = [0, null, false];
 
-  function show(index) {
+  /** Show a frame; while one is decoded, only the last that was asked for waits. */
+  async function show(index) {
+    strip.children[at].firstChild.setAttribute("aria-pressed", "false");
+    strip.children[index].firstChild.setAttribute("aria-pressed", "true");
     at = index;
     slider.value = String(index);
-    const picture = pictures[index];
-    told.textContent = `${frames[index].name} (${index + 1} of ${frames.length})${picture === undefined ? ", its picture is being made" : ""}`;
-    [...strip.children].forEach((each, place) => each.firstChild.setAttribute("aria-pressed", String(place === index)));
-    if (picture === undefined) return;
+    if (isDecoding) return;
+    isDecoding = true;
+    let drawn = null;
+    try {
+      while (drawn !== at && pictures[at] !== undefined) {
+        drawn = at;
+        const picture = await createImageBitmap(pictures[at]);
+        draw(picture);
+        picture.close();
+      }
+    } finally {
+      isDecoding = false;
+    }
+    told.textContent = `${frames[at].name} (${at + 1} of ${frames.length})${drawn === at ? "" : ", its picture is being made"}`;
+  }
+
+  function draw(picture) {
     if (canvas.width !== picture.width || canvas.height !== picture.height) [canvas.width, canvas.height] = [picture.width, picture.height];
     canvas.getContext("2d").drawImage(picture, 0, 0);
   }
@@ -67,14 +83,15 @@ async function player(place, job, isChosen) {
     const small = element("canvas", { height: STRIP_PX });
     const button = strip.children[index].firstChild;
     const path = `/v1/jobs/${job}/pictures/${frames[index].name.split("/").map(encodeURIComponent).join("/")}`;
-    const picture = await createImageBitmap(await fetched(path, (answer) => answer.blob()));
-    pictures[index] = picture;
+    pictures[index] = await fetched(path, (answer) => answer.blob());
+    const picture = await createImageBitmap(pictures[index]);
     small.width = Math.max(1, Math.round((STRIP_PX * picture.width) / picture.height));
     const pen = small.getContext("2d");
     pen.imageSmoothingQuality = "high";
     pen.drawImage(picture, 0, 0, small.width, small.height);
     button.replaceChildren(small);
-    if (index === at) show(index);
+    if (index === at) await show(index);
+    picture.close();
   }
 
   strip.replaceChildren(...frames.map((_, index) => element("li", {}, element("button", { type: "button", class: "bare", "aria-label": `Frame ${index + 1}`, "aria-pressed": "false",

@@ -142,7 +142,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     light();
   }
 
-  view.canvas.addEventListener("webglcontextrestored", () => { lighting.forgetMaps(); light(); });
+  renderer.domElement.addEventListener("webglcontextrestored", () => { lighting.forgetMaps(); light(); });
   control.lit.addEventListener("change", light);
   control.shadows.addEventListener("change", light);
   control.surface.addEventListener("change", () => { surfaces.show(control.surface.value); view.changed(); });
@@ -180,6 +180,7 @@ export async function mount(parent, file, { rig = null, environments = [], load 
     state: () => ({ lit: control.lit.value, environment: map?.name ?? null, turn_degrees: Number(control.turn.value), exposure: Number(control.exposure.value),
       triangles: asset.triangles, points: asset.points, textures: asset.textures, problems: asset.problems, distance: distance.value }),
     picture: () => view.picture(),
+    settled: () => view.settled(),
   };
 }
 

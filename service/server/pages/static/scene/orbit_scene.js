@@ -3,6 +3,7 @@
 import { Box3, PerspectiveCamera, Scene, Sphere, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { element } from "../element.js";
+import { SceneLoop } from "./scene_loop.js";
 
 const FIELD_OF_VIEW = 35; // degrees, of a lens that distorts shapes little
 const MARGIN = 1.15; // around the bounding sphere
@@ -14,9 +15,8 @@ const DRAG_PX = 4; // a pointer that moves farther than this does not click
 const KEYS = "Arrow keys turn it, with Shift they move it, plus and minus zoom, 0 shows the first view.";
 
 export class OrbitScene {
-  #asked = false;
   #controls;
-  #destroyed = false;
+  #loop;
   #observer;
   #pressed = null;
 
@@ -29,7 +29,8 @@ export class OrbitScene {
   constructor(parent, label, { onclick = () => {}, ondraw = () => {}, onfault = () => {} } = {}) {
     this.canvas = element("canvas", { class: "scene", tabindex: 0, role: "img", "aria-label": `${label}. ${KEYS}` });
     parent.append(this.canvas);
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: true, alpha: true });
+    this.renderer = new WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
+    this.#loop = new SceneLoop(this.renderer, this.canvas, () => this.#render());
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW);
     this.ondraw = ondraw;
@@ -42,8 +43,9 @@ export class OrbitScene {
       const box = this.canvas.getBoundingClientRect();
       onclick(new Vector3((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height, 0));
     });
-    this.canvas.addEventListener("webglcontextlost", () => onfault("The graphics processor has stopped. The picture comes back when it does; else load the page again."));
-    this.canvas.addEventListener("webglcontextrestored", () => { onfault(""); this.changed(); });
+    const drawn = this.renderer.domElement;
+    drawn.addEventListener("webglcontextlost", () => onfault("The graphics processor has stopped. The picture comes back when it does; else load the page again."));
+    drawn.addEventListener("webglcontextrestored", () => { onfault(""); this.changed(); });
     this.#observer = new ResizeObserver(() => this.#resize());
     this.#observer.observe(this.canvas);
     this.onclick = onclick;
@@ -69,16 +71,15 @@ export class OrbitScene {
 
   /** Draw soon. */
   changed() {
-    if (this.#asked || this.#destroyed) return;
-    this.#asked = true;
-    requestAnimationFrame(() => {
-      this.#asked = false;
-      if (!this.#destroyed) this.draw();
-    });
+    this.#loop.changed();
   }
 
-  /** Draw now. */
-  draw() {
+  /** Return when what is shown is whole. */
+  settled() {
+    return this.#loop.settled();
+  }
+
+  #render() {
     const distance = this.camera.position.distanceTo(this.#controls.target);
     this.camera.near = distance / 100;
     this.camera.far = distance + 20 * (this.radius ?? 1);
@@ -92,7 +93,7 @@ export class OrbitScene {
    * @returns {{rows: number, cols: number, pixels: Uint8Array}} RGBA [rows, cols, 4] as encoded for the screen, from the top, premultiplied.
    */
   picture() {
-    this.draw();
+    this.#loop.drawNow();
     const gl = this.renderer.getContext();
     const [cols, rows] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     const flipped = new Uint8Array(4 * rows * cols);
@@ -126,7 +127,7 @@ export class OrbitScene {
 
   /** Give everything back. */
   destroy() {
-    this.#destroyed = true;
+    this.#loop.stop();
     this.#observer.disconnect();
     this.#controls.dispose();
     release(this.scene);
@@ -141,7 +142,7 @@ export class OrbitScene {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, LARGEST_RATIO));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
-    this.draw();
+    this.changed();
   }
 
   #key(event) {

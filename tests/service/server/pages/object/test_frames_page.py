@@ -13,7 +13,17 @@ from tests.service.server.pages.frames import encoded
 
 pytestmark = pytest.mark.long
 
-FRAMES = 4
+FRAMES = 12
+MOST_OPEN = 4
+"""Pictures that are decoded at one time: three that come, and one that is shown."""
+COUNT_BITMAPS = """globalThis.openBitmaps = globalThis.mostOpen = 0;
+const decode = createImageBitmap, close = ImageBitmap.prototype.close;
+globalThis.createImageBitmap = async (...given) => {
+  const bitmap = await decode(...given);
+  mostOpen = Math.max(mostOpen, ++openBitmaps);
+  return bitmap;
+};
+ImageBitmap.prototype.close = function () { openBitmaps -= 1; close.call(this); };"""
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +50,7 @@ def test_the_picture_of_a_frame_is_the_frame_as_a_screen_shows_it(server, solved
 
 def test_frames_are_played_recorded_and_saved(page, solved, relit):
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    page.add_init_script(COUNT_BITMAPS)
     page.goto(f"{solved.pages['object']}#mode=frames")
     page.locator("[data-shows=frames] canvas[data-ready]").wait_for()
     assert page.locator(".filmstrip li").count() == FRAMES
@@ -57,6 +68,8 @@ def test_frames_are_played_recorded_and_saved(page, solved, relit):
     with page.expect_download() as download:
         page.get_by_role("button", name="Save a video").click()
     assert download.value.path().read_bytes()[:4] == b"\x1aE\xdf\xa3"  # EBML, of which WebM is made
+    page.wait_for_function("() => openBitmaps === 0")
+    assert 0 < page.evaluate("() => mostOpen") <= MOST_OPEN
     page.get_by_text(f"All {FRAMES} frames as EXR").click()
     with page.expect_download() as download:
         page.get_by_role("link", name="frame.0002.exr").click()

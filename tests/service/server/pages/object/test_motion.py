@@ -28,6 +28,28 @@ SLOW = """async () => {
   const isBand = ({ band }) => band !== undefined;
   return { moving: drawn.filter((each) => !isBand(each)).map(({ stride }) => stride), bands: drawn.filter(isBand), shown };
 }"""
+SLOW_SCENE = """async () => {
+  const { SceneLoop } = await import("/static/scene/scene_loop.js");
+  const [canvas, drawn] = [document.createElement("canvas"), new OffscreenCanvas(400, 400)];
+  const [pen, speed] = [drawn.getContext("2d"), 400]; // pixels per ms: a whole picture takes 400 ms
+  let [size, at, looks] = [null, 0, 0];
+  const gl = { flush: () => {}, isContextLost: () => false, deleteSync: () => {}, SIGNALED: true,
+    fenceSync: () => performance.now() + size[0] * size[1] / speed,
+    getSyncParameter: (time) => { looks += 1; return performance.now() >= time; } };
+  const renderer = { domElement: drawn, getContext: () => gl, getPixelRatio: () => 1,
+    setViewport: (x, y, ...given) => { size = given; } };
+  const loop = new SceneLoop(renderer, canvas, () => { pen.fillStyle = `rgb(${at} 0 0)`; pen.fillRect(0, 400 - size[1], ...size); });
+  const shown = [];
+  new MutationObserver(() => shown.push([Number(canvas.dataset.share), canvas.getContext("2d").getImageData(399, 399, 1, 1).data[0]]))
+    .observe(canvas, { attributes: true });
+  for (at = 0; at < 40; at += 1) {
+    loop.changed();
+    await new Promise(requestAnimationFrame);
+  }
+  loop.changed();
+  await loop.settled();
+  return { shown, looks };
+}"""
 LARGEST_SHIFT = 7e-4
 """Less than a line of text across the page that moves by its own height: 20 × 1248 of 1280 × 860 px, twice, times 20 of 1280 px."""
 SHIFTS = """globalThis.shifts = [];
@@ -47,6 +69,15 @@ def test_a_slow_machine_draws_less_while_something_moves_and_all_of_it_in_bands_
     assert len(bands) > 10  # none of them holds a new motion up for long
     assert [each.get("isSame", False) for each in found["bands"]] == [False, *[True] * (len(bands) - 1)]
     assert found["shown"][-1] == [1, 39] and all(stride > 1 for stride, _ in found["shown"][:-1])
+
+
+@pytest.mark.long
+def test_a_scene_is_shown_when_it_is_drawn_in_fewer_pixels_while_it_moves(page):
+    """The context has nothing that waits for a drawing: a call of it would fail."""
+    page.goto("/jobs")
+    found = page.evaluate(SLOW_SCENE)
+    assert found["shown"][-1] == [1, 40] and all(share < 1 for share, _ in found["shown"][:-1])
+    assert len(found["shown"]) > 2 and found["looks"] >= len(found["shown"])
 
 
 @pytest.mark.long

@@ -5,6 +5,9 @@ import re
 import numpy as np
 import pytest
 
+from service.requests.base.identifiers import CAPTURE, JOB, new_id
+from service.requests.jobs import DepthJob
+from service.server.database import jobs
 from stage.formats import exr
 from tests.service.server.api.job_calls import admitted
 from tests.service.server.pages.axe import violations
@@ -97,3 +100,27 @@ def test_no_violation(browser, server, depth):
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     assert violations(page) == []
     page.close()
+
+
+def test_other_scans_are_chosen_to_be_fused(page, server, depth):
+    """The capture of the other scan was deleted; its depth goes by the name of its job, which is hostile."""
+    other, name = new_id(JOB), "<img src=x onerror=alert(1)> other side"
+    page.on("dialog", lambda dialog: pytest.fail(dialog.message))
+    with server.database() as database:
+        database.transact(lambda connection: jobs.insert(
+            connection, project="default", key=None, request=DepthJob(kind="depth", capture=new_id(CAPTURE), name=name), chunk_frames=8,
+            inputs=[], finished=other))
+    with server.client() as client:
+        capture = client.get(f"/v1/jobs/{depth[0]}").json()["request"]["capture"]
+        page.goto(f"/object/{capture}")
+        page.get_by_text("Fuse with other scans").click()
+        page.get_by_role("button", name="Find the poses").click()
+        page.get_by_text("Choose at least one other scan.").wait_for()
+        page.get_by_label(name, exact=True).check()
+        with page.expect_response(lambda answer: answer.request.method == "POST" and answer.url.endswith("/v1/jobs")) as answered:
+            page.get_by_role("button", name="Find the poses").click()
+        assert answered.value.status == 202
+        made = answered.value.json()
+        assert made["request"]["kind"] == "register" and made["request"]["depths"] == [depth[0], other]
+        page.locator(f"a[href='/jobs/{made['id']}']").first.wait_for()
+        client.post(f"/v1/jobs/{made['id']}/cancel")
