@@ -4,7 +4,6 @@ import { DataTexture, DirectionalLight, EquirectangularReflectionMapping, FloatT
 
 const LARGEST_COLS = 1024; // of a map: three.js makes cubes of a quarter of it
 const QUARTER = 4; // three.js has +x in the middle of a map, Relit +z: a quarter of the width
-const LEAST_FACE = 64; // texels in a row of a filtered map: four levels of roughness
 const KEPT = 2; // filtered maps: the first, which is the room, and the one that was opened last
 const SHADOW_PX = 2048; // of the shadow map in each direction
 const SHADOW_BIAS = 0.01; // in radii of the object, along the normal: half a pixel of the map at 85° from the light
@@ -73,13 +72,6 @@ function latLongTexture(map) {
   return texture;
 }
 
-/** Filters a map for all roughnesses on faces as large as the map has texels for, and not on the 256 × 256 texels that three.js takes at least. */
-class Filter extends PMREMGenerator {
-  _setSize(side) {
-    this._cubeSize = Math.max(LEAST_FACE, 2 ** Math.floor(Math.log2(side)));
-  }
-}
-
 /** Lights a scene in one way at a time. */
 export class Lighting {
   #scene;
@@ -116,7 +108,7 @@ export class Lighting {
 
   #filter(map) {
     const texture = latLongTexture(map);
-    const generator = new Filter(this.#renderer);
+    const generator = new PMREMGenerator(this.#renderer);
     const filtered = generator.fromEquirectangular(texture);
     generator.dispose();
     texture.dispose();
