@@ -11,7 +11,7 @@ from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
 from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
-from service.scans.registration.fine import TUKEY, Fit, fit
+from service.scans.registration.fine import TUKEY, Fit, Held, fit
 from service.scans.registration.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
 
 FEATURE_CELLS = 5.0
@@ -137,15 +137,19 @@ def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float,
     return _best(a, b, _settled(a, b, poses, cell_m), numbers, cell_m, least_overlap)
 
 
-def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float,
+           decides: bool = False) -> Pair:
     """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`.
 
     The fine scale is tried at once. The rough scale has few points, and only leads there where the start does not.
+
+    Args:
+        decides: whether the start is taken in directions that the surfaces leave open.
     """
-    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, from_start=True)
+    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, start=start, decides=decides)
     if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
         return pair
-    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, from_start=True)
+    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, start=start, decides=decides)
 
 
 def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -> Iterator[np.ndarray]:
@@ -172,8 +176,8 @@ def fits_roughly(found: Fit, a: Prepared, b: Prepared, cell_m: float) -> bool:
 
 
 def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float, *,
-          from_start: bool = False) -> Pair:
-    """Return the best pair of poses that are tried; `from_start`: of the one that is given, so that others far from it are none."""
+          start: np.ndarray | None = None, decides: bool = False) -> Pair:
+    """Return the best pair of poses that are tried; `start`: the one that is given, so that others far from it are none."""
     found: list[Pair] = []
     for pose in poses:
         settled = fitted(a, b, pose, cell_m)
@@ -189,16 +193,17 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
     if rival is not None:
         return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
-    tried = _tried_out(a, b, best, cell_m, least_overlap, from_start)
+    tried = _tried_out(a, b, best, cell_m, least_overlap, start, decides)
     if tried.state is PairState.JOINED and tried.fit is not None:
         tried = tried._replace(fit=_doubted(a.fine, b.fine, tried.fit, 1.5 * max(a.spacing, b.spacing)))
     return tried
 
 
-def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
+def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None, held: Held | None = None
+           ) -> Fit | None:
     """Return the fit of so many points at the fine scale from a start; None if there is none."""
     spacing = max(a.spacing, b.spacing)
-    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most)
+    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most, held=held)
 
 
 def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
@@ -225,23 +230,38 @@ def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least
 def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
     """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
     other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
-    return found if other is None else doubted(found, other.pose)
+    return found if other is None else doubted(found, step_between(other.pose @ inverse(found.pose), found.pivot)[None])
 
 
-def doubted(found: Fit, pose: np.ndarray) -> Fit:
-    """Return a fit whose σ holds the motion to another pose, as a doubt beside the noise."""
-    doubt = step_between(pose @ inverse(found.pose), found.pivot)
-    pull = found.information @ doubt
-    return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
+def doubted(found: Fit, motions: np.ndarray) -> Fit:
+    """Return a fit whose σ holds motions about its pivot, [k, 6], as doubts beside the noise."""
+    pull = found.information @ motions.T
+    held = pull @ np.linalg.solve(np.eye(len(motions)) + motions @ pull, pull.T)
+    return found._replace(doubt=np.concatenate([found.doubt, motions]), information=found.information - held)
 
 
-def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, from_start: bool) -> Pair:
-    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
+def _at_start(a: Prepared, b: Prepared, best: Pair, start: np.ndarray, steps: np.ndarray, cell_m: float, least_overlap: float, words: str
+              ) -> Pair:
+    """Return the pair as it fits without a motion away from its start in directions that the surfaces leave open, steps [k, 6] of which
+    each moves the points by about their size: there its σ is a cell, as near as starts are right."""
+    assert best.fit is not None
+    found = fitted(a, b, start, cell_m, held=Held(steps, best.fit.pivot))
+    if found is None:
+        return best._replace(state=PairState.AMBIGUOUS, reason=words)
+    pair = judged(a, b, found, (best.a, best.b), least_overlap)
+    if pair.state is not PairState.JOINED:
+        return pair
+    return pair._replace(fit=doubted(found, steps * (cell_m * step_units(b)[0])),
+                         reason=f"{words}: its start is taken there, as right to {1e3 * cell_m:.3g} mm")
+
+
+def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, start: np.ndarray | None, decides: bool) -> Pair:
+    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well, unless the start decides."""
     assert best.fit is not None
     units = step_units(b)
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
     near = NEAR_SHIFT * max(a.spacing, b.spacing)
-    shifts, reach = ((near * units[0], -near * units[0]), near) if from_start else (SHIFTS, cell_m)
+    shifts, reach = ((near * units[0], -near * units[0]), near) if start is not None else (SHIFTS, cell_m)
     undetermined = []
     for value, axis in zip(values, axes.T, strict=True):
         noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
@@ -253,8 +273,10 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
     if not undetermined:
         return best
     kind = "turned about an axis" if np.linalg.norm(undetermined[0][:3]) > 0.5 else "shifted along itself"
-    return best._replace(state=PairState.AMBIGUOUS,
-                         reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
+    words = f"the surface looks the same when it is {kind}, so that its pose is not determined"
+    if decides and start is not None:
+        return _at_start(a, b, best, start, np.array(undetermined), cell_m, least_overlap, words)
+    return best._replace(state=PairState.AMBIGUOUS, reason=words)
 
 
 def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
