@@ -44,6 +44,8 @@ BENT, WEAKLY_BENT = 0.18, 1.5
 the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .06 to .18 about its axis at
 spacings of 6 to 20 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
 details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
+FEW_MATCHES, FEW_DETERMINED, FEW_BENT = 200, 10.0, 0.3
+"""The same of fewer matches than this: those of a stem, joined to its turned self, come back too."""
 TRIED_POINTS = 800
 """The most points of the fit that is first tried out."""
 SHIFTS = (0.05, -0.05, 0.1, -0.1, 0.3, -0.3, 0.6, -0.6)
@@ -263,11 +265,12 @@ def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overla
     near = NEAR_SHIFT * max(a.spacing, b.spacing)
     shifts, reach = ((near * units[0], -near * units[0]), near) if start is not None else (SHIFTS, cell_m)
     undetermined = []
+    least, least_bent = (NOT_DETERMINED, BENT) if best.fit.matches >= FEW_MATCHES else (FEW_DETERMINED, FEW_BENT)
     for value, axis in zip(values, axes.T, strict=True):
         noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
                                   for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
         step = units * axis / units[0]
-        if value < NOT_DETERMINED * noise or value < BENT * even_bend or ((value < WEAK * noise or value < WEAKLY_BENT * bend) and any(
+        if value < least * noise or value < least_bent * even_bend or ((value < WEAK * noise or value < WEAKLY_BENT * bend) and any(
                 _stays_away(a, b, best, shift * step, shift, reach, least_overlap) for shift in shifts)):
             undetermined.append(step)
     if not undetermined:
