@@ -306,6 +306,7 @@ def _stays_away(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, shift: f
         kept = abs(float(step_between(found.pose @ inverse(best.fit.pose), best.fit.pivot) @ step / (step @ step)))
         if kept <= min(KEPT, RETURNED / abs(shift)):
             return False
+    assert found is not None
     return _as_good(judged(a, b, found, (best.a, best.b), least_overlap), best)
 
 

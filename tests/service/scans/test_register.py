@@ -124,7 +124,7 @@ def test_starts_decide_where_the_surface_does_not(relit, tmp_path):
     The direction that is open is found from noisy normals, so that a fifth of a degree of the fit's own way is left.
     """
     seen = views(vase, 0, 30)
-    turn = rotation_about(np.array([0.0, 1.0, 0.0]), 0.5)
+    turn = rotation_about((0.0, 1.0, 0.0), 0.5)
     poses = [view.world_from_scan @ np.eye(4) for view in seen]
     poses[1][:3] = turn @ poses[1][:3]
     poses[1][1, 3] += 3 * MM
