@@ -54,6 +54,9 @@ class RegisterOptions(Options):
     """Least part of the smaller of two scans that must lie on the surface of the other."""
     accept: Accepted | None = None
     """Poses that are taken although the evidence is open. None: they are refused."""
+    starts: bool = False
+    """Take poses of the file, or of the turntable, where they fit and the surfaces do not decide, as of a vase about its axis: σ there is a
+    cell (`cell_m`)."""
     reference: Line | None = None
     """Name of the scan whose pose stays. None: the first with a pose, or the first."""
     markers: Markers | None = None
@@ -90,6 +93,9 @@ class RegisterRequest(RegisterOptions):
     def _check(self) -> Self:
         if self.turntable is not TableUse.START and self.poses is GivenPoses.IGNORED:
             raise ValueError(f"poses is ignored, but turntable is {self.turntable}: give one of them")
+        if self.starts and (self.poses is GivenPoses.IGNORED or self.turntable is TableUse.FIXED):
+            other = f"poses is {self.poses}" if self.poses is GivenPoses.IGNORED else f"turntable is {self.turntable}"
+            raise ValueError(f"starts: is given, but {other}: give one of them")
         return self
 
 

@@ -165,11 +165,14 @@ def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: Share
     missed = _missed(request, known)
     timings.stage("register", 100)
     options = RegistrationOptions(cell_m=request.cell_m, least_overlap=request.least_overlap, reference=reference,
-                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, threads=threads)
+                                  accept_alike=request.accept is Accepted.LOOK_ALIKE, starts_decide=request.starts, threads=threads)
     said += missed + _without_viewpoint(listed, known)
+    starts = _starts(request, listed, known)
+    if request.starts and sum(start is not None for start in starts) < 2:
+        raise RequestError(f"--starts: {file} has no two scans with a pose: give scan_to_world, or a turntable with angles_deg")
     try:
-        found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], _starts(request, listed, known),
-                            options, table=table if request.turntable is TableUse.ANGLES else None,
+        found = register_by(kept, [scan.name for scan in known], [scan.extent_m for scan in known], starts, options,
+                            table=table if request.turntable is TableUse.ANGLES else None,
                             targets={number: scan.targets for number, scan in enumerate(known)}, advance=timings.advance_percent)
     except NoneJoinedError as error:
         return _Placed(known, {}, {}, error.alone, error.pairs, {"method": PAIRS}, said, error)

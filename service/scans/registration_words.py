@@ -45,6 +45,8 @@ def registration_warnings(found: Registration, scans: Sequence[ScanFacts]) -> li
         if weight <= REFUSED:
             out.append(f"{scans[pair.a].name} and {scans[pair.b].name}: the loops through other scans contradict their pose by "
                        f"{pair.by.value}, which counts as nothing")
+    out += [f"{scans[pair.a].name} and {scans[pair.b].name}: {pair.reason}" for pair, _ in found.kept
+            if pair.reason and pair.by is Evidence.SURFACES]
     if found.alike_turned:
         out.append(f"{', '.join(scans[number].name for number in found.alike_turned)}: look much the same when they are turned about an "
                    "axis: only what sticks out tells their poses from turned ones, which may fit as well and have a small σ: look at the "

@@ -37,8 +37,8 @@ def covariances(solved: Solved, pairs: Sequence[Pair], edges: Sequence[Edge], ro
     onto = [_onto(edge, solved, place) for edge in edges]
     for pair, weight, jacobian in zip(pairs, solved.weights, onto, strict=True):
         assert pair.fit is not None
-        pull = jacobian.T @ (weight * pair.fit.information @ pair.fit.doubt)
-        spread += np.outer(pull, pull)
+        pull = jacobian.T @ (weight * pair.fit.information @ pair.fit.doubt.T)
+        spread += pull @ pull.T
     for number in order:
         of_scan = [k for k, pair in enumerate(pairs) if number in (pair.a, pair.b)]
         if not of_scan:

@@ -38,7 +38,7 @@ class Fit(NamedTuple):
 
     pose: np.ndarray  # [4, 4] a_from_b
     pivot: np.ndarray  # [3] metres, frame of a: the mean of the matched points, about which rotations count
-    doubt: np.ndarray  # [6] a motion about the pivot by which the pose may be wrong beside the noise; its square is in `information`
+    doubt: np.ndarray  # [k, 6] motions about the pivot by which the pose may be wrong beside the noise; `information` is less by them
     information: np.ndarray  # [6, 6] of rotation vector (radians) and translation (metres), frame of a
     normal: np.ndarray  # [6, 6] the matrix of the normal equations of `rows`
     noise: np.ndarray  # [6, 6] the part of it that noise in the normals alone would make
@@ -53,6 +53,19 @@ class Fit(NamedTuple):
     matches: int  # with a weight above 0
 
 
+class Held(NamedTuple):
+    """Motions of a scan that a fit does not make."""
+
+    motions: np.ndarray  # [k, 6] about the pivot
+    pivot: np.ndarray  # [3] metres, frame of a
+
+    def free(self, pivot: np.ndarray, size: float) -> np.ndarray:
+        """Return the motions about another pivot that are left, [6, 6 - k]: at right angles to the others for points of a size, metres."""
+        turn = self.motions[:, :3]
+        there = np.concatenate([turn, self.motions[:, 3:] + np.cross(turn, pivot - self.pivot)], axis=1)
+        return np.asarray(np.linalg.svd(there * np.array([size**2] * 3 + [1.0] * 3))[2][len(there):].T)
+
+
 class Rows(NamedTuple):
     """The matched points of a fit, each a row of its least squares."""
 
@@ -63,13 +76,15 @@ class Rows(NamedTuple):
     sigma_b: np.ndarray  # [k] float32
 
 
-def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float], *, most: int | None = None) -> Fit | None:
+def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float], *, most: int | None = None, held: Held | None = None
+        ) -> Fit | None:
     """Move scan b until its surface lies on that of scan a.
 
     Args:
         start: [4, 4] a_from_b.
         reaches: the largest distances, metres, at which points are matched, one after the other.
         most: the most points of b that are matched; None: all that are drawn.
+        held: motions that are not made; None: all are.
 
     Returns:
         The fit, or None if fewer than `LEAST_MATCHES` points can be matched or they do not determine a pose at all.
@@ -85,12 +100,14 @@ def fit(a: Cloud, b: Cloud, start: np.ndarray, reaches: list[float], *, most: in
             if found is None:
                 return None
             system = _system(found)
+            size = float(np.sqrt(np.sum((found.placed - system.pivot) ** 2) / len(found.placed)))
+            free = np.eye(6) if held is None else held.free(system.pivot, size)
             try:
-                step = -np.linalg.solve(system.information + 1e-9 * np.trace(system.information) / 6 * np.eye(6), system.gradient)
+                normal = free.T @ (system.information + 1e-9 * np.trace(system.information) / 6 * np.eye(6)) @ free
+                step = -free @ np.linalg.solve(normal, free.T @ system.gradient)
             except np.linalg.LinAlgError:
                 return None
             pose = moved(step, system.pivot, pose)
-            size = float(np.sqrt(np.sum((found.placed - system.pivot) ** 2) / len(found.placed)))
             enough = STILL * found.scale / np.sqrt(len(found.at)) if last else NEARLY_STILL * found.scale
             if float(np.linalg.norm(step[:3])) * size + float(np.linalg.norm(step[3:])) < enough:
                 break
@@ -115,7 +132,7 @@ def _result(a: Cloud, found: "_Matches", pose: np.ndarray) -> Fit:
     scale = -float(weight @ (grow * found.distance) - cross @ solved[:, 1]) / left if left > 0 else 0.0
     rows = Rows(found.at, found.of, system.weighted.astype(np.float32), found.sigma_a.astype(np.float32), found.sigma_b.astype(np.float32))
     scale_sigma = float(np.sqrt(squared / left)) if left > 0 else float("inf")
-    return Fit(pose=pose, pivot=system.pivot, doubt=np.zeros(6), information=system.information / squared, normal=system.information,
+    return Fit(pose=pose, pivot=system.pivot, doubt=np.zeros((0, 6)), information=system.information / squared, normal=system.information,
                noise=system.noise, bend=system.bend, even_bend=system.even_bend, residual=found.scale, ratio=found.ratio,
                together=together, scale=scale,
                scale_sigma=scale_sigma, rows=rows, matches=int((found.weight > 0).sum()))

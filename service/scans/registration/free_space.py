@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, maximum_filter, minimum_filter
 
 from service.scans.points.cloud import Cloud
+from service.scans.points.neighbours import Neighbours
 from service.scans.points.rigid import applied, inverse
 from service.scans.points.scan import Scan
 from stage.capture.camera import Camera
@@ -32,6 +33,13 @@ FACING = 0.35
 """Cosine of the angle between the normal of a surface and a line of sight from which on the camera cannot have missed the surface: a sheet
 seen edge-on lies between its pixels."""
 
+RAYS, LEAST_RAYS, RAY_REACH = 6, 4, 1.5
+"""Points of a set around a line of sight that are asked how far the surface is, fewest of them within `RAY_REACH` distances of neighbouring
+points that tell it."""
+HIDES, MOST_HIDDEN = 6.0, 0.1
+"""A point is behind others of its set from so many distances of neighbours on. A set of which more than this part is was not seen from one
+place, and says nothing."""
+
 
 class Sight(NamedTuple):
     """Numbers of points of one scan that another scan sees, or contradicts."""
@@ -56,6 +64,8 @@ class Contradiction(NamedTuple):
     """The part of all contradicted points."""
     surface: float
     """The part of the contradicted points on surface that the other camera cannot have missed."""
+    before_sets: float
+    """The part of the points that lie before the surface of sets of points, of those that their lines of sight pass."""
 
 
 def depth_range(scan: Scan) -> DepthRange | None:
@@ -110,14 +120,16 @@ def _seen(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np
 
 def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cloud_b: Cloud, pose: np.ndarray, tolerance: float
                   ) -> Contradiction:
-    """Return which parts of the points in sight lie where the other camera saw through, at a pose a_from_b; a set of points says nothing.
+    """Return which parts of the points in sight lie where the other camera or scanner saw through, at a pose a_from_b.
 
     On a part of the surface lie points whose neighbours are contradicted too, that are on no border and that the other camera does not see
     edge-on: where a pixel takes in the edge of a surface and what is behind it, its point lies on neither.
     """
-    through = contradicted = in_sight = 0
-    for image, cloud, way in ((a, cloud_b, pose), (b, cloud_a, inverse(pose))):
+    through = contradicted = in_sight = before_sets = on_sets = 0
+    for image, own, cloud, way in ((a, cloud_a, cloud_b, pose), (b, cloud_b, cloud_a, inverse(pose))):
         if image is None:
+            of_set = _seen_by_set(own, cloud.points[cloud.sample], way, tolerance)
+            before_sets, on_sets = before_sets + of_set.contradicted, on_sets + of_set.agreeing
             continue
         before, on, _ = _seen(image, cloud.points, way, tolerance)
         at = np.flatnonzero(before & ~cloud.border)
@@ -127,7 +139,34 @@ def contradiction(a: DepthRange | None, b: DepthRange | None, cloud_a: Cloud, cl
             through += int((before[around[:, 1:]].mean(axis=1) >= MOST_ALIKE).sum())
         contradicted += int(before.sum())
         in_sight += int(before.sum() + on.sum())
-    return Contradiction(contradicted / max(in_sight, 1), through / max(in_sight, 1))
+    return Contradiction(contradicted / max(in_sight, 1), through / max(in_sight, 1), before_sets / max(before_sets + on_sets, 1))
+
+
+def _seen_by_set(cloud: Cloud, points: np.ndarray, pose: np.ndarray, tolerance: float) -> Sight:
+    """Compare points of another scan with a set of points, from where its lines of sight come together; arguments as of `sight`."""
+    own = cloud.points[cloud.sample]
+    spacing = float(np.median(cloud.spacing)) * float(np.sqrt(len(cloud.points) / len(own)))
+    across = np.eye(3) - cloud.directions[cloud.sample][:, :, None] * cloud.directions[cloud.sample][:, None, :]
+    together = across.sum(axis=0) + 1e-12 * len(own) * np.eye(3)  # parallel lines meet nowhere
+    origin = np.linalg.solve(together, (across @ own[:, :, None]).sum(axis=0)[:, 0])
+    length = np.linalg.norm(own - origin, axis=1)
+    if not length.min() > 0:
+        return Sight(0, 0, 0)
+    rays, reach = Neighbours((own - origin) / length[:, None]), RAY_REACH * spacing / float(np.median(length))
+
+    def ranges(of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        far = np.linalg.norm(of - origin, axis=1)
+        index, apart = rays.nearest((of - origin) / np.maximum(far, np.finfo(np.float64).tiny)[:, None], RAYS)
+        near = apart < reach
+        least, most = (np.where(near, length[index], none) for none in (np.inf, -np.inf))
+        return far, least.min(axis=1), most.max(axis=1), near.sum(axis=1) >= LEAST_RAYS
+
+    far, least, _, _ = ranges(own)
+    if (far - least > HIDES * spacing).mean() > MOST_HIDDEN:
+        return Sight(0, 0, 0)
+    far, least, most, judged = ranges(applied(pose, points))
+    before = judged & (far < least - tolerance - spacing)
+    return Sight(int((judged & ~before & (far <= most + tolerance + spacing)).sum()), int(before.sum()), int(judged.sum()))
 
 
 def _facing(image: DepthRange, points: np.ndarray, normals: np.ndarray, pose: np.ndarray) -> np.ndarray:

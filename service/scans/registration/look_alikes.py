@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from service.scans.points.rigid import inverse, screwed
+from service.scans.points.rigid import inverse, screwed, step_between
 from service.scans.registration.coarse import is_near
 from service.scans.registration.fine import fit
 from service.scans.registration.pairs import (
@@ -61,7 +61,8 @@ def told_from_turned(a: Prepared, b: Prepared, best: Pair, *, cell_m: float, lea
         words = (f"it fits as well when it is turned by {np.degrees(np.arccos(np.clip(cosine, -1, 1))):.0f}°, with {rival.overlap:.0%} of "
                  f"the surface matched instead of {best.overlap:.0%}, and nothing that was seen tells which is right")
         if accept:
-            return best._replace(fit=doubted(best.fit, found.pose), reason=words + ": accepted")
+            apart = step_between(found.pose @ inverse(best.fit.pose), best.fit.pivot)
+            return best._replace(fit=doubted(best.fit, apart[None]), reason=words + ": accepted")
         return best._replace(state=PairState.AMBIGUOUS, reason=words)
     return best
 

@@ -44,6 +44,8 @@ class PairTask(NamedTuple):
     """True if the pose is searched if the start does not lead to one."""
     accept_alike: bool = False
     """True if a pose that was searched is taken although the scans fit as well when they are turned."""
+    start_decides: bool = False
+    """True if the start is taken in directions that the surfaces leave open, and nothing is searched in its place."""
 
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:
@@ -63,8 +65,9 @@ def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[flo
             b, cell = _part_around(b, a, inverse(task.start), cell)
         if min(len(a.rough.points), len(b.rough.points)) == 0 or overlap_of(a, b, task.start, task.near_cells * cell) < least_overlap:
             return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
-        pair = refine(a, b, task.start, numbers=numbers, cell_m=cell, least_overlap=least_overlap)
-        if not task.may_search or pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
+        pair = refine(a, b, task.start, numbers=numbers, cell_m=cell, least_overlap=least_overlap,
+                      decides=task.start_decides)
+        if not task.may_search or task.start_decides or pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
             return pair
     return told_from_turned(a, b, search(a, b, numbers=numbers, cell_m=cell, least_overlap=least_overlap), cell_m=cell,
                             least_overlap=least_overlap, accept=task.accept_alike)

@@ -11,7 +11,7 @@ from service.scans.points.cloud import Cloud, cloud_of, rough_scan, thinned_scan
 from service.scans.points.rigid import applied, inverse, moved, step_between
 from service.scans.points.scan import Scan
 from service.scans.registration.coarse import fpfh, is_near, rough_poses
-from service.scans.registration.fine import TUKEY, Fit, fit
+from service.scans.registration.fine import TUKEY, Fit, Held, fit
 from service.scans.registration.free_space import Contradiction, DepthRange, both_sights, contradiction, depth_range
 
 FEATURE_CELLS = 5.0
@@ -25,6 +25,9 @@ CONTRADICTED = 0.1
 SEEN_THROUGH = 0.002
 """The same of points that belong to a part of the surface which faces the camera: parts that stick out tell a body from its turned self.
 Right poses of the statue of tests/scenes leave none to .0007, those that are turned by a quarter or a half .0023 and more."""
+BEFORE_SETS = 0.03
+"""The same of points before the surface of a set of points, whose scanner is often known to 20° alone. Right pairs of a real dragon leave
+none to .02, with few points and noise too; of wrong ones nearly all leave more, and none that leaves less passes the other tests."""
 MATCHED_CONTRADICTED, ROUGH_CONTRADICTED = 0.4, 0.25
 """The same of a pose from matched features, and after its fit at the rough scale."""
 BEND = 0.12
@@ -33,22 +36,25 @@ ROUGH_BEND = 0.15
 """The largest residual of a rough pose in cells: right poses leave .05 of a cell on a statue, wrong ones .3 and more."""
 RATIO = 2.5
 """The largest residual in units of σ of scans whose residual is above `BEND`."""
-NOT_DETERMINED, WEAK = 10.0, 60.0
+NOT_DETERMINED, WEAK = 4.0, 60.0
 """A direction whose information is less than this many times what the noise of the normals makes alone is not determined, or is tried out.
-A vase has 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
-BENT, WEAKLY_BENT = 0.3, 1.5
+A vase has up to 4 about its axis; the statue of tests/scenes has 140 and more at overlaps above a tenth."""
+BENT, WEAKLY_BENT = 0.18, 1.5
 """The same against what normals make that are as wrong as those of 8 neighbours differ from those of 16: that is too much, but grows with
-the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .1 to .2 about its axis at
-spacings of 6 to 17 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
+the spacing of the points and with the bend of the surface, as the error of the normals does. A vase has .06 to .18 about its axis at
+spacings of 6 to 20 mm, the statue .5 and more. Edges are left out of the first rule: a courtyard whose points are as far apart as its
 details are large has .2 with them and 5 to 50 without, and is tried out for the second."""
+FEW_MATCHES, FEW_DETERMINED, FEW_BENT = 200, 10.0, 0.3
+"""The same of fewer matches than this: those of a stem, joined to its turned self, come back too."""
 TRIED_POINTS = 800
 """The most points of the fit that is first tried out."""
-SHIFTS = (0.1, -0.1, 0.3)
-"""Distances, in parts of the size of the scans, by which a scan is moved along a weak direction to try it out."""
+SHIFTS = (0.05, -0.05, 0.1, -0.1, 0.3, -0.3, 0.6, -0.6)
+"""Distances, in parts of the size of the scans, by which a scan is moved along a weak direction to try it out. Right pairs of few or noisy
+points of a real dragon come back from all; bodies of revolution, balls, pillars and plates stay away at one or another."""
 NEAR_SHIFT = 3.0
 """The same from a start, in spacings: a place far from the start is none."""
-KEPT = 0.3
-"""The part of such a shift that is left after a fit, from which on the scan slides along the direction."""
+KEPT, RETURNED = 0.3, 0.02
+"""The part of such a shift, and the part of the size, of which the smaller is the most that is left where a scan comes back."""
 AS_GOOD, LEAST_ALIKE, MORE_CONTRADICTED = 1.15, 0.6, 0.01
 """Another pose fits as well if its residual is at most this many times that of the best, its overlap at least that part of it, and not
 this much more of it is contradicted."""
@@ -115,7 +121,7 @@ class Prepared:
 
 def is_contradicted(found: Contradiction) -> bool:
     """Return whether the free space of two scans refuses a pose."""
-    return found.points > CONTRADICTED or found.surface > SEEN_THROUGH
+    return found.points > CONTRADICTED or found.surface > SEEN_THROUGH or found.before_sets > BEFORE_SETS
 
 
 def prepare(scan: Scan, *, cell_m: float, threads: int = 1) -> Prepared:
@@ -133,15 +139,19 @@ def search(a: Prepared, b: Prepared, *, numbers: tuple[int, int], cell_m: float,
     return _best(a, b, _settled(a, b, poses, cell_m), numbers, cell_m, least_overlap)
 
 
-def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float) -> Pair:
+def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, int], cell_m: float, least_overlap: float,
+           decides: bool = False) -> Pair:
     """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`.
 
     The fine scale is tried at once. The rough scale has few points, and only leads there where the start does not.
+
+    Args:
+        decides: whether the start is taken in directions that the surfaces leave open.
     """
-    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, from_start=True)
+    pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, start=start, decides=decides)
     if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
         return pair
-    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, from_start=True)
+    return _best(a, b, _settled(a, b, [start], cell_m), numbers, cell_m, least_overlap, start=start, decides=decides)
 
 
 def _settled(a: Prepared, b: Prepared, poses: list[np.ndarray], cell_m: float) -> Iterator[np.ndarray]:
@@ -168,8 +178,8 @@ def fits_roughly(found: Fit, a: Prepared, b: Prepared, cell_m: float) -> bool:
 
 
 def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[int, int], cell_m: float, least_overlap: float, *,
-          from_start: bool = False) -> Pair:
-    """Return the best pair of poses that are tried; `from_start`: of the one that is given, so that others far from it are none."""
+          start: np.ndarray | None = None, decides: bool = False) -> Pair:
+    """Return the best pair of poses that are tried; `start`: the one that is given, so that others far from it are none."""
     found: list[Pair] = []
     for pose in poses:
         settled = fitted(a, b, pose, cell_m)
@@ -185,16 +195,17 @@ def _best(a: Prepared, b: Prepared, poses: Iterator[np.ndarray], numbers: tuple[
     rival = next((pair for pair in found[1:] if _as_good(pair, best)), None)
     if rival is not None:
         return best._replace(state=PairState.AMBIGUOUS, reason="poses that lie apart fit alike: the surface repeats itself")
-    tried = _tried_out(a, b, best, cell_m, least_overlap, from_start)
+    tried = _tried_out(a, b, best, cell_m, least_overlap, start, decides)
     if tried.state is PairState.JOINED and tried.fit is not None:
         tried = tried._replace(fit=_doubted(a.fine, b.fine, tried.fit, 1.5 * max(a.spacing, b.spacing)))
     return tried
 
 
-def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None) -> Fit | None:
+def fitted(a: Prepared, b: Prepared, start: np.ndarray, cell_m: float, most: int | None = None, held: Held | None = None
+           ) -> Fit | None:
     """Return the fit of so many points at the fine scale from a start; None if there is none."""
     spacing = max(a.spacing, b.spacing)
-    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most)
+    return fit(a.fine, b.fine, start, [max(cell_m, 3 * spacing), 3 * spacing, 1.5 * spacing], most=most, held=held)
 
 
 def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least_overlap: float) -> Pair:
@@ -211,7 +222,8 @@ def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least
         if SCALE_LEAST < abs(found.scale) < SCALE_MOST and abs(found.scale) > SCALE_SIGMAS * found.scale_sigma:
             reason += f", and one is {abs(found.scale):.2%} larger than the other: check its scale"
     elif is_contradicted(against):
-        state, reason = PairState.CONTRADICTED, f"{against.points:.1%} of the points in sight lie where the other camera saw through"
+        state = PairState.CONTRADICTED
+        reason = f"{max(against.points, against.before_sets):.1%} of the points in sight lie where the other camera saw through"
     elif overlap < least_overlap:
         state, reason = PairState.LITTLE_OVERLAP, f"only {overlap:.1%} of the smaller surface is matched"
     return Pair(*numbers, state, found, overlap, against.points, reason)
@@ -220,51 +232,54 @@ def judged(a: Prepared, b: Prepared, found: Fit, numbers: tuple[int, int], least
 def _doubted(a: Cloud, b: Cloud, found: Fit, reach: float) -> Fit:
     """Return a fit with what another choice of the normals does to its pose, which is about what the spacing of the points does."""
     other = fit(replace(a, normals=a.near_normals), replace(b, normals=b.near_normals), found.pose, [reach])
-    return found if other is None else doubted(found, other.pose)
+    return found if other is None else doubted(found, step_between(other.pose @ inverse(found.pose), found.pivot)[None])
 
 
-def doubted(found: Fit, pose: np.ndarray) -> Fit:
-    """Return a fit whose σ holds the motion to another pose, as a doubt beside the noise."""
-    doubt = step_between(pose @ inverse(found.pose), found.pivot)
-    pull = found.information @ doubt
-    return found._replace(doubt=doubt, information=found.information - np.outer(pull, pull) / (1 + doubt @ pull))
+def doubted(found: Fit, motions: np.ndarray) -> Fit:
+    """Return a fit whose σ holds motions about its pivot, [k, 6], as doubts beside the noise."""
+    pull = found.information @ motions.T
+    held = pull @ np.linalg.solve(np.eye(len(motions)) + motions @ pull, pull.T)
+    return found._replace(doubt=np.concatenate([found.doubt, motions]), information=found.information - held)
 
 
-def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, from_start: bool) -> Pair:
-    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well."""
+def _at_start(a: Prepared, b: Prepared, best: Pair, start: np.ndarray, steps: np.ndarray, cell_m: float, least_overlap: float, words: str
+              ) -> Pair:
+    """Return the pair as it fits without a motion away from its start in directions that the surfaces leave open, steps [k, 6] of which
+    each moves the points by about their size: there its σ is a cell, as near as starts are right."""
+    assert best.fit is not None
+    found = fitted(a, b, start, cell_m, held=Held(steps, best.fit.pivot))
+    if found is None:
+        return best._replace(state=PairState.AMBIGUOUS, reason=words)
+    pair = judged(a, b, found, (best.a, best.b), least_overlap)
+    if pair.state is not PairState.JOINED:
+        return pair
+    return pair._replace(fit=doubted(found, steps * (cell_m * step_units(b)[0])),
+                         reason=f"{words}: its start is taken there, as right to {1e3 * cell_m:.3g} mm")
+
+
+def _tried_out(a: Prepared, b: Prepared, best: Pair, cell_m: float, least_overlap: float, start: np.ndarray | None, decides: bool) -> Pair:
+    """Return the pair, refused if a move along its weakest direction leads to another pose that fits as well, unless the start decides."""
     assert best.fit is not None
     units = step_units(b)
     values, axes = np.linalg.eigh(best.fit.normal * np.outer(units, units))
-    weak, undetermined = [], []
+    near = NEAR_SHIFT * max(a.spacing, b.spacing)
+    shifts, reach = ((near * units[0], -near * units[0]), near) if start is not None else (SHIFTS, cell_m)
+    undetermined = []
+    least, least_bent = (NOT_DETERMINED, BENT) if best.fit.matches >= FEW_MATCHES else (FEW_DETERMINED, FEW_BENT)
     for value, axis in zip(values, axes.T, strict=True):
         noise, bend, even_bend = (float(axis @ (part * np.outer(units, units)) @ axis)
                                   for part in (best.fit.noise, best.fit.bend, best.fit.even_bend))
-        if value < NOT_DETERMINED * noise or value < BENT * even_bend:
-            undetermined.append(units * axis / units[0])
-        elif value < WEAK * noise or value < WEAKLY_BENT * bend:
-            weak.append(units * axis / units[0])
-    if not undetermined and weak:
-        near = NEAR_SHIFT * max(a.spacing, b.spacing)
-        shifts, reach = ((near * units[0], -near * units[0]), near) if from_start else (SHIFTS, cell_m)
-        undetermined = [step for step in _left_behind(a, b, best, weak, shifts, reach) if _slides(a, b, best, step, cell_m, least_overlap)]
+        step = units * axis / units[0]
+        if value < least * noise or value < least_bent * even_bend or ((value < WEAK * noise or value < WEAKLY_BENT * bend) and any(
+                _stays_away(a, b, best, shift * step, shift, reach, least_overlap) for shift in shifts)):
+            undetermined.append(step)
     if not undetermined:
         return best
     kind = "turned about an axis" if np.linalg.norm(undetermined[0][:3]) > 0.5 else "shifted along itself"
-    return best._replace(state=PairState.AMBIGUOUS,
-                         reason=f"the surface looks the same when it is {kind}, so that its pose is not determined")
-
-
-def _left_behind(a: Prepared, b: Prepared, best: Pair, steps: list[np.ndarray], shifts: tuple[float, ...], reach: float
-                 ) -> list[np.ndarray]:
-    """Return the directions along which a fit of few points does not return from a shift along all of them."""
-    assert best.fit is not None
-    left: list[np.ndarray] = []
-    for shift in shifts:
-        start = moved(shift * np.sum(steps, axis=0), best.fit.pivot, best.fit.pose)
-        found = fitted(a, b, start, reach, TRIED_POINTS)
-        if found is not None:
-            left += [step for step in steps if _kept(found, best.fit, step) / shift > KEPT and not any(step is other for other in left)]
-    return left
+    words = f"the surface looks the same when it is {kind}, so that its pose is not determined"
+    if decides and start is not None:
+        return _at_start(a, b, best, start, np.array(undetermined), cell_m, least_overlap, words)
+    return best._replace(state=PairState.AMBIGUOUS, reason=words)
 
 
 def overlap_of(a: Prepared, b: Prepared, pose: np.ndarray, near_m: float) -> float:
@@ -281,24 +296,18 @@ def step_units(scan: Prepared) -> np.ndarray:
     return np.array([1 / size] * 3 + [1.0] * 3)
 
 
-def _slides(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, cell_m: float, least_overlap: float) -> bool:
-    """Return whether a fit from a place along a direction ends about there, and as good."""
+def _stays_away(a: Prepared, b: Prepared, best: Pair, step: np.ndarray, shift: float, reach: float, least_overlap: float) -> bool:
+    """Return whether a fit from a place along a direction, so many sizes of the scans away, does not come back and is as good."""
     assert best.fit is not None
-    for shift in SHIFTS:
-        start, found = moved(shift * step, best.fit.pivot, best.fit.pose), None
-        for most in (TRIED_POINTS, None):
-            found = fitted(a, b, start, cell_m, most)
-            if found is None or _kept(found, best.fit, step) / shift <= KEPT:
-                break
-        else:
-            if found is not None and _as_good(judged(a, b, found, (best.a, best.b), least_overlap), best):
-                return True
-    return False
-
-
-def _kept(found: Fit, best: Fit, step: np.ndarray) -> float:
-    """Return how far a fit lies from another along a direction, in its length."""
-    return float(step_between(found.pose @ inverse(best.pose), best.pivot) @ step / (step @ step))
+    for most in (TRIED_POINTS, None):
+        found = fitted(a, b, moved(step, best.fit.pivot, best.fit.pose), reach, most)
+        if found is None:
+            return False
+        kept = abs(float(step_between(found.pose @ inverse(best.fit.pose), best.fit.pivot) @ step / (step @ step)))
+        if kept <= min(KEPT, RETURNED / abs(shift)):
+            return False
+    assert found is not None
+    return _as_good(judged(a, b, found, (best.a, best.b), least_overlap), best)
 
 
 def _as_good(pair: Pair, best: Pair) -> bool:

@@ -45,6 +45,8 @@ class RegistrationOptions:
     """The scan whose pose is fixed; None: the first with a start, or the first."""
     accept_alike: bool = False
     """Whether a pose is taken although turned ones pass all tests as well."""
+    starts_decide: bool = False
+    """Whether starts are taken in directions that the surfaces leave open."""
     threads: int = 1
     """Pairs that are registered at one time."""
 
@@ -242,7 +244,8 @@ def _first_pairs(outlines: dict[int, Outline], starts: Sequence[np.ndarray | Non
             if count <= ALL_PAIRS:
                 tasks.append(PairTask(a, b, None, 0.0, True, options.accept_alike))
         elif (a, b) in near:
-            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS, options.accept_alike))
+            tasks.append(PairTask(a, b, inverse(first) @ second, START_CELLS, count <= ALL_PAIRS, options.accept_alike,
+                                  options.starts_decide))
         elif count <= ALL_PAIRS:
             pairs[a, b] = Pair(a, b, PairState.NO_POSE, None, 0.0, 0.0, NOT_THERE)
     pairs |= registered(tasks, 0.15, 0.75)

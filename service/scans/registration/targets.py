@@ -139,7 +139,7 @@ def _fit(points_a: np.ndarray, points_b: np.ndarray, spread_a: np.ndarray, sprea
     rows = Rows(np.concatenate([at, at]), np.concatenate([of, of]), gradient.astype(np.float32), np.concatenate([one, none]),
                 np.concatenate([none, one]))
     wide = max(ratio, 1.0) ** 2
-    return Fit(pose=pose, pivot=pivot, doubt=np.zeros(6), information=normal / wide, normal=normal, noise=np.zeros((6, 6)),
+    return Fit(pose=pose, pivot=pivot, doubt=np.zeros((0, 6)), information=normal / wide, normal=normal, noise=np.zeros((6, 6)),
                bend=np.zeros((6, 6)), even_bend=np.zeros((6, 6)), residual=MAD_TO_SIGMA * float(np.median(np.abs(off))), ratio=ratio,
                together=1.0, scale=scale,
                scale_sigma=float(np.sqrt(wide / left)), rows=rows, matches=len(points_a))

@@ -95,6 +95,19 @@ def test_point_sets_without_a_camera_come_together():
     assert len(wrong) == 3 and np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.2 * MM
 
 
+def test_few_noisy_points_with_little_in_common_come_together():
+    """1200 points each, some 20 mm apart and 6 mm of noise: a fit of 200 matched points is right to about a third of that, and to a degree.
+
+    What matches most is the figure turned by 91°, where each scan has points before what the other saw.
+    """
+    views = seen(figure, 0, 80, rows=80, sigma=6 * MM)
+    scans = [scan_of(view, points_only=True) for view in views]
+    drawn = [np.random.default_rng(number).permutation(len(scan.points))[:1200] for number, scan in enumerate(scans)]
+    few = [replace(scan, points=scan.points[kept], sigma=scan.sigma[kept]) for scan, kept in zip(scans, drawn, strict=True)]
+    wrong = off(views, register(few, [None, None], RegistrationOptions()))[1]
+    assert np.linalg.norm(wrong[3:]) < 6 * MM / 3 * 3**0.5 and np.degrees(np.linalg.norm(wrong[:3])) < 1
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", list(SYMMETRIC))
 @pytest.mark.parametrize("known", [False, True], ids=["searched", "from starts"])
