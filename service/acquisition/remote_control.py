@@ -194,7 +194,8 @@ class RemoteControl:
                   "retaken": retaken.get(shot.key, 0), "faults": faults.get(shot.key, [])} for shot in self._shots]
         found = {name: path.stat().st_mtime_ns for name in (PREVIEW_FILE, PICTURE_FILE) if (path := self._capture / name).exists()}
         live, version = self._live, self._version()
-        return {"name": self._name, "chosen": self._chosen.model_dump(include=set(PlanChoices.model_fields)), "running": running,
+        chosen = PlanChoices.model_validate(self._chosen, from_attributes=True)  # without what else a request holds
+        return {"name": self._name, "chosen": chosen.model_dump(), "running": running,
                 "metering": self._metering and running, "prompt": self._prompt,
                 "code": self._code(), "projector": self._address if running else None, "shots": shots,
                 "files": found, "lines": list(self._lines), "folder": str(self._capture),

@@ -122,10 +122,12 @@ def _factors(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, r
     seen = np.isfinite(found)
     free, told = np.ones(len(found)), np.ones(len(found))
     logarithm = np.log(found[seen])
-    fall = np.polynomial.Polynomial.fit(directions[seen, 2], logarithm, FALL_DEGREE)(directions[seen, 2])
-    independent = SURE * (logarithm - fall).std() * np.sqrt(FALL_DEGREE / len(logarithm))  # what errors of single lights have of it
-    if independent < fall.std() <= LARGEST_FALL:
-        logarithm = logarithm - fall
+    powers = np.vander(directions[seen, 2], FALL_DEGREE + 1)
+    if len(powers) > powers.shape[1]:
+        fall = powers @ np.linalg.lstsq(powers, logarithm)[0]
+        independent = SURE * (logarithm - fall).std() * np.sqrt(FALL_DEGREE / len(logarithm))  # what errors of single lights have of it
+        if independent < fall.std() <= LARGEST_FALL:
+            logarithm = logarithm - fall
     free[seen] = np.exp(logarithm - logarithm.mean())
     told[seen] = np.exp(logarithm - untold(logarithm, directions[seen], falling=False))
     return free, told
