@@ -125,7 +125,7 @@ def _factors(readings: np.ndarray, usable: np.ndarray, directions: np.ndarray, r
     powers = np.vander(directions[seen, 2], FALL_DEGREE + 1)
     if len(powers) > powers.shape[1]:
         fall = powers @ np.linalg.lstsq(powers, logarithm)[0]
-        independent = SURE * (logarithm - fall).std() * np.sqrt(FALL_DEGREE / len(logarithm))  # what errors of single lights have of it
+        independent = SURE * (logarithm - fall).std() * np.sqrt(FALL_DEGREE / (len(powers) - powers.shape[1]))  # errors of single lights
         if independent < fall.std() <= LARGEST_FALL:
             logarithm = logarithm - fall
     free[seen] = np.exp(logarithm - logarithm.mean())

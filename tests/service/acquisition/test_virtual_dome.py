@@ -200,7 +200,7 @@ def test_the_commands_take_the_pictures_of_a_virtual_camera(tmp_path):
         assert twin.stdout.readline().startswith("twin ")
         until(lambda: any(card.glob("*")), "the card has no picture")
         subprocess.run([*program, "capture", tmp_path / "plan.json", "--rig", tmp_path / "rig.json", "--camera", "gphoto2", "--out",
-                        tmp_path / "capture"], check=True, cwd=ROOT, env=virtual_camera(card))
+                        tmp_path / "capture", "--retakes", "20"], check=True, cwd=ROOT, env=virtual_camera(card))
     finally:
         twin.kill()
         twin.wait()

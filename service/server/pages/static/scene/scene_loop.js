@@ -31,6 +31,7 @@ export class SceneLoop {
     this.#renderer = renderer;
     this.#canvas = canvas;
     this.#render = render;
+    renderer.domElement.addEventListener("webglcontextlost", () => { this.#pending = null; this.#share = 0; }); // its fence will never tell
   }
 
   /** Draw soon. */
@@ -84,6 +85,7 @@ export class SceneLoop {
 
   #begin(share) {
     const gl = this.#renderer.getContext();
+    if (gl.isContextLost()) return; // changed() is called when it is back
     const { width, height } = this.#renderer.domElement;
     if (this.#pending !== null) gl.deleteSync(this.#pending.fence);
     const size = [Math.max(1, Math.round(share * width)), Math.max(1, Math.round(share * height))];

@@ -26,8 +26,8 @@ def opened(page, solved):
 
 def prepared_view(client, capture: str) -> dict:
     """What was prepared of a capture alone, whatever else the server has prepared."""
-    view = next(job for job in client.get("/v1/jobs").json()["jobs"] if job["request"]["kind"] == "view"
-                and job["request"]["capture"] == capture and job["request"].get("maps") is None)
+    view = next(job for job in client.get("/v1/jobs", params={"kind": "view", "limit": 500}).json()["jobs"]
+                if job["request"]["capture"] == capture and job["request"].get("maps") is None)
     return client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
 
 
