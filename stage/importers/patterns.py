@@ -33,11 +33,10 @@ def camera_and_projector(path: Path, resolution: tuple[int, int], projector: tup
                          second: str = "projector", extrinsics: Path | None = None) -> dict[str, Any]:
     """Return the camera and the projector of the manifest from an OpenCV calibration file.
     `second`: what stands in the place of the projector, for messages. `extrinsics`: file of R and T; None: the same."""
-    found = read_matrices(path)
-    if extrinsics is not None:
-        found |= {name: value for name, value in read_matrices(extrinsics).items() if name in (*ROTATION, *TRANSLATION)}
-    rotation = pick(found, ROTATION, path, "rotation R", shape=(3, 3))
-    translation = pick(found, TRANSLATION, path, "translation T", shape=(3,)) * unit_m
+    found, posed = read_matrices(path), extrinsics or path
+    pose_found = found if extrinsics is None else read_matrices(extrinsics)
+    rotation = pick(pose_found, ROTATION, posed, "rotation R", shape=(3, 3))
+    translation = pick(pose_found, TRANSLATION, posed, "translation T", shape=(3,)) * unit_m
     pose = camera_from_projector(rotation, translation)
     entries = {}
     for entry, what, matrix, coefficients, sides, size in (

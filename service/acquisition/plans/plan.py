@@ -152,9 +152,11 @@ def read_plan(given: str) -> Plan:
 
 def plan_of(chosen: PlanChoices) -> Plan:
     """Return the plan that was chosen: exposure times are those of all pictures that make one capture.
-    Raises RequestError if a name is none of a sequence."""
-    changed = []
-    for sequence in read_plan(chosen.plan).sequences:
+    Raises RequestError if a name is none of a sequence, or lamps are chosen where none is lit by itself."""
+    changed, sequences = [], read_plan(chosen.plan).sequences
+    if chosen.lights is not None and not any(isinstance(sequence, OlatSequence) for sequence in sequences):
+        raise RequestError(f"lights: {chosen.plan} lights no lamps one by one: add olat, or choose no lamps")
+    for sequence in sequences:
         exposed = {"exposures_s": chosen.exposures_s} if isinstance(sequence, _EXPOSED) else {}
         lit = {"lights": chosen.lights} if isinstance(sequence, OlatSequence) else {}
         changed.append(sequence.model_copy(update={**exposed, **lit}))

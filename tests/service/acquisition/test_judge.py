@@ -5,9 +5,10 @@ import pytest
 
 from service.acquisition.checks.expectation import FaultKind
 from service.acquisition.checks.judge import FULL_SCALE, Judge
-from service.acquisition.plans.plan import Plan
+from service.acquisition.plans.plan import Plan, plan_of
 from service.acquisition.plans.shots import TRACKING, shots_of
 from service.errors import RequestError
+from service.requests.acquire import PlanChoices
 from service.twin.camera import OVEREXPOSED
 from stage.transforms import fibonacci_sphere
 from tests.scenes.captures import make_scene, render
@@ -189,3 +190,9 @@ def test_each_lamp_alone_at_each_exposure_with_tracking_between():
 def test_what_cannot_be_taken_is_refused(sequences, words):
     with pytest.raises(RequestError, match=words):
         shots(*sequences)
+
+
+def test_lamps_are_chosen_where_they_are_lit_one_by_one():
+    assert plan_of(PlanChoices(plan="dark,olat", lights=("lamp_001",))).sequences[-1].lights == ("lamp_001",)
+    with pytest.raises(RequestError, match="lights: dark,gradients"):
+        plan_of(PlanChoices(plan="dark,gradients", lights=("lamp_001",)))

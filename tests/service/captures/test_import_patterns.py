@@ -228,6 +228,8 @@ def test_two_cameras(relit, tmp_path, pair, kind):
                 for key in own:
                     file.write(key, found[key])
                 file.release()
+            words = ["--calibration", rig, "--extrinsics", tmp_path / "intrinsics.yml"]
+            relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam1", tmp_path / "pair", *words).refused("intrinsics.yml")
             words = ["--calibration", tmp_path / "intrinsics.yml", "--extrinsics", tmp_path / "extrinsics.yml"]
     out = relit("import", "stereo", tmp_path / "cam0", tmp_path / "cam1", tmp_path / "pair", *words, "--unit-m", "0.001").well()
     assert f"{np.linalg.norm(stereo.POSE[:3, 3]):.4g} m from the first camera" in out
