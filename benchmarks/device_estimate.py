@@ -1,6 +1,6 @@
 """An estimate for a GPU that is not at hand, from what products ask of a device and from published speeds: a section of docs/figures.md.
 
-    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed; or own
+    python -m benchmarks.device_estimate svbrdf 64 1 counted 256   # what one small scene asks, as JSON; or timed, and own patches
 
 What is asked of the device is counted on an emulated one (tests/emulated_device.py). Small scenes stand for 12 megapixels: all limits of
 memory are made small in the same ratio, so that bands, batches and chunks of frames, and so launches and waits, are as many. Bytes, and the
@@ -201,7 +201,7 @@ def at_full_size(name: str) -> dict[str, float]:
             few, more = runs[sides[0], work.tried[0]], _run(name, sides[0], work.tried[0], counted=True, patches=MORE_PATCHES)
             for quantity in ("up", "down", "touched"):
                 found[quantity] += (more[quantity] - few[quantity]) / (MORE_PATCHES - FEW_PATCHES) * (interreflection.PATCHES - FEW_PATCHES)
-    if work.frames is None:
+    if work.frames is None:  # a solve, whose bounced light is bounded
         few, own = (_run(name, BOUNDED_SIDE, work.tried[0], counted=False, patches=patches) for patches in (FEW_PATCHES, None))
         for quantity, seconds in own.items():
             found[quantity] += max(0.0, seconds - few[quantity])

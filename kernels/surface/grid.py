@@ -9,6 +9,7 @@ border cases.
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import warp as wp
 
 from kernels import device as devices
@@ -70,6 +71,10 @@ class Grid(NamedTuple):
     def zeros(self, dtype: Any = wp.float32) -> wp.array:
         """Return a new array of this layout, all zero."""
         return wp.zeros(self.size, dtype=dtype, device=self.device)
+
+    def pixels(self, cells: np.ndarray) -> np.ndarray:
+        """Return the pixels [..., rows, cols] among cells [..., size] of this layout; of contiguous cells a view."""
+        return cells.reshape(*cells.shape[:-1], -1, self.pitch)[..., 1:self.rows + 1, 1:self.cols + 1]
 
     def no_edges(self) -> EdgeWeights:
         """Return new edge weights, all zero."""

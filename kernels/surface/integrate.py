@@ -108,7 +108,7 @@ def integrate_normals(
         done = improve(slopes, h, last=True)
     height = place(h, runs, grid=grid, perspective=perspective, spacing=spacing, mean_z=mean_z)
     if part is not None:
-        part = part.reshape(-1, grid.pitch)[1 : rows + 1, 1 : cols + 1]
+        part = grid.pixels(part)
     if (rows, cols) != whole:
         inside, height = height, wp.zeros(whole, dtype=wp.float32, device=device)
         wp.copy(height[box], inside)

@@ -69,15 +69,16 @@ def _move(first: int,
     """Move the maps as the forces push, and back towards what pixels say."""
     t = first + wp.tid()
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
-        for plane in range(given.shape[0]):
-            push = wp.float32(0.0)
-            for k in range(4):
-                push += forces[plane, k, i - way[k]] - forces[plane, k, i]
-            before, said = found[plane, i], given[plane, i]
-            away = before - size[i] * push - said
-            now = said + wp.sign(away) * wp.max(wp.abs(away) - size[i] * trust[i], 0.0)
-            ahead[plane, i] = 2.0 * now - before
-            found[plane, i] = now
+        if size[i] > 0.0:  # not of spare cells
+            for plane in range(given.shape[0]):
+                push = wp.float32(0.0)
+                for k in range(4):
+                    push += forces[plane, k, i - way[k]] - forces[plane, k, i]
+                before, said = found[plane, i], given[plane, i]
+                away = before - size[i] * push - said
+                now = said + wp.sign(away) * wp.max(wp.abs(away) - size[i] * trust[i], 0.0)
+                ahead[plane, i] = 2.0 * now - before
+                found[plane, i] = now
 
 
 def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarray], *, device: str) -> np.ndarray:
@@ -102,7 +103,7 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     def laid_out(images: np.ndarray) -> wp.array:
         """Return [..., rows, cols] images as the grid has them, on the device."""
         cells = np.zeros((*images.shape[:-2], grid.size), np.float32)
-        cells[..., :(rows + 1) * grid.pitch].reshape(*images.shape[:-2], rows + 1, grid.pitch)[..., 1:, 1:cols + 1] = images
+        grid.pixels(cells)[...] = images
         return wp.array(cells, device=device)
 
     linked, ways = np.zeros((len(STEPS), rows, cols), np.float32), [down * grid.pitch + right for down, right in STEPS]
@@ -124,5 +125,4 @@ def least_variation(values: np.ndarray, trust: np.ndarray, links: list[np.ndarra
     group = devices.Repeated(steps, device)
     for _ in range(GROUPS):
         group.run()
-    cells = found.numpy()[:, :(rows + 1) * grid.pitch].reshape(planes, rows + 1, grid.pitch)
-    return np.ascontiguousarray(cells[:, 1:, 1:cols + 1])
+    return np.ascontiguousarray(grid.pixels(found.numpy()))

@@ -125,9 +125,9 @@ class _Measure(NamedTuple):
     """How the frames of a code tell a lag."""
 
     sums: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    """Of readings [frames, pixels] and places [pixels]: what is averaged over pixels, [sums, pixels]."""
+    """Returns the sums [sums, pixels] that are averaged over pixels, from readings [frames, pixels] and places [pixels]."""
     lag: Callable[[np.ndarray, np.ndarray], Lags]
-    """Of these averages and the number of pixels in each."""
+    """Returns the lags, from these averages and the number of pixels in each."""
 
 
 def _measure_of(used: Sequence[Code], collected: Collected, noise: NoiseModel) -> _Measure | None:

@@ -159,7 +159,7 @@ def test_the_lights_of_the_rig_are_shown_and_light_the_asset(asset, solved):
 
 
 def test_nothing_sparkles_at_the_rim(asset):
-    """Of the room and of lights before the ball, which has no highlights: the rim is no brighter than the brightest of the rest, which
+    """In the room and under lights before the ball, which has no highlights, the rim is no brighter than the brightest of the rest, which
     faces up to 74 degrees to the side, as the lights stand. A twentieth is for the solved albedo; nothing is clipped two stops down."""
     lights = asset.locator("select").first.locator("option").evaluate_all("all => all.slice(2).map((each) => each.value)")
     for light in ("room", *lights[::8]):
