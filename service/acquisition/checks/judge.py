@@ -26,7 +26,7 @@ from service.acquisition.checks.expectation import (
 )
 from service.acquisition.checks.motion import Bands, bands_of, motion_between, shift_between
 from service.acquisition.checks.picture_sample import place_of_tile, sample_of
-from service.acquisition.checks.unreached import glows, unreached_faults
+from service.acquisition.checks.unreached import glows, shows, unreached_faults
 from service.acquisition.plans.shots import Shot
 from stage.rig.rig import Rig
 
@@ -42,8 +42,9 @@ UNLIT_PART = 0.03
 """A picture with less than this part of the light that it should have was not lit: predictions are wrong by a few times, not by thirty."""
 SAME_PART = 0.15
 """Two pictures are of one light if they differ by less than this part of what the third nearest picture differs by."""
-AGREEMENT_WEIGHT = 4.0
-"""A correlation of 1 against 0.5 counts as much as misfits of 7 against 1."""
+NEIGHBOURS, NEIGHBOUR_WEIGHT = 8, 4.0
+"""The neighbours of either lamp whose predictions tell which of them shone, and how much the logarithm of what they misfit counts: their
+pictures are right, and there are several."""
 NEAR_COSINE = 0.3
 """Lamps within this cosine of one another light the same sides of an object, so that their pictures differ with the angle between them."""
 BRIGHT_GAIN = 2.0
@@ -210,8 +211,8 @@ class Judge:
         light, should = float((sample.blocks - dark).mean()), float((expected - dark).mean())
         least = LEAST_LIGHT * float((usual - dark).mean())
         if shot.lamp is not None:
-            if should >= 4 * least and not isinstance(dark, float) and not glows(seen, dark):
-                return [Fault(shot.key, FaultKind.UNLIT, "shows no sign of the lamp")]  # few lamps behind an object light no rim of it
+            if not isinstance(dark, float) and not glows(seen, dark) and shows(seen, dark, UNLIT_PART * float((expected - dark).max())):
+                return [Fault(shot.key, FaultKind.UNLIT, "shows no sign of the lamp")]
             should = min(should, lower_quartile([(abs(weight), float((each.sample.blocks - dark).mean())) for weight, each in used]))
         faint = should < least
         if faint and (shot.lamp is None or light < least):
@@ -284,8 +285,8 @@ class Judge:
     def _twin(self, seen: Seen, others: list[Seen]) -> str | None:
         """Return the key of another lamp's picture that is of the same light and fits there better than this one does here.
 
-        The farther apart two lamps are, the more their pictures differ; so the picture's differences from the other pictures tell which of
-        both lamps shone.
+        Three things tell which of both lamps shone: what the others predict of either, what the picture at either place predicts of its
+        neighbours, and that pictures differ the more, the farther apart their lamps are.
         """
         if len(others) < LEAST_LAMPS:
             return None
@@ -293,13 +294,16 @@ class Judge:
         order = np.argsort(differ)
         if differ[order[0]] > SAME_PART * differ[order[2]]:
             return None
-        other, rest = others[order[0]], order[1:]
-        remaining = [others[index] for index in rest]
-        towards = self._expectation.towards(remaining)
-        here, there = (self._expectation.misfit(each, remaining) for each in (seen, other))
-        own, its = (_agreement(differ[rest], towards @ self._expectation.directions[lamp]) for lamp in (seen.shot.lamp, other.shot.lamp))
-        evidence = np.log(max(here, LEAST_MISFIT) / max(there, LEAST_MISFIT)) + AGREEMENT_WEIGHT * (its - own)
-        return other.shot.key if evidence > 0 else None
+        both, rest = (seen, others[order[0]]), [others[index] for index in order[1:]]
+        cosines = self._expectation.towards(rest) @ self._expectation.towards(list(both)).T
+        near = [rest[index] for index in np.argsort(-cosines.max(axis=1))[:NEIGHBOURS]]
+        around = np.array([[self._expectation.misfit(one, [*(other for other in rest if other is not one), each]) for each in both]
+                           for one in near])
+        around = around[(around > 0).all(axis=1)].sum(axis=0)  # a misfit of 0: nothing was expected
+        misfits = [self._expectation.misfit(each, rest) for each in both]
+        worse = [np.log(max(misfit, LEAST_MISFIT)) + NEIGHBOUR_WEIGHT * np.log(max(beside, LEAST_MISFIT))
+                 - _agreement(differ[order[1:]], column) for misfit, beside, column in zip(misfits, around, cosines.T, strict=True)]
+        return both[1].shot.key if worse[0] > worse[1] else None
 
     def _sound(self) -> list[str]:
         return [key for key, each in self._seen.items() if not each.faults]

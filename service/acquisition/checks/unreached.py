@@ -54,10 +54,12 @@ def unreached_faults(pictures: Sequence[Seen], directions: np.ndarray, dark_of: 
 
 def glows(seen: Seen, dark: np.ndarray | float) -> bool:
     """Return whether a picture reads more than the dark one somewhere; False without a dark one."""
-    if isinstance(dark, float):
-        return False
-    above = seen.sample.blocks - dark
-    return bool(above.max() > GLOW_GAIN * -above.min())
+    return not isinstance(dark, float) and shows(seen, dark, float((seen.sample.blocks - dark).max()))
+
+
+def shows(seen: Seen, dark: np.ndarray, light: float) -> bool:
+    """Return whether a block of so much light would stand out from the noise of a picture."""
+    return light > GLOW_GAIN * -float((seen.sample.blocks - dark).min())
 
 
 def _related(pictures: Sequence[Seen]) -> list[bool]:
