@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from service.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
-from service.sharing.sharing import digest
+from service.sharing.sharing import LOOK_S, PieceStore, agree, digest, opened, sealed
 from stage.errors import storage
 from stage.files import replacing
 from stage.results.depth_maps import DEPTH_FILE

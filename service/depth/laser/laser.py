@@ -11,11 +11,10 @@ import numpy as np
 from kernels.status import Status
 from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
-from service.depth.laser.plane_accuracy import CLEAR_SIGMAS, compare_sweeps, unconfirmed
 from service.depth.laser.spot import find_spot, nearest_points
 from service.depth.laser.stripe_curves import WHOLE
 from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
-from service.depth.laser.stripes import Sweep, along_of, measure_stripe, stripe_signal
+from service.depth.laser.stripes import CLEAR_SIGMAS, Sweep, along_of, compare_sweeps, measure_stripe, stripe_signal, unconfirmed
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
