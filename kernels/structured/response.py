@@ -75,12 +75,7 @@ def modulated_wave(response: Sequence[float] | np.ndarray | None, carrier_weight
 
 def fitted_curve(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return what a fit of sinusoids makes of a wave at GRID even phases: C + iS, and A.
-
-    Args:
-        wave: [GRID] light over one turn.
-        weights: [frames, 3] of the fit's A, C and S.
-        shifts: [frames] turns.
-    """
+    `wave`: [GRID] light over one turn. `weights`: [frames, 3] of the fit's A, C and S. `shifts`: [frames] turns."""
     at = (np.arange(GRID)[:, None] / GRID - shifts) % 1.0
     light = np.interp(at, np.arange(GRID + 1) / GRID, np.append(wave, wave[0]))
     return light @ (weights[:, 1] + 1j * weights[:, 2]), light @ weights[:, 0]

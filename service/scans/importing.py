@@ -59,12 +59,8 @@ def import_scans(request: ScansImport) -> Imported:
     """Write a scan-set.json for the point files of a folder, and find out where the scanner stood; or for the frames of a depth camera.
 
     Files other than PLY are written as PLY.
-
-    Raises:
-        ManifestError: there are no scans, or the file of poses is wrong; names it.
-        ResultError: a file is not what its ending says, or holds no points.
-        StorageError: a file cannot be read or written.
-    """
+    Raises ManifestError: there are no scans, or the file of poses is wrong; names it. Raises ResultError: a file is not what its ending
+    says, or holds no points. Raises StorageError: a file cannot be read or written."""
     source, folder = request.source, request.folder
     with storage("read", source):
         listed = natural_order(path.name for path in source.iterdir() if not path.name.startswith("."))
@@ -199,10 +195,7 @@ def _conf_poses(path: Path) -> dict[str, np.ndarray]:
     """Return world_from_scan [4, 4] of the meshes that a Stanford .conf file names, in the unit of the file, stretched as its quaternions.
 
     A line is `bmesh FILE tx ty tz qx qy qz qw`; the quaternions turn the world into the scan.
-
-    Raises:
-        ManifestError: a line is wrong.
-    """
+    Raises ManifestError: a line is wrong."""
     poses = {}
     for number, line in read_lines(path):
         words = line.split()
@@ -235,10 +228,7 @@ def depth_names(names: list[str]) -> list[str]:
 
 def write_frames(request: ScansImport, names: list[str]) -> tuple[list[ScanEntry], list[tuple[str, str]]]:
     """Write each frame as a folder with a depth.exr, and with the colours as points.ply, and return the scans and what was understood.
-
-    Raises:
-        ManifestError: intrinsics are missing, or a pose or an image is wrong; names the file.
-    """
+    Raises ManifestError: intrinsics are missing, or a pose or an image is wrong; names the file."""
     folder, chosen = request.source, names[:: request.every]
     matrix = _matrix(folder / INTRINSICS, 3)
     if matrix is None:

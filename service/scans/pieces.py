@@ -60,11 +60,8 @@ class SharedPieces:
 
     def __init__(self, store: PieceStore, *, leads: bool = True, invite: Callable[[int], None] = lambda pieces: None) -> None:
         """Create the part of a worker.
-
-        Args:
-            leads: whether this worker has the job; it alone says what a phase follows from.
-            invite: called with the number of pieces before each phase, to ask other workers.
-        """
+        `leads`: whether this worker has the job; it alone says what a phase follows from. `invite`: called with the number of pieces
+        before each phase, to ask other workers."""
         self._store, self._leads, self._invite = store, leads, invite
         self._run, self._phases, self._has_agreed = "", 0, False
 

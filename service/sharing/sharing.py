@@ -132,11 +132,8 @@ class SharedSolve:
 
     def __init__(self, store: PieceStore, *, leads: bool, invite: Callable[[int], None] = lambda pieces: None) -> None:
         """Take part in the solve whose pieces are in the store.
-
-        Args:
-            leads: whether this worker has the job; it alone says what a pass follows from.
-            invite: called with the number of pieces before each pass that can be shared.
-        """
+        `leads`: whether this worker has the job; it alone says what a pass follows from. `invite`: called with the number of pieces
+        before each pass that can be shared."""
         self._store, self._leads, self._invite = store, leads, invite
         self._solve, self._passes, self._has_agreed = "", 0, False
 
@@ -147,12 +144,8 @@ class SharedSolve:
     def deal(self, names: Sequence[str], pieces: Sequence[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None], *,
              waiting: Callable[[], None], pixels_of: Callable[[Piece], Any], results: Results) -> None:
         """Do the pieces of a pass that no other worker does, and read those of the others.
-
-        Args:
-            names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
-            waiting: called now and then while pieces of other workers are waited for.
-            pixels_of: returns the place of a piece on the last axis of the arrays.
-        """
+        `names, pieces, work, done`: as of `deal`; `done` is told the pieces of other workers too. `waiting`: called now and then while
+        pieces of other workers are waited for. `pixels_of`: returns the place of a piece on the last axis of the arrays."""
         self._passes += 1
         if len(pieces) < LEAST_PIECES:
             deal(names, pieces, work, done)

@@ -73,14 +73,8 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
 
 def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: LightsOverTime | None = None) -> None:
     """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
-
-    Args:
-        request: that of the other process, on a device of the same kind.
-        progress: told how far the solve is; it ends the help by an exception.
-
-    Raises:
-        DivergedError: this process finds something else than the other.
-    """
+    `request`: that of the other process, on a device of the same kind. `progress`: told how far the solve is; it ends the help by an
+    exception. Raises DivergedError: this process finds something else than the other."""
     opened = open_solve(request, None, Timings(progress), sharing, over_time)
     opened.solver(opened.given, opened.lights)
 

@@ -138,11 +138,7 @@ SAME_CURVE_PX = 4.0
 
 def stripe_signal(radiance: np.ndarray, mask: np.ndarray) -> Signal:
     """Return the brightest channel of a frame, with its median as zero.
-
-    Args:
-        radiance: [rows, cols, 3] float32, less ambient light.
-        mask: [rows, cols] bool, not empty.
-    """
+    `radiance`: [rows, cols, 3] float32, less ambient light. `mask`: [rows, cols] bool, not empty."""
     channel = int(np.argmax(np.where(mask[..., None], radiance, 0).max(axis=(0, 1))))
     inside = radiance[..., channel][mask]
     few = inside[:: max(1, len(inside) // NOISE_SAMPLE)]
@@ -171,10 +167,7 @@ class Stripes(NamedTuple):
 def measure_stripe(signal: Signal, mask: np.ndarray, laser: LaserPlane, sweep: Sweep, camera: Camera, *, device: str, near_m: float,
                    far_m: float) -> Stripes:
     """Measure the stripe of one frame on each line; depths outside the span are OUT_OF_RANGE.
-
-    Args:
-        sweep: of the frames whose stripes cross the same lines.
-    """
+    `sweep`: of the frames whose stripes cross the same lines."""
     along = along_of(laser)
     place, sigma, brightness, amplitude, status = _peaks(signal, mask, along, sweep, device)
     chosen: Chosen = choose_curves(place, brightness, status)

@@ -33,11 +33,8 @@ class PatternsResult(NamedTuple):
 
 def make_patterns(request: PatternsRequest, progress: Progress | None = None) -> PatternsResult:
     """Write PNG images and patterns.json.
-
-    Raises:
-        RequestError: an option that does not belong to the code, or that the code refuses.
-        StorageError: a file cannot be written.
-    """
+    Raises RequestError: an option that does not belong to the code, or that the code refuses. Raises StorageError: a file cannot be
+    written."""
     for option, codes in CODES_OF_OPTION.items():
         if option in request.model_fields_set and request.code not in codes:
             raise RequestError(f"{option} says nothing about {request.code}: it is an option of {', '.join(codes)}")

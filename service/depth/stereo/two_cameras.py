@@ -64,10 +64,7 @@ class Places(NamedTuple):
 def solve_two_cameras(capture: Capture, beside: Path, mask: np.ndarray, request: DepthRequest, device: str,
                       timings: Timings) -> DepthSolution:
     """Decode both captures and intersect the lines of sight of their cameras, at the pixels of the first.
-
-    Args:
-        beside: folder of the capture of the second camera, under the same patterns of the same projector.
-    """
+    `beside`: folder of the capture of the second camera, under the same patterns of the same projector."""
     other = Capture.open(beside, request.pixels._replace(crop=None))
     for each in (capture, other):
         check_perspective(each)
@@ -155,11 +152,8 @@ def _decoded(coordinate: np.ndarray, sigma: np.ndarray, amplitude: np.ndarray, s
 
 def find_places(column: np.ndarray, row: np.ndarray, sigma_column: np.ndarray, sigma_row: np.ndarray, other: CodedImage) -> Places:
     """Find the places of the projector in the image of a second camera.
-
-    Args:
-        column, row: [n] of the first camera, projector pixels, with their standard deviations.
-        other: what the second camera has decoded.
-    """
+    `column, row`: [n] of the first camera, projector pixels, with their standard deviations. `other`: what the second camera has
+    decoded."""
     count = len(column)
     nothing = Places(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
     planes = _planes(other)

@@ -59,11 +59,7 @@ class Phases(NamedTuple):
 
 def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float]) -> str | None:
     """Return how frequencies are declared wrongly, as a sentence; None if none is, or no other reading fits.
-
-    Args:
-        declared: share of the pixels whose frequencies agree as declared.
-        agreeing: of other phases.
-    """
+    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases."""
     if declared >= AGREE or len(phases.hz) < 2:
         return None
     tried = [(agreeing(other), words) for other, words in _readings(phases)]

@@ -276,9 +276,5 @@ def compared(bands: Bands, difference: np.ndarray, noise: np.ndarray, pixel_m: f
 
 def unlike_noise(bands: Bands, move: np.ndarray, sigma: np.ndarray, agree: np.ndarray, pixel_m: float) -> np.ndarray:
     """Return [V] bool, where the motions of the vertices around are larger than the noise of the depth explains.
-
-    Args:
-        move, sigma: [V] metres; sigma is the standard deviation of the depth.
-        agree: [V] bool, the vertices that moved.
-    """
+    `move, sigma`: [V] metres; sigma is the standard deviation of the depth. `agree`: [V] bool, the vertices that moved."""
     return np.asarray(agree & (bands.averaged((move / sigma)[:, None] ** 2, MOTION_PX * pixel_m, agree)[:, 0] > MOTION))

@@ -85,11 +85,8 @@ class PreparedScans:
 
     def __init__(self, file: Path, scan_set: ScanSet, folder: Path, voxel_m: float | None, *, device: str) -> None:
         """Create the scans, of which none is read yet; an existing folder takes their arrays.
-
-        Args:
-            voxel_m: metres, to which pixels that are far smaller are joined; None: they stay.
-            device: where sets of points are made range images.
-        """
+        `voxel_m`: metres, to which pixels that are far smaller are joined; None: they stay. `device`: where sets of points are made
+        range images."""
         self._file, self._scan_set, self._folder, self._voxel_m, self._device = file, scan_set, folder, voxel_m, device
         self._prepared: dict[int, PreparedScan] = {}
         self._complete: dict[int, PreparedScan] = {}
@@ -164,11 +161,8 @@ def _summary(scan: PreparedScan, number: int) -> ScanSummary:
 
 def as_range_image(scan: Scan, where: str, voxel_m: float | None = None, *, device: str) -> Scan:
     """Return a set of points as a range image from its viewpoint, in the frame of a camera that looks at the middle of the points.
-
-    Args:
-        scan: a set of points with a pose, whose `origin` is where the scanner stood.
-        voxel_m: metres, to which points that are far closer together are joined; None: they stay.
-    """
+    `scan`: a set of points with a pose, whose `origin` is where the scanner stood. `voxel_m`: metres, to which points that are far
+    closer together are joined; None: they stay."""
     away = scan.points.astype(np.float64) - scan.origin
     range_m = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(range_m, np.finfo(np.float64).tiny)[:, None]

@@ -45,12 +45,8 @@ class Overlaps:
 
     def __init__(self, outlines: Mapping[int, Outline], poses: Mapping[int, np.ndarray], near_cells: float) -> None:
         """Make the bound for scans at poses.
-
-        Args:
-            outlines: of the scans.
-            poses: world_from_scan [4, 4] of those that have one.
-            near_cells: how far points may be apart, in cells.
-        """
+        `outlines`: of the scans. `poses`: world_from_scan [4, 4] of those that have one. `near_cells`: how far points may be apart, in
+        cells."""
         self._outlines, self._poses, self._near = outlines, poses, near_cells
         self._cells: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
         self._ways: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}

@@ -98,11 +98,7 @@ class NoneJoinedError(ScanError):
 
     def __init__(self, names: Sequence[str], alone: dict[int, str], pairs: tuple[Pair, ...]) -> None:
         """Say why each scan is alone.
-
-        Args:
-            names: of all scans.
-            alone: the reasons by the number of the scan, in words after its name.
-        """
+        `names`: of all scans. `alone`: the reasons by the number of the scan, in words after its name."""
         super().__init__(*(f"{names[number]}: {words}" for number, words in alone.items()))
         self.alone, self.pairs = alone, pairs
 
@@ -125,11 +121,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
                 options: RegistrationOptions, *, table: Turntable | None = None, targets: Mapping[int, Sequence[Target]] | None = None,
                 advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object, whose names are for messages; other arguments as of `register`.
-
-    Args:
-        extents: of the scans, as `extent_of` returns it.
-        targets: the targets that each scan shows. None: there are none.
-    """
+    `extents`: of the scans, as `extent_of` returns it. `targets`: the targets that each scan shows. None: there are none."""
     count = len(names)
     cells = dict(cells_of(extents, starts, options.cell_m))
     usual = usual_extent(extents)

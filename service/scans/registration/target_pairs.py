@@ -149,11 +149,8 @@ def _place(name: str, shown: list[tuple[int, np.ndarray, np.ndarray]]) -> Target
 
 def pose_by_targets(a: Sequence[Target], b: Sequence[Target], *, first_row: tuple[int, int]) -> TargetPose:
     """Find the pose of scan b against scan a by the targets that both show.
-
-    Args:
-        first_row: from which number on `Rows.at` and `Rows.of` count the targets, 3 numbers each, in the order of a and of b, so that
-            the covariance of a pose graph tells them from points of the surface.
-    """
+    `first_row`: from which number on `Rows.at` and `Rows.of` count the targets, 3 numbers each, in the order of a and of b, so that the
+    covariance of a pose graph tells them from points of the surface."""
     place = {target.name: number for number, target in enumerate(b)}
     pairs = [(number, place[target.name]) for number, target in enumerate(a) if target.name in place]
     common = tuple(a[i].name for i, _ in pairs)

@@ -121,10 +121,7 @@ class _Sample(NamedTuple):
 
 def find_distance(capture: Capture, stack: Stack, device: str) -> Distance:
     """Return a capture with the depth of the surface that its images tell; an orthographic camera whose images do not keeps z = 0.
-
-    Raises:
-        ManifestError: the images of a perspective camera do not tell the depth, or the lights are not usable.
-    """
+    Raises ManifestError: the images of a perspective camera do not tell the depth, or the lights are not usable."""
     try:
         return _found(capture, stack, device)
     except NotTold as error:

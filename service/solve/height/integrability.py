@@ -57,11 +57,7 @@ def doubt(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Came
 
 def beside_parts(sigma: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Return the standard deviation of normals, [rows, cols] in degrees, with that of pixels beside another part raised.
-
-    Args:
-        sigma: [rows, cols] standard deviation without this.
-        part: as for `doubt`.
-    """
+    `sigma`: [rows, cols] standard deviation without this. `part`: as for `doubt`."""
     framed, (rows, cols) = np.pad(part, 1), part.shape
     around = [framed[down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
     beside = (part > 0) & np.any([(side > 0) & (side != part) for side in around], axis=0)

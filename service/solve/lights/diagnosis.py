@@ -29,11 +29,8 @@ FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].lig
 
 def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, solution: Solution) -> None:
     """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
-
-    Args:
-        lights: the lights with which the normals were solved; readings are examined under distant ones.
-        declared: the lights of the manifest, which may have other intensities.
-    """
+    `lights`: the lights with which the normals were solved; readings are examined under distant ones. `declared`: the lights of the
+    manifest, which may have other intensities."""
     field = FIELDS.get(type(lights), "the capture of the reference ball")
     fit = None
     if isinstance(lights, DistantLights):

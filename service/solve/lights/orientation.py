@@ -69,11 +69,8 @@ class _Map(NamedTuple):
 
 def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | None, fit: Fit | None) -> LightAxes | None:
     """Return which axes of the lights are exchanged, mirrored or turned, or None.
-
-    Args:
-        lights: the distant lights; None: other lights, whose readings are not fitted again.
-        fit: the fit of some pixels under these lights, or None.
-    """
+    `lights`: the distant lights; None: other lights, whose readings are not fitted again. `fit`: the fit of some pixels under these
+    lights, or None."""
     if lights is not None and fit is not None and len(lights.direction) >= LEAST_LIGHTS and fit.facing < FACING:
         return _exchanged(given, lights, fit)
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)

@@ -31,13 +31,8 @@ class ReferenceBall(NamedTuple):
 
     def pixel_of(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the position in the image at which the ball shows each normal, at least RIM_PX inside the outline.
-
-        Args:
-            normal: [n, 3] unit, camera frame.
-
-        Returns:
-            column and row, each [n] float64, in array elements: the centre of the first pixel is (0, 0).
-        """
+        `normal`: [n, 3] unit, camera frame. Returns column and row, each [n] float64, in array elements: the centre of the first pixel
+        is (0, 0)."""
         camera = self.capture.camera
         across = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
         radius = np.minimum(np.linalg.norm(normal[:, :2], axis=1), 1 - RIM_PX / self.ball.radius_px)
