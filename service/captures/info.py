@@ -69,8 +69,6 @@ class Inspection(NamedTuple):
 
 
 class _FrameLevel(NamedTuple):
-    """The readings of one frame."""
-
     lowest: float
     peak: float
     saturated: int
@@ -208,7 +206,6 @@ def _facts(capture: Capture) -> Iterator[tuple[str, str]]:
 
 
 def _near_lights(lights: PlacedLights) -> str:
-    """Return how many near lights there are, and how far away."""
     near = lights.place[:, 3] == 1
     distance = np.linalg.norm(lights.place[near, :3] - lights.centre, axis=1)
     return f"{int(near.sum())}, {distance.min():.3g} to {distance.max():.3g} m from the object's centre"

@@ -45,8 +45,6 @@ GREY = 128
 
 
 class _Scan(NamedTuple):
-    """A scan of the set, in metres."""
-
     name: str
     path: str
     points: np.ndarray  # [n, 3]

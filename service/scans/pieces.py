@@ -148,7 +148,6 @@ class SharedPieces:
         return others
 
     def _made(self, name: str, piece: str, make: Callable[[str], bytes]) -> bytes:
-        """Make a piece, keep and return it."""
         content = make(piece)
         self._store.write(name, sealed(content))
         return content

@@ -179,8 +179,6 @@ class SharedSolve:
 
 
 class _Pass:
-    """The results of all workers in one pass."""
-
     def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
         self._store, self._name, self._leads, self._arrays = store, name, leads, arrays
         self._follows_from = follows_from

@@ -43,8 +43,6 @@ way of other surfaces, as in the laser's shadow or when the stripe has left the 
 
 
 class _Spot(NamedTuple):
-    """The point that one laser ray lights."""
-
     point: np.ndarray  # [3] metres, camera frame
     row: int
     col: int
@@ -128,7 +126,6 @@ def _check_order(capture: Capture, samples: StripeSamples, counts: list[int], al
 
 
 def _second_stripes(doubled: list[str], frames: int) -> str:
-    """Return a sentence about frames that show two stripes."""
     return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe beside the "
             "first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
             "status multipath")

@@ -126,5 +126,4 @@ def _overlaps(curve: np.ndarray, several: np.ndarray) -> list[tuple[int, int, np
 
 
 def _of(values: np.ndarray, curve: np.ndarray, number: int, at: np.ndarray) -> np.ndarray:
-    """Return the values of one curve on these lines."""
     return np.asarray(values[np.argmax(curve[:, at] == number, axis=0), at])

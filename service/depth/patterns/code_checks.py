@@ -110,8 +110,6 @@ def _numbers(bits: np.ndarray, *, gray: bool) -> np.ndarray:
 
 
 class _Pairs(NamedTuple):
-    """Neighbouring pixels of the image rows that read their stripe."""
-
     first: np.ndarray  # [pairs] index into the flat sample
     second: np.ndarray  # [pairs]
     row: np.ndarray  # [pairs]

@@ -174,7 +174,6 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
 
 
 def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: NoiseModel, device: str) -> Disparity:
-    """Match some rows and judge every pixel."""
     left, right = (np.ascontiguousarray(each[:, rows]) for each in (images.left, images.right))
     right_seen = images.right_seen[rows]
     volume = matching_cost(left, right, right_seen, labels, device=device)

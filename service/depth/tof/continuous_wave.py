@@ -98,8 +98,6 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
 
 
 class _Pairs(NamedTuple):
-    """Levels and the squared noise at them, from one estimator."""
-
     levels: list[np.ndarray]
     squares: list[np.ndarray]
 

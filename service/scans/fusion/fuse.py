@@ -155,7 +155,6 @@ def _require_surface(file: Path, faces: int, voxel: float) -> None:
 
 
 def _facts(fused: FusedBricks, surface: Surface, holes: Holes) -> dict[str, Any]:
-    """Return what the report says."""
     area = holes.face_areas_m2
     least = surface.seen[surface.faces].min(axis=1)
     missing = sum(hole.area_m2 for hole in holes.holes)

@@ -70,8 +70,6 @@ class _Mesh(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """The standard deviations that weight the least squares."""
-
     sigma: np.ndarray  # [V] metres, of the depth
     tilt: np.ndarray  # [V] radians, standard deviation of the photometric normals
     slope: float  # variance of the normals of the depth

@@ -116,7 +116,6 @@ def _pcd(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
 
 
 def _las(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
-    """Yield the scan of a LAS or LAZ file."""
     points, colours = read_las(path)
     yield PointScan(points, colours)
 

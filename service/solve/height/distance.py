@@ -96,8 +96,6 @@ class NearFit(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """Readings of a grid of pixels."""
-
     mask: np.ndarray  # [rows, cols] bool
     x: np.ndarray  # [rows, cols] slopes of the lines of sight
     y: np.ndarray
@@ -199,7 +197,6 @@ def _span(capture: Capture) -> float:
 
 
 def _sample(capture: Capture, stack: Stack) -> _Sample:
-    """Read a grid of pixels."""
     camera, mask = capture.camera, capture.mask()
     rows, cols = np.nonzero(mask)
     step = max(1, int(np.ceil((max(np.ptp(rows), np.ptp(cols)) + 1) / ACROSS)))

@@ -65,7 +65,6 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
 
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
-    """Return the readings of pixels that are spread over the mask."""
     stack = given.stack
     inside = np.flatnonzero(given.mask)
     radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])

@@ -60,8 +60,6 @@ class LightAxes(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """A small map of the surface."""
-
     normal: np.ndarray  # [3, rows, cols] float32, z towards the viewer of each pixel; 0 outside
     mask: np.ndarray  # [rows, cols] bool
     pixels: np.ndarray  # [rows, cols] row-major positions in the image
@@ -209,7 +207,6 @@ def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> _Map:
-    """Return a small map of solved normals."""
     pixels, inside = _grid(mask, MAP_SIZE)
     flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
     return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)

@@ -58,16 +58,12 @@ class OtherLights(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """Readings of some pixels."""
-
     readings: np.ndarray  # [lights, pixels] float64, radiance over irradiance
     usable: np.ndarray  # [lights, pixels] bool
     points: np.ndarray  # [pixels, 3] from the middle of the object, in its half widths
 
 
 class _Trial(NamedTuple):
-    """A fit under other lights."""
-
     fit: NearFit
     sentence: str
     least_gain: float = LEAST_GAIN
