@@ -33,13 +33,8 @@ MIN_SLOPE = 0.1
 
 def light_of(response: Sequence[float] | np.ndarray | None, levels: np.ndarray) -> np.ndarray:
     """Return the light of a projector at levels […], 0…1, as a part of its white minus its black, float64.
-
-    Args:
-        response: [n] the projector's light at n even levels from 0 to 1, rising; None: linear.
-
-    Raises:
-        ArrayError: a response that does not rise.
-    """
+    `response`: [n] the projector's light at n even levels from 0 to 1, rising; None: linear. Raises ArrayError: a response that does not
+    rise."""
     if response is None:
         return np.asarray(levels, dtype=np.float64)
     given = np.asarray(response, dtype=np.float64)
@@ -123,12 +118,8 @@ def wave_error(response: Sequence[float] | np.ndarray, weights: np.ndarray, shif
 
 def straighten(rows: Sequence[wp.array], tables: Sequence[np.ndarray | None], errors: Sequence[float], *, device: str) -> None:
     """Put phases right in place; not synchronised on CUDA.
-
-    Args:
-        rows: phase, amplitude, offset, sigma and status, [periods, pixels] each, as in WrappedPhase.
-        tables: of `phase_table`, one a period; None leaves the phases as they are.
-        errors: of each period's phase beyond noise, radians, added to its deviation.
-    """
+    `rows`: phase, amplitude, offset, sigma and status, [periods, pixels] each, as in WrappedPhase. `tables`: of `phase_table`, one a
+    period; None leaves the phases as they are. `errors`: of each period's phase beyond noise, radians, added to its deviation."""
     plain = np.tile([0.0, 1.0, 1.0, 0.0], (BINS + 1, 1))
     given = np.stack([plain if table is None else table for table in tables])
     pack = devices.pack_width(device)

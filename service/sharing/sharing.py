@@ -219,10 +219,7 @@ def kind_of_worker(device: str) -> str:
 
 def digest(value: object) -> str:
     """Return the SHA-256, hexadecimal, of numbers, strings, arrays and of tuples, lists and dataclasses of these.
-
-    Raises:
-        TypeError: a value is of another kind, whose content is not known.
-    """
+    Raises TypeError: a value is of another kind, whose content is not known."""
     hasher = hashlib.sha256()
     _add(value, hasher.update)
     return hasher.hexdigest()

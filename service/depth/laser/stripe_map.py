@@ -115,12 +115,8 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
     the edge of a surface one side does. A curve is contradicted where a third of its samples are, by stripes of three times its brightness
     (their median: texture changes single ones). Where frames of the capture show two stripes, stripes of any brightness contradict it; else
     it may see a post that is narrower than the distance of the planes.
-
-    Args:
-        samples: of all frames whose stripes cross the same lines; those that are OK are compared.
-        curve: [n] int, number of the curve of each sample, different for curves of different frames.
-        doubled: whether frames of the capture show two stripes.
-    """
+    `samples`: of all frames whose stripes cross the same lines; those that are OK are compared. `curve`: [n] int, number of the curve of
+    each sample, different for curves of different frames. `doubled`: whether frames of the capture show two stripes."""
     ok = np.flatnonzero(samples.status == Status.OK)
     order = ok[np.lexsort((samples.place[ok], samples.line[ok]))]
     line, place, depth, bright, owner = (values[order] for values in (samples.line, samples.place, samples.depth, samples.amplitude, curve))

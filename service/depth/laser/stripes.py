@@ -267,11 +267,8 @@ def depth_per_turn(x: np.ndarray, y: np.ndarray, depth: np.ndarray, laser: Laser
 
 def unconfirmed(samples: Sequence[StripeSamples], planes: Sequence[LaserPlane], camera: Camera, *, along: str) -> str | None:
     """Return a sentence about planes whose accuracy nobody declares: what one sweep does not tell, and what it would make.
-
-    Args:
-        samples: the samples of each frame whose stripe crosses the same lines; their depth is 0 where there is none.
-        planes: the plane of each of these frames, in the same order.
-    """
+    `samples`: the samples of each frame whose stripe crosses the same lines; their depth is 0 where there is none. `planes`: the plane
+    of each of these frames, in the same order."""
     turned, moved = [], []
     for index, (part, plane) in enumerate(zip(samples, planes, strict=True)):
         other = planes[index + 1 if index + 1 < len(planes) else index - 1]

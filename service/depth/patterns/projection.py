@@ -73,10 +73,7 @@ def patterns_of(request: PatternsRequest) -> tuple[Pattern, ...]:
 
 def make_plan(request: PlanRequest) -> tuple[planner.Plan, ...]:
     """Return the planner's table: lighting point by point and line by line, then every code.
-
-    Raises:
-        RequestError: baseline, distance and focal length are not given together, or the planner refuses a value.
-    """
+    Raises RequestError: baseline, distance and focal length are not given together, or the planner refuses a value."""
     rig = None
     if request.baseline is not None and request.distance is not None and request.focal is not None:
         rig = planner.Rig(request.baseline, request.distance, request.focal)

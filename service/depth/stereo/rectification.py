@@ -92,11 +92,8 @@ class Rectification(NamedTuple):
 
     def positions(self, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where pixels of the reference camera lie in its rectified image.
-
-        Returns:
-            Column and row in the left image, whole at the centres of its pixels; and the depth of the rectified frame at depth 1 of the
-            reference camera. Each [rows, cols] float64.
-        """
+        Returns column and row in the left image, whole at the centres of its pixels; and the depth of the rectified frame at depth 1 of
+        the reference camera. Each [rows, cols] float64."""
         u, v = np.meshgrid(np.arange(self.reference.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
         x, y = self.reference.plane_at(u, v)
         towards = np.stack([x, y, -np.ones_like(x)], axis=-1) @ self.rectified_from_reference.T

@@ -148,11 +148,7 @@ def range_of(places: Places) -> tuple[float, float] | None:
 
 def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel, device: str) -> Iterator[tuple[int, Disparity]]:
     """Match two rectified images band by band; yield how many rows are done, and the disparity of the whole image, final in those rows.
-
-    Args:
-        least, most: the disparities that are considered.
-        noise: of a reading before smoothing.
-    """
+    `least, most`: the disparities that are considered. `noise`: of a reading before smoothing."""
     _, rows, cols = images.left.shape
     labels = Labels.covering(least, most, device)
     result = Disparity.empty((rows, cols))
@@ -232,11 +228,7 @@ def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
 
 def contrast(images: np.ndarray, reach: int) -> np.ndarray:
     """Return the standard deviation of the readings in a square around each pixel, root mean square over the frames: [rows, cols] float32.
-
-    Args:
-        images: [frames, rows, cols] float32.
-        reach: half side of the square.
-    """
+    `images`: [frames, rows, cols] float32. `reach`: half side of the square."""
     total = np.zeros(images.shape[1:])
     for image in images:
         readings = image.astype(np.float64) - float(image.mean())
@@ -249,14 +241,8 @@ def bend(disparity: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
     A surface of curvature k lies k x² / 2 above its tangent at a distance x, and the plane of least squares k/2 times the mean of x² above
     it in the middle. The curvature is the second difference over the window, averaged over the pixels around.
-
-    Args:
-        disparity: [rows, cols] float32, each fitted as a plane.
-        usable: [rows, cols] bool, where it holds.
-
-    Returns:
-        [rows, cols] float64; 0 where too few neighbours hold.
-    """
+    `disparity`: [rows, cols] float32, each fitted as a plane. `usable`: [rows, cols] bool, where it holds. Returns [rows, cols] float64;
+    0 where too few neighbours hold."""
     total = np.zeros(disparity.shape)
     for axis in (0, 1):
         before, after = (np.roll(disparity, shift, axis) for shift in (WINDOW_REACH, -WINDOW_REACH))

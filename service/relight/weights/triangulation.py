@@ -118,11 +118,8 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
 
 def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lights that each light [lights, 3] would be predicted from if it were missing, and their shares.
-
-    Returns:
-        [lights, 3] int32 and [lights, 3] float32. Taken from the neighbours of the light: of the triangles between them that hold it,
-        the one whose farthest corner is nearest. Where none holds it, at the rim of a dome, all shares are 0.
-    """
+    Returns [lights, 3] int32 and [lights, 3] float32. Taken from the neighbours of the light: of the triangles between them that hold
+    it, the one whose farthest corner is nearest. Where none holds it, at the rim of a dome, all shares are 0."""
     kept, triangles = first_of_equals(directions), triangles_between(directions)
     real = len(kept)
     around: list[set[int]] = [set() for _ in range(len(triangles.vertex))]

@@ -106,12 +106,8 @@ class NoneJoinedError(ScanError):
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
              table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object, all of which are in memory.
-
-    Args:
-        starts: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
-        table: the turntable, if its axis is right and only the angles are to be found.
-        advance: told how far the work is, from 0 to 1.
-    """
+    `starts`: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
+    `table`: the turntable, if its axis is right and only the angles are to be found. `advance`: told how far the work is, from 0 to 1."""
     with ThreadPoolExecutor(options.threads) as pool:
         return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
                            table=table, targets={number: scan.targets for number, scan in enumerate(scans)}, advance=advance)

@@ -44,12 +44,8 @@ class ReferenceBall(NamedTuple):
 
 def reference_ball(capture: Capture, reference: Capture) -> ReferenceBall:
     """Check that the capture of a reference ball fits the capture that is solved, and find the ball in it.
-
-    Raises:
-        ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is
-            perspective, or the reference has no mask.
-        CalibrationError: the mask shows no ball.
-    """
+    Raises ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is perspective, or
+    the reference has no mask. Raises CalibrationError: the mask shows no ball."""
     where = reference.folder / FILE_NAME
     check_surface(capture)
     ours, theirs = capture.sources(), reference.sources()
