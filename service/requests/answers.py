@@ -53,7 +53,7 @@ class JobView(View):
     """The reason why the job failed, in one sentence."""
 
     @classmethod
-    def of(cls, row: Mapping[str, Any]) -> Self:
+    def of(cls, row: Mapping[Any, Any]) -> Self:
         """Return the view of a row of the service's table of jobs."""
         progress = None
         if row["stage"] is not None:
