@@ -29,7 +29,7 @@ ROUNDS = 6
 
 
 class Contradiction(NamedTuple):
-    """What systematic residuals say of a calibration."""
+    """Evidence of systematic residuals against a calibration."""
 
     size_px: float
     """Distance of the decoded places from the epipolar lines that the fit explains, root mean square."""
