@@ -134,10 +134,10 @@ def opened(path: str | Path) -> Iterator[Source]:
         yield Source(given, file, folder is not None, None if folder is None else folder.max_pixels)
 
 
-def read_bytes(path: str | Path, most: int = -1) -> bytes:
-    """Return the content of a file, or its first `most` bytes."""
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a file."""
     with opened(path) as source, storage("read", path):
-        return source.file.read(most)
+        return source.file.read()
 
 
 def _folder_of(path: Path) -> Confined | None:

@@ -93,10 +93,7 @@ def _mark_kernel(first: int, voxel: float, corner: wp.vec3, views: wp.array(dtyp
 
 def find_blocks(views: ViewArrays, voxel: float, corner: tuple[int, int, int], blocks: int = BRICK, *, device: str) -> Blocks:
     """Find the blocks of a brick that come near a measured surface; waits for the device.
-
-    Args:
-        corner: lattice coordinates of the lowest voxel of the brick; voxel (0, 0, 0) lies at the origin of the views' coordinates.
-    """
+    `corner`: lattice coordinates of the lowest voxel of the brick; voxel (0, 0, 0) lies at the origin of the views' coordinates."""
     side = blocks + 1
     marked = wp.zeros((side, side, side), dtype=wp.uint8, device=device)
     low = wp.vec3(*(float(voxel * c) for c in corner))

@@ -168,12 +168,8 @@ def _resample_kernel(first: int, rows: int, cols: int, focal: float, start: wp.a
 
 def resample(places: np.ndarray, depths: np.ndarray, sigmas: np.ndarray, shape: tuple[int, int], focal: float, *, device: str) -> Resampled:
     """Return the range image of points that a perspective camera without distortion saw; waits for the device.
-
-    Args:
-        places: [n, 2] u and v of the points in pixels, from the top-left corner of the image; those outside of it do not count.
-        depths, sigmas: [n] metres, above 0; the errors of points are independent.
-        focal: in pixels.
-    """
+    `places`: [n, 2] u and v of the points in pixels, from the top-left corner of the image; those outside of it do not count. `depths,
+    sigmas`: [n] metres, above 0; the errors of points are independent. `focal`: in pixels."""
     rows, cols = shape
     col, row = np.floor(places).astype(np.int64).T
     inside = np.flatnonzero((col >= 0) & (col < cols) & (row >= 0) & (row < rows))

@@ -61,11 +61,8 @@ def _residual_kernel(first: int, voxels: Voxels, views: wp.array(dtype=View), ce
 
 def residuals(volume: Volume, views: ViewArrays) -> tuple[np.ndarray, np.ndarray]:
     """Return how far the pixels of all views lie from the fused surface in a brick; waits for the device.
-
-    Returns:
-        [C] float32 metres, positive outside, one for the upper left pixel of each cell; and [C] uint8, ELSEWHERE, FUSED, LOST or REFUSED:
-        distances count where it is FUSED.
-    """
+    Returns [C] float32 metres, positive outside, one for the upper left pixel of each cell; and [C] uint8, ELSEWHERE, FUSED, LOST or
+    REFUSED: distances count where it is FUSED."""
     blocks: Blocks = volume.blocks
     count = len(views.cells)
     distance: Any = wp.zeros(count, dtype=float, device=blocks.device)

@@ -84,7 +84,7 @@ class Cell:
 
 @wp.struct
 class Measured:
-    """What all views measured, as kernels read it; the fields are those of `ViewArrays`."""
+    """The measurements of all views, as kernels read them; the fields are those of `ViewArrays`."""
 
     views: wp.array(dtype=View)
     cell: wp.array(dtype=int)

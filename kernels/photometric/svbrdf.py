@@ -140,12 +140,8 @@ def model_weights(costs: np.ndarray, *, temperature: float) -> np.ndarray:
 def average_normals(normals: np.ndarray, costs: np.ndarray, *, temperature: float,
                     spreads: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean of a pixel's normals under several models, by `model_weights`, and their weighted RMS spread in degrees.
-
-    Args:
-        normals: [models, n, 3] unit.
-        costs: [models, n].
-        spreads: [models, n] RMS spread, in degrees, of the normals that each model's normal is the mean of; None: of none.
-    """
+    `normals`: [models, n, 3] unit. `costs`: [models, n]. `spreads`: [models, n] RMS spread, in degrees, of the normals that each model's
+    normal is the mean of; None: of none."""
     weights = model_weights(costs, temperature=temperature)
     mean = np.einsum("sn,snc->nc", weights, normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
@@ -169,11 +165,7 @@ def doubt_of_f0(samples: Samples, normal: np.ndarray, material: Material, shared
     """Return the angle in degrees, [n] float32, to a normal that explains the pixel about as well with the shared F0.
 
     It is 0 where F0 is not far above the shared ones, and where no such normal was found.
-
-    Args:
-        material: of material.fit_material.
-        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials.
-    """
+    `material`: of material.fit_material. `shared`: [materials, 4] F0 and roughness of shared_materials.choose_materials."""
     doubt = np.zeros(len(normal), np.float32)
     common = shared[is_dielectric(shared), 0]
     if not len(common):

@@ -91,10 +91,7 @@ def decode_kary(frames: Band, digits: Sequence[int], *, white: int, black: int, 
 
 def expected_levels(levels: np.ndarray, crosstalk: np.ndarray | None) -> np.ndarray:
     """Return the reading of each digit value, as a part of white minus black, [k, channels] float64.
-
-    Raises:
-        ArrayError: shapes that cannot be, or levels that look the same.
-    """
+    Raises ArrayError: shapes that cannot be, or levels that look the same."""
     given = np.asarray(levels, dtype=np.float64)
     if given.ndim == 1:
         given = given[:, None]

@@ -46,11 +46,8 @@ def saturation_masks(frames: Band, *sets: Sequence[int | None]) -> wp.array:
 
 def upload(values: np.ndarray, saturated: np.ndarray | None = None, *, device: str) -> Band:
     """Lay frames out on the device; on the CPU nothing is copied when the pixels divide into packs and lie without gaps.
-
-    Args:
-        values: [frames, pixels] or [frames, channels, pixels] float32, linear.
-        saturated: [⌈frames / 8⌉, pixels] uint8 bits: frame f is bit f % 8 of byte f // 8; None when no reading saturates.
-    """
+    `values`: [frames, pixels] or [frames, channels, pixels] float32, linear. `saturated`: [⌈frames / 8⌉, pixels] uint8 bits: frame f is
+    bit f % 8 of byte f // 8; None when no reading saturates."""
     if values.ndim not in (2, 3) or values.dtype != np.float32 or 0 in values.shape:
         raise ArrayError(f"values are {values.dtype} {values.shape}: give [frames, pixels] or [frames, channels, pixels] float32")
     count, channels, pixels = len(values), 1 if values.ndim == 2 else values.shape[1], values.shape[-1]

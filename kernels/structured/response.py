@@ -33,13 +33,8 @@ MIN_SLOPE = 0.1
 
 def light_of(response: Sequence[float] | np.ndarray | None, levels: np.ndarray) -> np.ndarray:
     """Return the light of a projector at levels […], 0…1, as a part of its white minus its black, float64.
-
-    Args:
-        response: [n] the projector's light at n even levels from 0 to 1, rising; None: linear.
-
-    Raises:
-        ArrayError: a response that does not rise.
-    """
+    `response`: [n] the projector's light at n even levels from 0 to 1, rising; None: linear. Raises ArrayError: a response that does not
+    rise."""
     if response is None:
         return np.asarray(levels, dtype=np.float64)
     given = np.asarray(response, dtype=np.float64)
@@ -75,12 +70,7 @@ def modulated_wave(response: Sequence[float] | np.ndarray | None, carrier_weight
 
 def fitted_curve(wave: np.ndarray, weights: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return what a fit of sinusoids makes of a wave at GRID even phases: C + iS, and A.
-
-    Args:
-        wave: [GRID] light over one turn.
-        weights: [frames, 3] of the fit's A, C and S.
-        shifts: [frames] turns.
-    """
+    `wave`: [GRID] light over one turn. `weights`: [frames, 3] of the fit's A, C and S. `shifts`: [frames] turns."""
     at = (np.arange(GRID)[:, None] / GRID - shifts) % 1.0
     light = np.interp(at, np.arange(GRID + 1) / GRID, np.append(wave, wave[0]))
     return light @ (weights[:, 1] + 1j * weights[:, 2]), light @ weights[:, 0]
@@ -128,12 +118,8 @@ def wave_error(response: Sequence[float] | np.ndarray, weights: np.ndarray, shif
 
 def straighten(rows: Sequence[wp.array], tables: Sequence[np.ndarray | None], errors: Sequence[float], *, device: str) -> None:
     """Put phases right in place; not synchronised on CUDA.
-
-    Args:
-        rows: phase, amplitude, offset, sigma and status, [periods, pixels] each, as in WrappedPhase.
-        tables: of `phase_table`, one a period; None leaves the phases as they are.
-        errors: of each period's phase beyond noise, radians, added to its deviation.
-    """
+    `rows`: phase, amplitude, offset, sigma and status, [periods, pixels] each, as in WrappedPhase. `tables`: of `phase_table`, one a
+    period; None leaves the phases as they are. `errors`: of each period's phase beyond noise, radians, added to its deviation."""
     plain = np.tile([0.0, 1.0, 1.0, 0.0], (BINS + 1, 1))
     given = np.stack([plain if table is None else table for table in tables])
     pack = devices.pack_width(device)

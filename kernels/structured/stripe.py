@@ -259,12 +259,8 @@ def plane_depths(x: np.ndarray, y: np.ndarray, point: np.ndarray, normal: np.nda
     """Return the depth at which lines of sight (x, y, -1) through the camera's centre meet a plane of light.
 
     It is NaN where the line meets the plane behind the camera, or at less than 1.1 degrees.
-
-    Args:
-        x, y: [n] float64.
-        point: [3] on the plane, metres, camera frame. normal: [3] of the plane, unit.
-        along: "row" or "column": whether `per_pixel` is for x or for y.
-    """
+    `x, y`: [n] float64. `point`: [3] on the plane, metres, camera frame. normal: [3] of the plane, unit. `along`: "row" or "column":
+    whether `per_pixel` is for x or for y."""
     normal = np.asarray(normal, float)
     facing = x * normal[0] + y * normal[1] - normal[2]
     sine = np.abs(facing) / np.sqrt(x * x + y * y + 1)

@@ -67,13 +67,7 @@ def unwrap_jointly(wrapped: WrappedPhase, *, extent: float) -> Decoded:
     keep the coordinate that fits best, and its deviation in that wrap. OUT_OF_RANGE: what fits lies outside. Else the first period that has
     no phase says why. Where the periods disagree by more than their deviations, sigma grows by the root of χ² over its degrees of freedom:
     motion between frames and bent waves shift each period by another amount.
-
-    Args:
-        extent: projector pixels along the axis.
-
-    Raises:
-        ArrayError: the periods repeat within less than MIN_COVER of the projector.
-    """
+    `extent`: projector pixels along the axis. Raises ArrayError: the periods repeat within less than MIN_COVER of the projector."""
     if not extent > 0:
         raise ArrayError(f"the projector has {extent:g} px: give more than 0")
     covered = unwrap_range(wrapped.periods_px, extent)

@@ -60,7 +60,6 @@ def _multiply(first: int,
               # outputs
               q: wp.array(dtype=wp.float32),
               partial: wp.array(dtype=wp.float64)):
-    """Compute q = A·p, and each thread's part of p·q."""
     t = first + wp.tid()
     pitch = weights.pitch
     total = wp.float64(0.0)
@@ -121,7 +120,6 @@ def _turn(first: int,
           z: wp.array(dtype=wp.float32),
           # outputs
           p: wp.array(dtype=wp.float32)):
-    """Compute the next direction of search."""
     t = first + wp.tid()
     beta = _ratio(rz[1 - slot], rz[slot], goal)
     for i in range(first_cell(walk, t), end_cell(walk, t), walk.step):
@@ -188,5 +186,4 @@ class Solver:
         self.summer.finish(self.rz, slot)
 
     def _square(self, slot: int) -> float:
-        """Return the square of the residual's norm."""
         return max(0.0, float(self.rz[slot : slot + 1].numpy()[0]))

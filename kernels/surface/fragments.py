@@ -59,13 +59,8 @@ class Fragments(NamedTuple):
 
 def cut(surface: NormalMap, slope: Planes, weight: Planes, left: Planes, *, grid: Grid, spacing: float) -> Fragments:
     """Cut a surface wherever its normals turn abruptly or contradict each other around a loop.
-
-    Args:
-        slope: of the edges to the right and of those down, each [size], in units of the spacing.
-        weight: of these edges before loops are looked at; 0 is no edge.
-        left: weights that the loops leave.
-        spacing: distance of neighbouring pixels in the plane of x and y.
-    """
+    `slope`: of the edges to the right and of those down, each [size], in units of the spacing. `weight`: of these edges before loops are
+    looked at; 0 is no edge. `left`: weights that the loops leave. `spacing`: distance of neighbouring pixels in the plane of x and y."""
     there = np.stack([plane > 0 for plane in weight])
     usable = there[0] | there[1]
     usable[1:] |= there[0, :-1]

@@ -160,5 +160,4 @@ def _area(grid: BoardGrid, row: np.ndarray, col: np.ndarray, middle: tuple[float
 
 
 def _numbers(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values with floats of six digits."""
     return {key: float(f"{value:.6g}") if isinstance(value, float) else value for key, value in values.items()}

@@ -81,7 +81,6 @@ def read_design(path: Path) -> Nominal:
 
 
 def _check_places(path: Path, regions: tuple[Region, ...], grid: BoardGrid) -> None:
-    """Check that regions lie on the height map."""
     for region in regions:
         (x, y), (across, down) = region.centre_m, region.size_m
         row, col = grid.place(np.array([x - across / 2, x + across / 2]), np.array([y + down / 2, y - down / 2]))

@@ -64,8 +64,6 @@ class InspectBoardResult(NamedTuple):
 
 
 class _Judged(NamedTuple):
-    """Result of the comparison with nominal heights."""
-
     nominal: Nominal
     match: Match
     deviation: HeightMap
@@ -222,7 +220,6 @@ def _write_deviation(path: Path, judged: _Judged, provenance: dict[str, str]) ->
 
 
 def _stitching(board: BoardTiles, stitched: Stitched) -> dict[str, Any]:
-    """Return what the report says about the registration of tiles."""
     motions, length = stitched.motions, stitched.length_m
     tiles = []
     for number, tile in enumerate(board.tiles):
@@ -247,7 +244,6 @@ def _stitching(board: BoardTiles, stitched: Stitched) -> dict[str, Any]:
 
 
 def _comparison(judged: _Judged, area_count: int) -> dict[str, Any]:
-    """Return what the report says about the comparison with the nominal heights."""
     scan, found = judged.scan, judged.match
     known = judged.deviation.measured
     return {

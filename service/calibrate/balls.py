@@ -126,8 +126,6 @@ def find_mirror_balls(captures: LightCaptures, level: float, radius_m: float | N
 
 
 class _Found(NamedTuple):
-    """The balls of a capture."""
-
     balls: list[Ball]
     looked_at: int
     """The number of round outlines."""

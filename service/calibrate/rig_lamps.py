@@ -322,7 +322,6 @@ def _with_measured(rig: Rig, measured: dict[int, MeasuredPrimary], factor: np.nd
 
 def _entry(rig: Rig, column: int, found: MeasuredPrimary | CalibrationError, factor: np.ndarray, misfit: float,
            shots: list[Shot]) -> dict[str, Any]:
-    """Return what the report says of a primary."""
     index, primary = rig.emitters[column]
     named = {"light": rig.lights[index].name, "primary": primary.name, "images": [shot.frame.image for shot in shots]}
     if isinstance(found, CalibrationError):

@@ -152,7 +152,6 @@ def stereo(request: StereoRequest, progress: Progress | None = None, *, manifest
 
 
 def _check_cameras(target: Capture, capture: Capture) -> None:
-    """Refuse a capture of other cameras."""
     theirs, ours = ([(other.name, other.resolution) for other in each.manifest.other_cameras] for each in (target, capture))
     if theirs != ours:
         raise ManifestError(f"{target.folder / FILE_NAME}: other_cameras: differ in name or resolution from those of {capture.folder}: one "

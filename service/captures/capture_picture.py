@@ -132,7 +132,6 @@ def _shown(images: Sequence[np.ndarray | None], capture: Capture, review: Review
 
 
 def _crossed(aspect: float) -> np.ndarray:
-    """Return the image of a frame that cannot be read."""
     y, x = np.meshgrid(np.linspace(0, 1, THUMBNAIL), np.linspace(0, 1, max(2, round(THUMBNAIL * aspect))), indexing="ij")
     return np.where((np.minimum(np.abs(x - y), np.abs(x + y - 1)) < 0.04)[..., None], RED, DIM).astype(np.float32)
 

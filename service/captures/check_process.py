@@ -69,7 +69,6 @@ def import_in_process(folder: Path, choices: ImportChoices, assumed: tuple[str, 
 
 
 def _ask(asked: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Start the process, and return what it answers."""
     with ExitStack() as ended:
         errors = ended.enter_context(tempfile.TemporaryFile())
         process = ended.enter_context(subprocess.Popen(COMMAND, env=bare_environment(), cwd=os.sep, stdin=subprocess.PIPE,
@@ -126,7 +125,6 @@ def _answer(process: "subprocess.Popen[bytes]", progress: Progress) -> dict[str,
 
 
 def _end(code: int | None) -> str:
-    """Return a sentence about a process that ended without an answer."""
     if code is not None and -code in (signal.SIGXCPU, signal.SIGKILL):
         return (f"the check of the files was ended: it takes more than {CPU_S} seconds of processor time "
                 f"or {MEMORY_BYTES >> 30} GiB of memory")

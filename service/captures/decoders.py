@@ -40,8 +40,6 @@ SHRINK = 2
 
 
 class _Process:
-    """One process and the socket to it."""
-
     def __init__(self, max_pixels: int) -> None:
         self.socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:

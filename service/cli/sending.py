@@ -23,10 +23,7 @@ class Sender:
 
     def __init__(self, server: str, folder: Path) -> None:
         """Take note of the address of a service and the folder of a capture; nothing is sent yet.
-
-        Raises:
-            RequestError: the address is none of a service.
-        """
+        Raises RequestError: the address is none of a service."""
         try:
             self._client = Client(server, os.environ.get(KEY_VARIABLE))
         except ClientError as error:

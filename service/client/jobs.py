@@ -101,7 +101,6 @@ class Download:
 
 
 def _safe(name: str) -> PurePosixPath:
-    """Return a name that the service gave as a relative path that stays below the folder."""
     path = PurePosixPath(name)
     if path.is_absolute() or not path.parts or ".." in path.parts or "\\" in name or "\0" in name or ":" in name:
         raise FileError(f"{name!r}: the service names a file that cannot be written here")

@@ -183,7 +183,6 @@ def _check_plausible(solution: DepthSolution, capture: Capture, using: Ranging) 
 
 
 def _reasons(solution: DepthSolution | DecodedSolution) -> str:
-    """Return how many pixels have each status."""
     counts = solution.counts(np.ones_like(solution.estimated))
     return ", ".join(f"{count} {name}" for name, count in counts.items() if count and name != "unsolved") or "nothing is inside the mask"
 

@@ -48,12 +48,8 @@ class ScanResult(NamedTuple):
 
 def scan(request: ScanRequest, progress: Progress | None = None) -> ScanResult:
     """Turn a scan into a point cloud.
-
-    Raises:
-        StageError, KernelError: bad input; nothing is written.
-        RequestError: no shot gives a point, or LAS is asked for without laspy.
-        StorageError: the results cannot be written.
-    """
+    Raises StageError, KernelError: bad input; nothing is written. Raises RequestError: no shot gives a point, or LAS is asked for
+    without laspy. Raises StorageError: the results cannot be written."""
     if request.las and not las_is_installed():
         raise RequestError(f"{LAS_FILE} is written with laspy, which is not installed: pip install 'relit[las]'")
     timings = Timings(progress)

@@ -149,14 +149,8 @@ def separate(request: SeparateRequest, progress: Progress | None = None) -> Sepa
 
 def choose_sinusoids(collected: Collected, wanted_px: float | None) -> tuple[float, tuple[Sinusoid, ...]]:
     """Choose the period to separate with, and return its frames along each axis.
-
-    Args:
-        wanted_px: the period that was asked for; None: the shortest.
-
-    Raises:
-        ManifestError: no period has three shifts, or the shortest is longer than LONGEST_PX.
-        RequestError: no such period.
-    """
+    `wanted_px`: the period that was asked for; None: the shortest. Raises ManifestError: no period has three shifts, or the shortest is
+    longer than LONGEST_PX. Raises RequestError: no such period."""
     found: dict[float, list[Sinusoid]] = {}
     for code in (code for code in collected.codes if isinstance(code, PhaseCode)):
         for period in dict.fromkeys(code.periods_px):

@@ -144,8 +144,6 @@ def quantise(level: np.ndarray, rig: Rig) -> Quantised:
 
 
 class _Tour(NamedTuple):
-    """The order in which lamps are rounded."""
-
     order: list[int]
     later: list[list[int]]  # for each place of the tour, the places of the nearest lamps that come later
     share: list[np.ndarray]  # what each of them takes

@@ -162,7 +162,6 @@ def _open_surroundings(request: ExportRequest, maps: SurfaceMaps) -> Surrounding
 
 
 def _content_hashes(surroundings: Surroundings) -> dict[str, str]:
-    """Return the content hashes of what the asset brings along, by the names of the options."""
     found = {}
     if surroundings.rig is not None:
         found["rig"] = digest(surroundings.rig.folder / FILE_NAME)

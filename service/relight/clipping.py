@@ -53,12 +53,7 @@ class Clipping(NamedTuple):
 
 def clipped_channels(values: np.ndarray, bits: np.ndarray, scale: np.ndarray, level: np.ndarray) -> np.ndarray:
     """Return [3, lights padded, n] bool: which channels of readings are clipped; the bits of a stack tell only that one of the three is.
-
-    Args:
-        values: [3, lights padded, n] stored values.
-        bits: [lights padded / 8, n] of the stack.
-        level: [lights padded] of Clipping.
-    """
+    `values`: [3, lights padded, n] stored values. `bits`: [lights padded / 8, n] of the stack. `level`: [lights padded] of Clipping."""
     return _unpacked(bits) & (values.astype(np.float32) * scale[:, None] >= LEVEL_MARGIN * level[:, None])
 
 

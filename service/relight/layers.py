@@ -102,13 +102,8 @@ def read_maps(path: Path, capture: Capture) -> SurfaceMaps:
 def still_layers(layers: Collection[Layer], capture: Capture | None, maps: SurfaceMaps | None, where: Path | None,
                  space: str) -> tuple[StillLayer, ...]:
     """Return the layers that every frame of a capture shares, in the order of STILL; pixels that are not solved are 0.
-
-    Args:
-        layers: the wanted layers; those that depend on the light are passed over.
-        capture: gives the mask where there are no maps.
-        maps, where: solved maps and their file, or None.
-        space: the scene-linear colour space of the frames.
-    """
+    `layers`: the wanted layers; those that depend on the light are passed over. `capture`: gives the mask where there are no maps.
+    `maps, where`: solved maps and their file, or None. `space`: the scene-linear colour space of the frames."""
     found = []
     for layer, content in STILL.items():
         if layer not in layers:

@@ -57,11 +57,7 @@ class CaptureLighting:
     def __init__(self, lights: DistantLights, stack: Stack, environments: Environments | None, space: str, *, weighting: LightWeights,
                  device: str, model: ModelUse) -> None:
         """Keep what the frames of the capture have in common.
-
-        Args:
-            space: the scene-linear space of the stack.
-            device: where maps are shared out.
-        """
+        `space`: the scene-linear space of the stack. `device`: where maps are shared out."""
         self._lights, self._stack, self._environments, self._space = lights, stack, environments, space
         self._weighting, self._device, self._model = weighting, device, model
         self._range = RangeLighting(lights.direction, weighting) if model is ModelUse.RANGE else None

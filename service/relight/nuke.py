@@ -17,13 +17,8 @@ STEP_X, STEP_Y = 110, 80
 
 def write_nuke_script(path: Path, pattern: str, frames: Sequence[tuple[int, Path]], layers: Sequence[str], rate: float) -> None:
     """Write the script.
-
-    Args:
-        pattern: of the frames' path, with a run of # for the number.
-        frames: number and path of each, in their order.
-        layers: names of the layers of lights.
-        rate: frames per second.
-    """
+    `pattern`: of the frames' path, with a run of # for the number. `frames`: number and path of each, in their order. `layers`: names of
+    the layers of lights. `rate`: frames per second."""
     header = exr.read_header(frames[0][1])
     space = exr.color_space_of(header.metadata)
     first, last = frames[0][0], frames[-1][0]

@@ -64,10 +64,7 @@ class ScheduledFrame(NamedTuple):
 def schedule(request: RelightRequest | DriveRequest, numbers: Sequence[int], keys: LightKeys | None,
              environments: Environments | None) -> list[ScheduledFrame]:
     """Return what lights each of the numbered frames of a range, by the content of `request.keys` and the maps of `request.environment`.
-
-    Raises:
-        RequestError: nothing lights the frames, or two options turn the environment, or keys turn one that is not there.
-    """
+    Raises RequestError: nothing lights the frames, or two options turn the environment, or keys turn one that is not there."""
     if environments is None and (keys is None or not (keys.lights or keys.captured)):
         raise RequestError("nothing lights the frames: give --environment MAP, or --keys FILE with lights or captured images")
     turned = keys is not None and bool(keys.environment)

@@ -62,10 +62,7 @@ class ShadeResult(NamedTuple):
 
 def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResult:
     """Light solved maps, and write the picture whole or not at all.
-
-    Raises:
-        RequestError: no light, a file that is no .exr, or one that would replace an input.
-    """
+    Raises RequestError: no light, a file that is no .exr, or one that would replace an input."""
     timings = Timings(progress)
     device = devices.resolve(request.device)
     near: tuple[NearLight, ...] = (*request.light, *request.sphere, *request.rectangle)
@@ -102,10 +99,7 @@ def shade(request: ShadeRequest, progress: Progress | None = None) -> ShadeResul
 
 def check(request: ShadeRequest) -> Path:
     """Check a request as far as that is cheap, and return the file of the maps.
-
-    Raises:
-        RequestError: no light, a file that is no .exr or would replace an input, or layers that cannot be written.
-    """
+    Raises RequestError: no light, a file that is no .exr or would replace an input, or layers that cannot be written."""
     if not (request.light or request.sphere or request.rectangle) and request.environment is None:
         raise RequestError("there is no light: give --light, --sphere, --rectangle or --environment")
     if request.out.suffix.lower() != ".exr":

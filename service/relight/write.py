@@ -143,10 +143,7 @@ class FrameWriter:
 
         The function gets the first row and the one behind the last, the frames [frames, 3, pixels] and further layers as `put` does. It
         waits until the block before is written, then begins to write this one.
-
-        Raises:
-            StorageError: a frame cannot be written; none of this chunk is left behind.
-        """
+        Raises StorageError: a frame cannot be written; none of this chunk is left behind."""
         self.wait()
         height, begun = form.resolution[1], self.written.frames
         growing = [exr_rows.growing(file.path, rows=height, metadata={**form.attributes, **file.metadata}, checksum=True) for file in files]

@@ -1,7 +1,8 @@
 """The models of the answers of the service, views for short, shared by the API and its client."""
 
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -50,6 +51,16 @@ class JobView(View):
     progress: ProgressView | None
     error: str | None
     """The reason why the job failed, in one sentence."""
+
+    @classmethod
+    def of(cls, row: Mapping[Any, Any]) -> Self:
+        """Return the view of a row of the service's table of jobs."""
+        progress = None
+        if row["stage"] is not None:
+            left = max(0, row["total"] - row["done"])
+            progress = ProgressView(stage=row["stage"], done=row["done"], total=row["total"], rate=row["rate"],
+                                    remaining_s=left / row["rate"] if row["rate"] else None)
+        return cls.model_validate({**row, "progress": progress})
 
 
 class LogEntry(View):

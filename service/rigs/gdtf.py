@@ -207,7 +207,6 @@ def _irradiance(channels: list[Channel], names: list[str]) -> tuple[np.ndarray, 
 
 
 def _emitter(fixture: Any, channel: Any) -> Any:
-    """Return the emitter that the functions of a channel name, or None."""
     named = {str(function.emitter) for logical in channel.logical_channels for function in logical.channel_functions
              if function.emitter is not None}
     return next((emitter for emitter in fixture.emitters if emitter.name in named), None)

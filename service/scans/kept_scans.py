@@ -68,11 +68,7 @@ class KeptScans:
 
     def __init__(self, file: Path, listed: ScanSet, pieces: SharedPieces, *, memory_bytes: float, threads: int) -> None:
         """Create the scans, of which none is read yet.
-
-        Args:
-            memory_bytes: that scans read again may take, beside those that threads are at work on.
-            threads: scans and pairs at one time.
-        """
+        `memory_bytes`: that scans read again may take, beside those that threads are at work on. `threads`: scans and pairs at one time."""
         self._file, self._listed, self._pieces, self._threads = file, listed, pieces, threads
         self._most, self._held = memory_bytes, 0.0
         self._cache: OrderedDict[int, tuple[Prepared, float]] = OrderedDict()

@@ -10,8 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
-from service.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
-from service.sharing.sharing import digest
+from service.sharing.sharing import LOOK_S, PieceStore, agree, digest, opened, sealed
 from stage.errors import storage
 from stage.files import replacing
 from stage.results.depth_maps import DEPTH_FILE
@@ -61,11 +60,8 @@ class SharedPieces:
 
     def __init__(self, store: PieceStore, *, leads: bool = True, invite: Callable[[int], None] = lambda pieces: None) -> None:
         """Create the part of a worker.
-
-        Args:
-            leads: whether this worker has the job; it alone says what a phase follows from.
-            invite: called with the number of pieces before each phase, to ask other workers.
-        """
+        `leads`: whether this worker has the job; it alone says what a phase follows from. `invite`: called with the number of pieces
+        before each phase, to ask other workers."""
         self._store, self._leads, self._invite = store, leads, invite
         self._run, self._phases, self._has_agreed = "", 0, False
 
@@ -152,7 +148,6 @@ class SharedPieces:
         return others
 
     def _made(self, name: str, piece: str, make: Callable[[str], bytes]) -> bytes:
-        """Make a piece, keep and return it."""
         content = make(piece)
         self._store.write(name, sealed(content))
         return content

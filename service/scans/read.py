@@ -39,11 +39,8 @@ def read_scans(file: Path, scans: ScanSet) -> Iterator[Scan]:
 
 def read_scan(file: Path, scans: ScanSet, number: int, *, estimate_normals: bool = True) -> Scan:
     """Read one scan of a set.
-
-    Args:
-        number: of the scan, from 0.
-        estimate_normals: whether normals are fitted to the points where the scan has none; without them the scan has none.
-    """
+    `number`: of the scan, from 0. `estimate_normals`: whether normals are fitted to the points where the scan has none; without them the
+    scan has none."""
     entry = scans.scans[number]
     where = f"{file}: scans[{number}] ({entry.name})"
     path = file.parent / entry.path

@@ -57,8 +57,6 @@ class RegisterResult(NamedTuple):
 
 
 class _Placed(NamedTuple):
-    """Poses, and what there is to say of them."""
-
     scans: Sequence[ScanFacts]
     poses: dict[int, np.ndarray]
     covariances: dict[int, np.ndarray]
@@ -140,7 +138,6 @@ def _pieces(request: RegisterRequest, file: Path, listed: ScanSet, sharing: Shar
 
 
 def _placed(request: RegisterRequest, file: Path, alone: Distinct, pieces: SharedPieces, timings: Timings) -> _Placed:
-    """Return the poses of the scans of a set."""
     listed, reference = alone.scans, _checked(request, file, alone)
     said = alone.warnings() + rotation_warnings(listed)
     table, threads = listed.turntable, _threads(request)

@@ -51,11 +51,7 @@ class Viewpoints(NamedTuple):
 
 def find_viewpoints(scans: Sequence[np.ndarray], normals: Sequence[np.ndarray | None]) -> Viewpoints:
     """Find the place of the scanner of each scan: the origin if all scans can be seen from it, else a place far away along a direction.
-
-    Args:
-        scans: points [n, 3] of each, in its frame.
-        normals: [n, 3] of each as its file has them, or None.
-    """
+    `scans`: points [n, 3] of each, in its frame. `normals`: [n, 3] of each as its file has them, or None."""
     if (fewest := min(map(len, scans))) < LEAST_POINTS:
         return Viewpoints(None, 180.0, f"a scan has {fewest} points, and {LEAST_POINTS} are the fewest that tell a direction")
     drawn = [np.random.default_rng(0).permutation(len(points))[:MOST_POINTS] for points in scans]

@@ -113,12 +113,8 @@ def begin(
 
 def advance(track: Track, new: Track, joined: np.ndarray, *, unit: bool = False) -> Track:
     """Return the track after a further step.
-
-    Args:
-        new: of the step alone, of `begin`.
-        joined: [rows, cols] bool, where both agree; elsewhere the step stands alone.
-        unit: whether means are directions.
-    """
+    `new`: of the step alone, of `begin`. `joined`: [rows, cols] bool, where both agree; elsewhere the step stands alone. `unit`: whether
+    means are directions."""
     gain = np.where(joined, track.noise / np.maximum(track.noise + new.noise, 1e-30), 1).astype(np.float32)
     equal = joined & (track.noise + new.noise == 0)
     gain = np.where(equal, 1 / (track.count + 1), gain).astype(np.float32)

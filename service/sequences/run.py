@@ -45,8 +45,6 @@ class SequenceResult(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """The result of one step."""
-
     facts: dict[str, Any]
     solved: int
     warnings: list[str]
@@ -120,7 +118,6 @@ def _finish(request: Any, step: TimeStep, folder: Path, alone: Path, mask: np.nd
 
 def _run(request: Any, sequence: Sequence, progress: Progress | None, one: Callable[..., tuple[_Step, bool]],
          result: str) -> SequenceResult:
-    """Do the steps, and write what is said of all."""
     timings = Timings(progress)
     rows: list[dict[str, Any]] = []
     warnings: list[str] = [] if sequence.timed or request.frame_rate is not None else [UNTIMED.format(sequence.frames_per_second)]

@@ -15,15 +15,66 @@ import io
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
 
 from kernels import device as devices
 from kernels.relight.frames import cublas
+from service.errors import DivergedError
 from service.reporting.provenance import versions
-from service.sharing.piece_store import LOOK_S, PieceStore, agree, opened, sealed
+
+# Storage in which the workers of one job keep their pieces, and the check that they work at the same job.
+LOOK_S = 0.2
+"""Seconds between two looks for the pieces that others do."""
+DIGEST_BYTES = 32
+"""Length of the SHA-256 before the content of a piece."""
+
+
+class PieceStore(Protocol):
+    """Storage of the pieces that the workers of a job find. The methods are called by several threads."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return what was stored under a name, or None."""
+
+    def write(self, name: str, content: bytes) -> None:
+        """Store something under a name, whole or not at all."""
+
+    def claim(self, name: str) -> bool:
+        """Return whether this worker is to do a piece: False while another, which is still at work, has claimed it."""
+
+
+def agree(store: PieceStore, name: str, follows_from: str, *, leads: bool, is_begun: bool) -> None:
+    """Record what a pass over the pieces follows from, or compare it with what the worker that leads has recorded.
+
+    Args:
+        name: of the pass.
+        follows_from: a digest of all that the pass follows from.
+        leads: whether this worker has the job.
+        is_begun: whether the worker that leads has begun this pass, if it works at the same.
+
+    Raises:
+        DivergedError: this worker does not lead, and has something else.
+    """
+    found = store.read(name)
+    if leads and found != follows_from.encode():
+        store.write(name, follows_from.encode())
+    elif not leads and found != follows_from.encode() and (is_begun or found is not None):
+        raise DivergedError("inputs, versions, device or findings are not those of the worker that has the job")
+
+
+def sealed(content: bytes) -> bytes:
+    """Return content with its SHA-256 before it."""
+    return hashlib.sha256(content).digest() + content
+
+
+def opened(stored: bytes | None) -> bytes | None:
+    """Return the content that `sealed` got, or None if it is not there or not what was written."""
+    if stored is None or hashlib.sha256(stored[DIGEST_BYTES:]).digest() != stored[:DIGEST_BYTES]:
+        return None
+    return stored[DIGEST_BYTES:]
+
 
 Piece = TypeVar("Piece")
 
@@ -81,11 +132,8 @@ class SharedSolve:
 
     def __init__(self, store: PieceStore, *, leads: bool, invite: Callable[[int], None] = lambda pieces: None) -> None:
         """Take part in the solve whose pieces are in the store.
-
-        Args:
-            leads: whether this worker has the job; it alone says what a pass follows from.
-            invite: called with the number of pieces before each pass that can be shared.
-        """
+        `leads`: whether this worker has the job; it alone says what a pass follows from. `invite`: called with the number of pieces
+        before each pass that can be shared."""
         self._store, self._leads, self._invite = store, leads, invite
         self._solve, self._passes, self._has_agreed = "", 0, False
 
@@ -96,12 +144,8 @@ class SharedSolve:
     def deal(self, names: Sequence[str], pieces: Sequence[Piece], work: Callable[[Piece, str], None], done: Callable[[Piece], None], *,
              waiting: Callable[[], None], pixels_of: Callable[[Piece], Any], results: Results) -> None:
         """Do the pieces of a pass that no other worker does, and read those of the others.
-
-        Args:
-            names, pieces, work, done: as of `deal`; `done` is told the pieces of other workers too.
-            waiting: called now and then while pieces of other workers are waited for.
-            pixels_of: returns the place of a piece on the last axis of the arrays.
-        """
+        `names, pieces, work, done`: as of `deal`; `done` is told the pieces of other workers too. `waiting`: called now and then while
+        pieces of other workers are waited for. `pixels_of`: returns the place of a piece on the last axis of the arrays."""
         self._passes += 1
         if len(pieces) < LEAST_PIECES:
             deal(names, pieces, work, done)
@@ -135,15 +179,13 @@ class SharedSolve:
 
 
 class _Pass:
-    """The results of all workers in one pass."""
-
     def __init__(self, store: PieceStore, name: str, follows_from: str, leads: bool, arrays: Sequence[np.ndarray]) -> None:
         self._store, self._name, self._leads, self._arrays = store, name, leads, arrays
         self._follows_from = follows_from
         self._folder = f"{name}-{follows_from[:16]}"
 
     def agree(self, *, is_begun: bool = False) -> None:
-        """Record what the pass follows from, or compare it with what the worker that leads has recorded; as of piece_store.agree."""
+        """Record what the pass follows from, or compare it with what the worker that leads has recorded; as `agree` does."""
         agree(self._store, self._name, self._follows_from, leads=self._leads, is_begun=is_begun)
 
     def read(self, number: int, pixels: Any) -> bool:
@@ -177,10 +219,7 @@ def kind_of_worker(device: str) -> str:
 
 def digest(value: object) -> str:
     """Return the SHA-256, hexadecimal, of numbers, strings, arrays and of tuples, lists and dataclasses of these.
-
-    Raises:
-        TypeError: a value is of another kind, whose content is not known.
-    """
+    Raises TypeError: a value is of another kind, whose content is not known."""
     hasher = hashlib.sha256()
     _add(value, hasher.update)
     return hasher.hexdigest()

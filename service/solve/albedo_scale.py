@@ -36,10 +36,7 @@ def check_request(request: SolveRequest, capture: Capture, *, relative: bool) ->
 
 def moderate(given: SolveInput, lights: DistantLights | PlacedLights, capture: Capture) -> tuple[DistantLights | PlacedLights, float]:
     """Return lights under which half floats hold the albedo, and the factor by which these are brighter than those of the manifest.
-
-    Raises:
-        ManifestError: the lights are absolute, and half floats do not hold the albedo.
-    """
+    Raises ManifestError: the lights are absolute, and half floats do not hold the albedo."""
     inside = np.flatnonzero(given.mask)
     radiance, usable = given.stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
     readings = np.where(usable, grey_readings(radiance, lights.irradiance), 0).max(axis=0)

@@ -29,12 +29,8 @@ DARKEST = 0.02
 
 def agree_on_materials(solution: Solution, sigma: np.ndarray, shape: tuple[int, int], device: str) -> None:
     """Replace roughness and F0 of a solution by those that neighbouring pixels agree on; pixels with two materials keep theirs.
-
-    Args:
-        sigma: [pixels] standard error of the normals as each pixel's own readings show it, degrees.
-        shape: rows and columns of the image.
-        device: as Warp spells it.
-    """
+    `sigma`: [pixels] standard error of the normals as each pixel's own readings show it, degrees. `shape`: rows and columns of the
+    image. `device`: as Warp spells it."""
     if solution.roughness is None or solution.specular is None:
         return
     known = np.isin(solution.status, ESTIMATED).reshape(shape)

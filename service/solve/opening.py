@@ -111,7 +111,6 @@ def open_solve(request: SolveRequest, capture: Capture | None, timings: Timings,
 
 
 def _default_method(capture: Capture, *, unknown: bool) -> Method:
-    """Return the method that solves a capture for which the request names none."""
     if unknown:
         return Method.SVBRDF if len(capture.sources()) >= SVBRDF_LIGHTS else Method.ROBUST
     return next(method for method, entry in METHODS.items() if entry.is_default(capture))

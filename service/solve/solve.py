@@ -73,21 +73,13 @@ def solve(request: SolveRequest, progress: Progress | None = None, *, capture: C
 
 def help_solve(request: SolveRequest, progress: Progress, sharing: SharedSolve, *, over_time: LightsOverTime | None = None) -> None:
     """Do pieces of a solve that another process has begun; nothing is written but what it reads of them.
-
-    Args:
-        request: that of the other process, on a device of the same kind.
-        progress: told how far the solve is; it ends the help by an exception.
-
-    Raises:
-        DivergedError: this process finds something else than the other.
-    """
+    `request`: that of the other process, on a device of the same kind. `progress`: told how far the solve is; it ends the help by an
+    exception. Raises DivergedError: this process finds something else than the other."""
     opened = open_solve(request, None, Timings(progress), sharing, over_time)
     opened.solver(opened.given, opened.lights)
 
 
 class _Judged(NamedTuple):
-    """A solution with its height, and what it is worth."""
-
     solution: Solution
     placement: Placement | None
     """Parts of the object in depth; None: the height has no break, or shadows were not looked at."""
@@ -135,7 +127,6 @@ def _judge(request: SolveRequest, opened: Opened, solution: Solution) -> _Judged
 
 
 def _write(request: SolveRequest, opened: Opened, judged: _Judged, albedo_scale: float) -> SolveResult:
-    """Write the maps and the report of a solution, whose albedo is scaled already."""
     capture, method, given, solution = opened.capture, opened.method, opened.given, judged.solution
     stack, mask, timings = given.stack, given.mask, given.timings
     status = solution.status.reshape(mask.shape)
@@ -253,7 +244,6 @@ def _lobes_of_mixtures(solution: Solution, image: Callable[[np.ndarray], np.ndar
 
 
 def _nothing_solved(counts: Mapping[str, int]) -> str:
-    """Return the sentence for a result without a solved pixel."""
     common = max(counts, key=lambda name: counts[name])
     share = 100 * counts[common] / max(sum(counts.values()), 1)
     keep = ("; --max-sigma 180 keeps unsure normals" if common == Status.UNSURE.name.lower() else
@@ -262,7 +252,6 @@ def _nothing_solved(counts: Mapping[str, int]) -> str:
 
 
 def _above_one(part: float, capture: Capture) -> str:
-    """Return the sentence for an object that returns more light than arrives."""
     relative = capture.manifest.irradiance_scale == "relative"
     return (f"diffuse_albedo: is above 1 at {100 * part:.0f} % of the solved pixels, which no texture holds: " + (
         "leave --albedo-scale out, or give a smaller one" if relative else

@@ -86,8 +86,6 @@ def read_artnet(data: bytes, address: str) -> DataPacket | SyncPacket | None:
 
 @dataclass
 class _Source:
-    """A source as a universe knows it."""
-
     priority: int
     sequence: int | None
     seen: float

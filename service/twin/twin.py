@@ -129,7 +129,6 @@ def _playing(player: Prepared | None) -> Iterator[None]:
 
 
 def _record(path: Path, rig: Rig, listener: Listener) -> None:
-    """Write the levels of every frame as a table."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["frame", "time_s", *(f"{rig.lights[index].name}.{primary.name}" for index, primary in rig.emitters)])

@@ -96,7 +96,6 @@ def status_codes() -> dict[str, dict[str, Any]]:
 
 
 def _class_levels(found: ResultLayers) -> list[np.ndarray]:
-    """Return the class of every pixel of every level."""
     levels = [np.where(found.mask, SURE, np.where(found.estimated, UNSURE, NONE)).astype(np.uint8)]
     for _ in level_sizes(*found.mask.shape)[1:]:
         levels.append(halve_classes(levels[-1]))

@@ -99,11 +99,7 @@ def _numbered(shot: np.ndarray, range_m: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def read_las(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Read the points of a LAS or LAZ file. Raises ResultError if laspy is not installed, or the file is no LAS file.
-
-    Returns:
-        points: [n, 3] float64, in the unit of the file.
-        colours: [n, 3] uint8, or None.
-    """
+    Returns points: [n, 3] float64, in the unit of the file. colours: [n, 3] uint8, or None."""
     if not las_is_installed():
         raise ResultError(f"{path}: LAS files need laspy: pip install 'relit[las]'")
     import laspy

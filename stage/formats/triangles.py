@@ -48,7 +48,6 @@ def _merged(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _stl(content: bytes, path: Path) -> np.ndarray:
-    """Return the corners [F, 3, 3] of an STL file."""
     count = int.from_bytes(content[STL_HEADER - 4:STL_HEADER], "little")
     if len(content) >= STL_HEADER + count * FACET.itemsize and (count or content.lstrip()[:5].lower() != b"solid"):
         return np.frombuffer(content, dtype=FACET, count=count, offset=STL_HEADER)["corners"].astype(np.float64)
@@ -67,7 +66,6 @@ def _stl(content: bytes, path: Path) -> np.ndarray:
 
 
 def _obj(content: bytes, path: Path) -> np.ndarray:
-    """Return the corners [F, 3, 3] of an OBJ file."""
     points: list[list[str]] = []
     faces: list[tuple[int, int, int]] = []
     polygons: list[int] = []

@@ -173,12 +173,8 @@ def mixed_with_dark(readings: Readings, border: np.ndarray, coverage: np.ndarray
     """Return whether border pixels of known coverage mix the object with a dark background, where no pixel shows the background alone.
 
     What they have beyond their coverage of the object's radiance is the background's.
-
-    Args:
-        border: [n, 2] rows and columns, at least one.
-        coverage: [rows, cols] 0…1, below 1 at the border.
-        whole: [rows, cols] bool, pixels of the object alone, at least one.
-    """
+    `border`: [n, 2] rows and columns, at least one. `coverage`: [rows, cols] 0…1, below 1 at the border. `whole`: [rows, cols] bool,
+    pixels of the object alone, at least one."""
     share = coverage[border[:, 0], border[:, 1]]
     beside = readings.mean(nearest(whole)(border))
     background = float(np.sum(readings.mean(border) - share * beside)) / max(float(np.sum((1 - share) * beside)), 1e-30)

@@ -78,10 +78,7 @@ def specular_normals(parts: SeparatedMoments, grey_weights: tuple[float, float, 
     """Estimate normals halfway between the view and the centroid of the highlight: of a lobe symmetric about the mirror direction.
 
     `parts` may be told apart by polarisation or by colour; the rest is as for fit_highlights.
-
-    Returns:
-        [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from.
-    """
+    Returns [3, pixels padded] float32, unit; 0 where there is no highlight to tell a normal from."""
     toward = upload_view(view, pixel_count, device)
     normal = zeros(pixel_count, wp.float32, device, rows=3)
     devices.launch(_specular_kernel, pixel_count, [parts.specular, parts.diffuse.values, toward, wp.vec3(*grey_weights), gain],

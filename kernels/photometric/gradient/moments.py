@@ -44,12 +44,8 @@ def fit_moments(band: Band, rows: np.ndarray, scale: np.ndarray, grey_weights: t
 
     A reading of zero or below is a measurement here (a mirror that shows the dark end of a gradient reads zero); a saturated one, or one
     that is not finite in every channel, is not.
-
-    Args:
-        rows: [lights, 4] mean and dipole of each frame, along one axis at most; 0 for frames that do not take part.
-        scale: [lights] radiance of a stored 1.0.
-        grey_weights: of the channels, for the residual; they add up to one.
-    """
+    `rows`: [lights, 4] mean and dipole of each frame, along one axis at most; 0 for frames that do not take part. `scale`: [lights]
+    radiance of a stored 1.0. `grey_weights`: of the channels, for the residual; they add up to one."""
     band.require_channels(3)
     if rows.shape != (band.frame_count, 4) or scale.shape != (band.frame_count,):
         raise ArrayError(f"rows are {rows.shape}, scale {scale.shape}, the band has {band.frame_count} lights: give one for each")

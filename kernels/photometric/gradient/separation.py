@@ -47,11 +47,8 @@ def separate_polarised(cross: Moments, parallel: Moments, grey_weights: tuple[fl
     """Separate responses by polarisation: specular = (parallel - cross) / (1 - 2 leak).
 
     The diffuse responses are those of the cross frames less the part of the highlight that leaks, of half the diffuse light.
-
-    Args:
-        grey_weights: of the channels; they add up to one.
-        leak: part of a highlight's light that crossed polarisers pass, 0 to below 0.5.
-    """
+    `grey_weights`: of the channels; they add up to one. `leak`: part of a highlight's light that crossed polarisers pass, 0 to below
+    0.5."""
     diffuse = Moments(*(wp.clone(array) for array in cross)) if leak > 0 else cross
     specular = zeros(pixel_count, wp.float32, device, rows=6)
     devices.launch(_difference_kernel, pixel_count, [cross.values, cross.status, parallel.values, parallel.status,
@@ -64,10 +61,7 @@ def separate_by_colour(mixed: Moments, view: np.ndarray, *, pixel_count: int, de
     """Separate the diffuse and specular responses of unpolarised frames, where the diffuse colour is not grey.
 
     Where nothing is separated the diffuse responses are the mixed ones, and `tilt` is HIDDEN_TILT.
-
-    Args:
-        view: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share.
-    """
+    `view`: [3, pixels] float32 unit vectors from the surface to the camera, or [3, 1] for one that all share."""
     toward = upload_view(view, pixel_count, device)
     diffuse = Moments(*(wp.clone(array) for array in mixed))
     specular = zeros(pixel_count, wp.float32, device, rows=6)

@@ -51,14 +51,8 @@ class NearLights(NamedTuple):
 
 def pad_places(place: np.ndarray, lobe: np.ndarray) -> Places:
     """Check places and pad them to a multiple of 8.
-
-    Args:
-        place: [n, 4] positions (w = 1) and unit directions (w = 0).
-        lobe: [n, 4] unit axes and exponents, 0 for none.
-
-    Raises:
-        ArrayError: shapes that do not fit, numbers that are not finite, a w other than 0 and 1, an exponent below 0.
-    """
+    `place`: [n, 4] positions (w = 1) and unit directions (w = 0). `lobe`: [n, 4] unit axes and exponents, 0 for none. Raises ArrayError:
+    shapes that do not fit, numbers that are not finite, a w other than 0 and 1, an exponent below 0."""
     place, lobe = np.asarray(place, dtype=np.float32), np.asarray(lobe, dtype=np.float32)
     count = len(place)
     if place.shape != (count, 4) or lobe.shape != (count, 4) or count == 0:
@@ -73,11 +67,8 @@ def pad_places(place: np.ndarray, lobe: np.ndarray) -> Places:
 
 def see_near(band: Band, readings: Readings, field: NearField) -> NearLights:
     """Find the direction and falloff of every light at every pixel, and divide the readings by the falloff; not synchronised on CUDA.
-
-    Args:
-        readings: radiance / strength, of readings.grey_readings; on return b·l, or 0 where the light hardly shines.
-        field: places of the band's lights, and the points of its pixels.
-    """
+    `readings`: radiance / strength, of readings.grey_readings; on return b·l, or 0 where the light hardly shines. `field`: places of the
+    band's lights, and the points of its pixels."""
     places, points = field
     if len(places.place) != band.frame_count or points.shape != (3, band.pixel_count):
         raise ArrayError(f"there are {len(places.place)} padded lights and {points.shape} points, the band has "

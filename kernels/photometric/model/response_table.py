@@ -97,14 +97,8 @@ def response_table(direction: np.ndarray, solid_angle: np.ndarray, light: np.nda
 
 def search_table(table: wp.array, f0: float, widths: tuple[int, ...] = SEARCH_WIDTHS) -> wp.array:
     """Return the lobes of the search, specular ones of reflectance f0 at normal incidence; waits for the device.
-
-    Args:
-        table: of response_table.
-        widths: indices in WIDTHS of the GGX lobes.
-
-    Returns:
-        [GRID², lights, 2 + widths] float32: π times the diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX lobes.
-    """
+    `table`: of response_table. `widths`: indices in WIDTHS of the GGX lobes. Returns [GRID², lights, 2 + widths] float32: π times the
+    diffuse column, and SPECULAR_SCALE / f0 times the mirror and the GGX lobes."""
     values = table.numpy()
     kept = np.array([0, *(1 + j for j in widths)])
     specular = SPECULAR_SCALE / f0 * (f0 * values[..., 1 + 2 * kept] + values[..., 2 + 2 * kept])

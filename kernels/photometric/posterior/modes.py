@@ -56,13 +56,8 @@ class Modes(NamedTuple):
 
 def find_modes(samples: Samples, model: Model, view: np.ndarray) -> np.ndarray:
     """Return the candidates of least cost over the visible hemisphere; waits for the device.
-
-    Args:
-        view: [n, 3] unit directions to the viewer, the middle of the grid.
-
-    Returns:
-        [2, n, 3] float32 unit: the best, and the best of those at least APART from it.
-    """
+    `view`: [n, 3] unit directions to the viewer, the middle of the grid. Returns [2, n, 3] float32 unit: the best, and the best of those
+    at least APART from it."""
     offsets = rings(*GRID_RINGS)
     noise = np.tile(np.array(GRID_NOISE, dtype=np.float32), (samples.pixel_count, 1))
     cost = score_normals(samples, view, offsets, noise=noise, table=model.table, bound=model.bound).cost

@@ -100,12 +100,8 @@ class Found(NamedTuple):
 
 def search_sampling(samples: Samples, tables: SamplingTables, view: np.ndarray, *, start: np.ndarray | None = None) -> Found:
     """Find the normal and the material of sampled pixels that explain their readings best; waits for the device.
-
-    Args:
-        samples: their readings, radiance over the irradiance of each light.
-        view: [n, 3] unit directions to the viewer.
-        start: [n, 3] unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere.
-    """
+    `samples`: their readings, radiance over the irradiance of each light. `view`: [n, 3] unit directions to the viewer. `start`: [n, 3]
+    unit normals near which the best ones lie; None: they may be anywhere on the visible hemisphere."""
     lambert = Diffuse()
     first, other = find_modes(samples, bounded(tables.search[0], samples), view) if start is None else (start, start)
     near = search_normals(samples, first, shape=lambert, options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:],
@@ -154,13 +150,7 @@ def _choose(second: np.ndarray, a: tuple[np.ndarray, ...], b: tuple[np.ndarray, 
 
 def regimes(weights: np.ndarray, f0: np.ndarray, facing: np.ndarray, material: Material) -> np.ndarray:
     """Return [n] uint8 codes of Regime: a part of the light counts where both the mixture and the material contain it.
-
-    Args:
-        weights: [n, lobes] of the mixture.
-        f0: [n] of its specular lobes.
-        facing: [n] n·v.
-        material: of the same pixels.
-    """
+    `weights`: [n, lobes] of the mixture. `f0`: [n] of its specular lobes. `facing`: [n] n·v. `material`: of the same pixels."""
     fresnel = f0 + (1 - f0) * np.clip(1 - facing, 0, 1) ** 5
     mixed = SPECULAR_SCALE / f0 * fresnel * weights[:, 1:].sum(axis=1)  # under even light, as π times the diffuse weight is
     mixed /= np.maximum(mixed + np.pi * weights[:, 0], 1e-20)

@@ -72,12 +72,8 @@ class SingleLobe(NamedTuple):
 
 def standard_deviation(samples: Samples, found: Found, normal: np.ndarray, spread: np.ndarray, single: SingleLobe | None) -> Deviation:
     """Return the standard deviation of the normals of a search; waits for the device.
-
-    Args:
-        normal: [n, 3] unit, the result, which may be an average of several searches.
-        spread: [n] of that average, degrees.
-        single: the single lobe, whose curvature and noise count by its weight; None: it takes no part.
-    """
+    `normal`: [n, 3] unit, the result, which may be an average of several searches. `spread`: [n] of that average, degrees. `single`: the
+    single lobe, whose curvature and noise count by its weight; None: it takes no part."""
     lights = samples.light_count
     total, surplus, noise = evidence(samples, found.best.cost, found.best.weights)
     mean = lights * np.maximum(found.best.curvature.astype(np.float64), 1e-12)

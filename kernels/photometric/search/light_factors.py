@@ -60,12 +60,8 @@ class LightFactors(NamedTuple):
 def find_light_factors(samples: Samples, start: np.ndarray, directions: np.ndarray, row: np.ndarray, col: np.ndarray, *,
                        shape: Diffuse) -> LightFactors:
     """Find the factors of the intensities, and whether to believe them.
-
-    Args:
-        samples: direct light of some hundreds of pixels, spread over the object.
-        directions: [lights, 3] unit, in the camera frame.
-        row, col: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour.
-    """
+    `samples`: direct light of some hundreds of pixels, spread over the object. `directions`: [lights, 3] unit, in the camera frame.
+    `row, col`: [n] int, the square of the image that each pixel lies in; the squares of one half are those of a chessboard's colour."""
     half = (row + col) % 2 == 0
     square = np.unique(np.stack([row, col]), axis=1, return_inverse=True)[1].reshape(-1)
     same = np.ones(len(directions))
@@ -112,11 +108,8 @@ def untold(logarithm: np.ndarray, directions: np.ndarray, *, falling: bool) -> n
 
     A factor that is linear in the direction across the view turns all normals, which shading tells only weakly; it is kept as far as
     errors of the size of the others would give it.
-
-    Args:
-        falling: whether a part that falls with the angle to the viewer cannot be told at all, because the shape of the diffuse lobe is
-            free; else it is kept like those across the view.
-    """
+    `falling`: whether a part that falls with the angle to the viewer cannot be told at all, because the shape of the diffuse lobe is
+    free; else it is kept like those across the view."""
     design = np.stack([np.ones(len(directions)), directions[:, 2], directions[:, 0], directions[:, 1]], axis=1)
     found, spread = _robust_fit(design, logarithm)
     centred = design - design.mean(axis=0)

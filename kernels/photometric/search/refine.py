@@ -55,11 +55,7 @@ def refine(samples: Samples, normal: np.ndarray, roughness: np.ndarray, *, shape
     """Refine the normal and material of sampled pixels under lights of one direction each; waits for the device.
 
     The result is the best fit met on the way, never of higher cost than the first.
-
-    Args:
-        normal: [n, 3] unit normals, within a few degrees of the truth.
-        roughness: [n] of the material fit at these normals.
-    """
+    `normal`: [n, 3] unit normals, within a few degrees of the truth. `roughness`: [n] of the material fit at these normals."""
     device, lanes, packs = samples.device, samples.lanes, samples.packs
     refined = wp.empty((6, packs), dtype=pack_type(lanes, wp.float32), device=device)
     start = np.concatenate([normal, roughness[:, None]], axis=1)

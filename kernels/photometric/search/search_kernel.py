@@ -31,11 +31,7 @@ def search_type(lanes: int) -> Any:
 @once
 def search_kernel(lanes: int, lobes: Lobes, reweightings: int, sweeps: int) -> Any:
     """Return the kernel for one width of packs and one mixture.
-
-    Args:
-        reweightings: rounds of the robust fit of each candidate.
-        sweeps: coordinate sweeps of each non-negative solve.
-    """
+    `reweightings`: rounds of the robust fit of each candidate. `sweeps`: coordinate sweeps of each non-negative solve."""
     lane_type, samples_struct, scratch_struct, search_struct = (pack_type(lanes, wp.float32), samples_type(lanes), scratch_type(lanes),
                                                                 search_type(lanes))
     mixture, _, relaxation, prepare, fill = lobes

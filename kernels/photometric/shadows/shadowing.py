@@ -86,11 +86,8 @@ edge, which follows from a height that is not exact, decides the reading."""
 
 def divide_by_visible(samples: Samples, part: np.ndarray) -> None:
     """Divide readings by the visible part of their light, and mark those as no readings of which too little is visible, in place.
-
-    Args:
-        part: [n, lights] from 0 to 1: what each pixel reflects of each light where the surface hides some of it, over what it would reflect
-            of the whole.
-    """
+    `part`: [n, lights] from 0 to 1: what each pixel reflects of each light where the surface hides some of it, over what it would
+    reflect of the whole."""
     if part.shape != (samples.pixel_count, samples.light_count):
         raise ArrayError(f"part is {part.shape}: give one number for each of {samples.pixel_count} pixels and {samples.light_count} lights")
     devices.launch(_divide_kernel(samples.lanes), samples.packs,

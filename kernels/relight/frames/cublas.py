@@ -140,8 +140,6 @@ def split(weights: np.ndarray) -> list[SplitWeights]:
 
 
 class _Opened(NamedTuple):
-    """Result of opening cuBLAS on a device."""
-
     gemm: Gemm | None
     problem: str | None
 

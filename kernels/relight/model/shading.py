@@ -233,7 +233,6 @@ def lobes(pack: int) -> Any:
 
 @wp.func
 def _alpha_squared(rough: float) -> float:
-    """Return GGX's α² of a roughness."""
     a = wp.max(rough, LEAST_ROUGHNESS)
     return a * a * a * a
 

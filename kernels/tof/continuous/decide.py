@@ -41,11 +41,7 @@ def decide(found: Correlation, weighed: Hypotheses, *, light_speed: float, agree
 
     LOW_MODULATION: no more amplitude than noise has; SATURATED: no frequency is left; OUT_OF_RANGE: nothing in the span of `unwrap` fits;
     MULTIPATH: frequencies disagree by more than noise and `agreement_rad` explain.
-
-    Args:
-        light_speed: metres a second.
-        agreement_rad: systematic error of a phase up to which frequencies count as agreeing.
-    """
+    `light_speed`: metres a second. `agreement_rad`: systematic error of a phase up to which frequencies count as agreeing."""
     device, pixels = str(weighed.range.device), weighed.range.shape[1]
     pack, count = devices.pack_width(device), len(found.modulation_hz)
     agree = [float("inf"), *(quantile(freedom, MULTIPATH_Z) for freedom in range(1, count))]

@@ -20,10 +20,7 @@ def radians_per_metre(modulation_hz: Sequence[float] | np.ndarray, light_speed: 
 
 def require_frequencies(modulation_hz: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return modulation frequencies as [F] float64, or refuse them.
-
-    Raises:
-        ArrayError: no frequency, or one is not above zero.
-    """
+    Raises ArrayError: no frequency, or one is not above zero."""
     hz = np.asarray(modulation_hz, dtype=np.float64).reshape(-1)
     if hz.size == 0 or not np.all(np.isfinite(hz) & (hz > 0)):
         raise ArrayError(f"modulation frequencies are {list(map(float, hz))}: give one or more above zero")

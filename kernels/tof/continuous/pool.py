@@ -38,11 +38,7 @@ def pool(found: Correlation, rows: int, cols: int, *, light_speed: float) -> Poo
     """Add the phasors of dark neighbours up where a pixel has no signal of its own.
 
     Pixels with a signal of their own, or with none in any window, are as they were. Amplitude is the mean of the window.
-
-    Args:
-        found: phases of `decode`, corrected for wiggling; rows · cols pixels and padding.
-        light_speed: metres a second.
-    """
+    `found`: phases of `decode`, corrected for wiggling; rows · cols pixels and padding. `light_speed`: metres a second."""
     device, pixels, count = str(found.phase.device), found.phase.shape[1], found.phase.shape[0]
     if not 0 < rows * cols <= pixels:
         raise ArrayError(f"there are {pixels} pixels, the image is {rows} x {cols}: give the image's own size")

@@ -28,10 +28,7 @@ class LiveCounts(NamedTuple):
 
 def place(counts: np.ndarray, device: str) -> wp.array:
     """Return histograms [pixel, bin] on the device as [bin, pixel] float32, laid out so that the threads of the device read them in order.
-
-    Raises:
-        ArrayError: wrong shape, negative or not finite counts, or not one count in all of them.
-    """
+    Raises ArrayError: wrong shape, negative or not finite counts, or not one count in all of them."""
     if counts.ndim != 2 or counts.shape[1] < 3:
         raise ArrayError(f"histograms are {counts.shape}: give [pixel, bin] with three bins or more")
     values = np.ascontiguousarray(counts, dtype=np.float32)

@@ -81,11 +81,8 @@ def with_tail(sigma_bins: float, tail_bins: float, part: float) -> Pulse:
 
 def measured(times_bins: Sequence[float] | np.ndarray, power: Sequence[float] | np.ndarray) -> Pulse:
     """Return a pulse from samples of its power; time 0 is that of a return at no distance.
-
-    Args:
-        times_bins: [n ≥ 3] ascending times, in bins.
-        power: [n] in any unit, none negative, not all zero; between samples the power is linear, outside it is zero.
-    """
+    `times_bins`: [n ≥ 3] ascending times, in bins. `power`: [n] in any unit, none negative, not all zero; between samples the power is
+    linear, outside it is zero."""
     times, values = np.asarray(times_bins, dtype=np.float64), np.asarray(power, dtype=np.float64)
     if times.ndim != 1 or times.shape != values.shape or len(times) < 3:
         raise ArrayError(f"the pulse has {times.size} times and {values.size} powers: give three or more of each")

@@ -136,8 +136,6 @@ def _refined(gain: Callable[[int], float], start: int, value: float, least: int)
 
 
 class _Counted:
-    """Histograms on the host and on the device, and how likely they are."""
-
     def __init__(self, counts: np.ndarray, device: str) -> None:
         self.counts, self.device = counts, device  # [pixel, bin]
         self.placed = wp.array(np.ascontiguousarray(counts.T, dtype=np.float32), device=device)

@@ -87,8 +87,6 @@ def edges(mesh: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Normals:
-    """The normals of a full mesh, between its vertices."""
-
     def __init__(self, mesh: SurfaceMesh, places: np.ndarray) -> None:
         self._mesh = mesh
         self._patch = joined(len(places), *edges(mesh))

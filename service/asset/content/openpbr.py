@@ -85,7 +85,6 @@ def write_openpbr(document: mx.Document, folder: Path) -> Path:
 
 @cache
 def _library() -> mx.Document:
-    """Return the definitions of MaterialX's nodes."""
     library = mx.createDocument()
     mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
     return library

@@ -97,7 +97,6 @@ def vertex_tangents(mesh: SurfaceMesh) -> np.ndarray:
 
 
 def _divided(quads: np.ndarray, points: np.ndarray, st: np.ndarray) -> np.ndarray:
-    """Return the triangles of quads, [2 Q, 3]."""
     a, b, c, d = quads.T
     first, second = (((st[i] - st[k]) ** 2).sum(axis=-1) for i, k in ((a, c), (b, d)))
     alike = ((points[a] - points[c]) ** 2).sum(axis=-1) <= ((points[b] - points[d]) ** 2).sum(axis=-1)

@@ -44,14 +44,13 @@ class Glb:
         self._parts: list[np.ndarray | Path] = []
         self._size = 0
 
-    def add_array(self, values: np.ndarray, *, target: int, bounds: bool = False, normalized: bool = False) -> int:
+    def add_array(self, values: np.ndarray, *, target: int, bounds: bool = False) -> int:
         """Add an array and return the number of its accessor.
 
         Args:
             values: [n] or [n, 2, 3 or 4] uint8, uint16, uint32 or float32; kept until the file is written.
             target: what the array is for: ARRAY_BUFFER or ELEMENT_ARRAY_BUFFER of pygltflib.
             bounds: write the least and the greatest value of each component, as positions need.
-            normalized: integers stand for fractions of their largest value.
         """
         values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
         components = values.shape[1] if values.ndim == 2 else 1
@@ -59,7 +58,7 @@ class Glb:
         kind = _COMPONENT_TYPES[f"<{values.dtype.kind}{values.dtype.itemsize}"]  # single bytes have no order of their own
         self.document.accessors.append(Accessor(
             bufferView=self._add_part(values, values.nbytes, target), componentType=kind,
-            normalized=normalized, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
+            normalized=False, count=len(values), type=_ELEMENT_TYPES[components], min=least, max=greatest))
         return len(self.document.accessors) - 1
 
     def add_png(self, file: Path) -> int:

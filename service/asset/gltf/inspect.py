@@ -86,7 +86,6 @@ def _image(path: Path, contents: GlbContents, number: int) -> dict[str, Any]:
 
 
 def _faults(contents: GlbContents) -> Iterator[str]:
-    """Yield what reaches beyond its container."""
     document = contents.document
     children = [child for node in document.nodes for child in node.children or ()]
     for kind, used, there in (("node", children, document.nodes), ("mesh", [node.mesh for node in document.nodes], document.meshes)):

@@ -41,8 +41,6 @@ WIDTH_PART = 0.5
 
 
 class _Parts(NamedTuple):
-    """Mesh, points and colours of an asset of a depth."""
-
     mesh: SurfaceMesh | None  # None: no face, and points were asked for
     points: MeasuredPoints
     point_step: int  # the points are of every point_step-th row and column of pixels
@@ -80,7 +78,6 @@ def write_depth(maps: DepthMaps, cloud: PointCloud | None, path: str | Path, *, 
 
 
 def _parts(maps: DepthMaps, cloud: PointCloud | None, geometry: Geometry) -> _Parts:
-    """Return the parts of an asset, of which the one that is asked for exists."""
     points = measured_points(maps, cloud)
     colours = colour_image(points, maps.mask)
     if geometry is Geometry.MESH:

@@ -71,7 +71,6 @@ def _check_package(path: Path) -> list[str]:
 
 
 def _facts(usd_stage: Usd.Stage) -> dict[str, Any]:
-    """Return what holds for the asset as a whole."""
     root, unit_m = usd_stage.GetDefaultPrim(), UsdGeom.GetStageMetersPerUnit(usd_stage)
     facts = {"default_prim": str(root.GetPath()) if root else None, "up_axis": str(UsdGeom.GetStageUpAxis(usd_stage)),
              "meters_per_unit": unit_m}

@@ -89,8 +89,6 @@ class RigLight(NamedTuple):
 
 
 class _Emission(NamedTuple):
-    """Intensity and colour of a light of UsdLux."""
-
     prim: UsdLux.NonboundableLightBase | UsdLux.BoundableLightBase
     intensity: float
     color: tuple[float, float, float]

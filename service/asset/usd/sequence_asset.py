@@ -127,7 +127,6 @@ def _define_geometry(usd_stage: Usd.Stage, root: Sdf.Path, moment: Moment) -> An
 
 
 def _set(prim: Any, moment: Moment, time: Usd.TimeCode) -> None:
-    """Write the values of a step at a time."""
     prim.CreatePointsAttr().Set(_vectors(moment.points), time)
     if moment.faces is not None:
         prim.CreateFaceVertexCountsAttr().Set(Vt.IntArray.FromNumpy(np.ascontiguousarray(moment.faces.counts, dtype=np.int32)), time)

@@ -140,8 +140,6 @@ def choose_candidate(overlap: Overlap, expected: np.ndarray, covariance: np.ndar
 
 
 class _Fit(NamedTuple):
-    """One refined candidate."""
-
     difference: np.ndarray
     information: np.ndarray
     pixels: int

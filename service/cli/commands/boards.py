@@ -1,11 +1,16 @@
 """relit inspect-board and gauge-board: what is wrong with a board, and how well inspections repeat."""
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import with_bar
-from service.cli.request_commands import local_command
+from service.cli.request_commands import product_command
 from service.requests.inspect_board import GaugeBoardRequest, InspectBoardRequest
+
+if TYPE_CHECKING:
+    from service.boards.gauge_board import GaugeBoardResult
+    from service.boards.inspect_board import InspectBoardResult
 
 MOST_PRINTED = 10
 """Findings that are printed; the table has all."""
@@ -13,14 +18,11 @@ MOST_PRINTED = 10
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    local_command(app, "inspect-board", _inspect_board)
-    local_command(app, "gauge-board", _gauge_board)
+    product_command(app, "inspect-board", InspectBoardRequest, "service.boards.inspect_board:inspect_board", _inspect_board)
+    product_command(app, "gauge-board", GaugeBoardRequest, "service.boards.gauge_board:gauge_board", _gauge_board)
 
 
-def _inspect_board(request: InspectBoardRequest) -> None:
-    from service.boards.inspect_board import inspect_board
-
-    result = with_bar(inspect_board, request)
+def _inspect_board(result: "InspectBoardResult") -> None:
     print(f"height   {result.board_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")
@@ -44,10 +46,7 @@ def _inspect_board(request: InspectBoardRequest) -> None:
         raise typer.Exit(1)
 
 
-def _gauge_board(request: GaugeBoardRequest) -> None:
-    from service.boards.gauge_board import gauge_board
-
-    result = with_bar(gauge_board, request)
+def _gauge_board(result: "GaugeBoardResult") -> None:
     study = result.study
     print(f"table    {result.table_path}")
     print(f"report   {result.report_path}")

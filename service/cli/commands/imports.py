@@ -64,10 +64,7 @@ def _guess(folder: FolderArgument) -> None:
 
 def _auto(folder: Path, destination: Path | None, *, kept: bool = True) -> list[Path]:
     """Run the import of a folder, or of each folder in it, record in its capture.json what the guess assumed, and return the captures.
-
-    Args:
-        kept: whether they stay; nothing is said of places that do not.
-    """
+    `kept`: whether they stay; nothing is said of places that do not."""
     from service.captures.importing import import_files
     from stage.errors import ManifestError
     from stage.importers.guess import guess_each

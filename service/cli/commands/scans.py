@@ -1,11 +1,17 @@
 """relit register, fuse and compare: the poses of many scans of one object, the surface of all, and its deviations from a design."""
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from service.cli.printing import print_warnings
-from service.cli.progress import with_bar
-from service.cli.request_commands import local_command
+from service.cli.request_commands import product_command
 from service.requests.register import CompareRequest, FuseRequest, RegisterRequest
+
+if TYPE_CHECKING:
+    from service.comparison.compare import CompareResult
+    from service.scans.fusion.fuse import FuseResult
+    from service.scans.register import RegisterResult
 
 MOST_PRINTED = 20
 """Regions that are printed; the table has all."""
@@ -13,15 +19,12 @@ MOST_PRINTED = 20
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    local_command(app, "register", _register)
-    local_command(app, "fuse", _fuse)
-    local_command(app, "compare", _compare)
+    product_command(app, "register", RegisterRequest, "service.scans.register:register_scans", _register)
+    product_command(app, "fuse", FuseRequest, "service.scans.fusion.fuse:fuse", _fuse)
+    product_command(app, "compare", CompareRequest, "service.comparison.compare:compare", _compare)
 
 
-def _register(request: RegisterRequest) -> None:
-    from service.scans.register import register_scans
-
-    result = with_bar(register_scans, request)
+def _register(result: "RegisterResult") -> None:
     print(f"scans    {result.scan_set_path}")
     print(f"report   {result.report_path}")
     print(f"joined   {result.joined} of {result.scans} scans")
@@ -34,10 +37,7 @@ def _register(request: RegisterRequest) -> None:
         raise typer.Exit(1)
 
 
-def _fuse(request: FuseRequest) -> None:
-    from service.scans.fusion.fuse import fuse
-
-    result = with_bar(fuse, request)
+def _fuse(result: "FuseResult") -> None:
     facts = result.facts
     if result.mesh_path is not None:
         print(f"mesh     {result.mesh_path}")
@@ -55,10 +55,7 @@ def _fuse(request: FuseRequest) -> None:
     print_warnings(result.warnings)
 
 
-def _compare(request: CompareRequest) -> None:
-    from service.comparison.compare import compare
-
-    result = with_bar(compare, request)
+def _compare(result: "CompareResult") -> None:
     print(f"scan     {result.deviations_path}")
     print(f"picture  {result.picture_path}")
     print(f"report   {result.report_path}")

@@ -11,11 +11,10 @@ import numpy as np
 from kernels.status import Status
 from service.depth.base.solution import HALF_SURE, DepthSolution
 from service.depth.base.triangulation_check import check_perspective
-from service.depth.laser.plane_accuracy import CLEAR_SIGMAS, compare_sweeps, unconfirmed
 from service.depth.laser.spot import find_spot, nearest_points
 from service.depth.laser.stripe_curves import WHOLE
 from service.depth.laser.stripe_map import StripeSamples, concordance, contradicted, stripe_map
-from service.depth.laser.stripes import Sweep, along_of, measure_stripe, stripe_signal
+from service.depth.laser.stripes import CLEAR_SIGMAS, Sweep, along_of, compare_sweeps, measure_stripe, stripe_signal, unconfirmed
 from service.reporting.progress import Timings
 from service.requests.depth import DepthRequest
 from stage.capture.camera import Camera
@@ -44,8 +43,6 @@ way of other surfaces, as in the laser's shadow or when the stripe has left the 
 
 
 class _Spot(NamedTuple):
-    """The point that one laser ray lights."""
-
     point: np.ndarray  # [3] metres, camera frame
     row: int
     col: int
@@ -129,7 +126,6 @@ def _check_order(capture: Capture, samples: StripeSamples, counts: list[int], al
 
 
 def _second_stripes(doubled: list[str], frames: int) -> str:
-    """Return a sentence about frames that show two stripes."""
     return (f"frames[].laser: {len(doubled)} of {frames} frames, {doubled[0]} the first of them, show a second stripe beside the "
             "first, and the manifest declares one plane for each frame: photograph one plane at a time; their doubtful points have the "
             "status multipath")

@@ -41,12 +41,8 @@ class Chosen(NamedTuple):
 
 def choose_curves(place: np.ndarray, brightness: np.ndarray, status: np.ndarray) -> Chosen:
     """Return the stripe to take on each line.
-
-    Args:
-        place: [peaks, lines] float, continuous coordinates along the lines, the brightest first.
-        brightness: [peaks, lines] float.
-        status: [peaks, lines] uint8; those that are OK are stripes.
-    """
+    `place`: [peaks, lines] float, continuous coordinates along the lines, the brightest first. `brightness`: [peaks, lines] float.
+    `status`: [peaks, lines] uint8; those that are OK are stripes."""
     lines = place.shape[1]
     there = status == Status.OK
     several = there.sum(axis=0) > 1
@@ -130,5 +126,4 @@ def _overlaps(curve: np.ndarray, several: np.ndarray) -> list[tuple[int, int, np
 
 
 def _of(values: np.ndarray, curve: np.ndarray, number: int, at: np.ndarray) -> np.ndarray:
-    """Return the values of one curve on these lines."""
     return np.asarray(values[np.argmax(curve[:, at] == number, axis=0), at])

@@ -58,12 +58,8 @@ class StripeMap(NamedTuple):
 
 def stripe_map(samples: StripeSamples, shape: tuple[int, ...], camera: Camera, *, along: str) -> StripeMap:
     """Carry samples to pixel centres.
-
-    Args:
-        samples: those with status OK are used.
-        shape: lines, and pixels of a line.
-        along: "row": lines are rows; "column": lines are columns.
-    """
+    `samples`: those with status OK are used. `shape`: lines, and pixels of a line. `along`: "row": lines are rows; "column": lines are
+    columns."""
     ok = samples.status == Status.OK
     order = np.lexsort((samples.place[ok], samples.line[ok]))
     line, place, depth, sigma, amplitude = (values[ok][order] for values in samples[:5])
@@ -119,12 +115,8 @@ def contradicted(samples: StripeSamples, curve: np.ndarray, camera: Camera, *, d
     the edge of a surface one side does. A curve is contradicted where a third of its samples are, by stripes of three times its brightness
     (their median: texture changes single ones). Where frames of the capture show two stripes, stripes of any brightness contradict it; else
     it may see a post that is narrower than the distance of the planes.
-
-    Args:
-        samples: of all frames whose stripes cross the same lines; those that are OK are compared.
-        curve: [n] int, number of the curve of each sample, different for curves of different frames.
-        doubled: whether frames of the capture show two stripes.
-    """
+    `samples`: of all frames whose stripes cross the same lines; those that are OK are compared. `curve`: [n] int, number of the curve of
+    each sample, different for curves of different frames. `doubled`: whether frames of the capture show two stripes."""
     ok = np.flatnonzero(samples.status == Status.OK)
     order = ok[np.lexsort((samples.place[ok], samples.line[ok]))]
     line, place, depth, bright, owner = (values[order] for values in (samples.line, samples.place, samples.depth, samples.amplitude, curve))
@@ -155,12 +147,8 @@ def concordance(samples: StripeSamples, frame: np.ndarray, planes: Sequence[Lase
 
     Compared are the places of stripes on one line, a third of the sweep apart, with those at which their planes cut it at the median depth.
     The relief of the scene shifts stripes by less than that, as a rule.
-
-    Args:
-        samples: of all frames whose stripes cross the same lines; those that were found are compared.
-        frame: [n] int, the frame of each sample.
-        planes: of each frame.
-    """
+    `samples`: of all frames whose stripes cross the same lines; those that were found are compared. `frame`: [n] int, the frame of each
+    sample. `planes`: of each frame."""
     seen = np.flatnonzero(np.isin(samples.status, (Status.OK, Status.MULTIPATH, Status.OUT_OF_RANGE)) & np.isfinite(samples.place))
     deep = samples.depth[seen][samples.depth[seen] > 0]
     middle = float(np.median(deep)) if deep.size else 1.0

@@ -49,13 +49,7 @@ ENOUGH = 200
 
 def doubt_pixels(solution: DepthSolution, residual_px: np.ndarray | None, camera: Camera, projector: Projector, device: str) -> np.ndarray:
     """Return the probability of each pixel's depth to be right, and add to σ what texture within the pixels does.
-
-    Args:
-        residual_px: [rows, cols] of both axes; None with one axis.
-
-    Returns:
-        [rows, cols] float32, 0…1; 0 where there is no depth.
-    """
+    `residual_px`: [rows, cols] of both axes; None with one axis. Returns [rows, cols] float32, 0…1; 0 where there is no depth."""
     assert solution.sigma is not None and solution.amplitude is not None
     solved = np.isin(solution.status, SOLVED)
     right = np.zeros(solution.depth.shape, np.float32)

@@ -110,8 +110,6 @@ def _numbers(bits: np.ndarray, *, gray: bool) -> np.ndarray:
 
 
 class _Pairs(NamedTuple):
-    """Neighbouring pixels of the image rows that read their stripe."""
-
     first: np.ndarray  # [pairs] index into the flat sample
     second: np.ndarray  # [pairs]
     row: np.ndarray  # [pairs]
@@ -170,12 +168,8 @@ def _check_order(stripes: Stripes, code: BinaryCode, extent: int) -> str | None:
 def _mends(numbers: np.ndarray, pairs: _Pairs, declared: np.ndarray, jumps: np.ndarray, count: float, *, outside: bool) -> float | None:
     """Return the mean logarithm of the steps under other numbers of the stripes over that under the declared ones, if the stripes follow
     each other much better so; else None.
-
-    Args:
-        declared: [pairs] steps as declared, and `jumps` among them.
-        count: number of stripes that the projector shows.
-        outside: whether stripes lie beyond the projector as declared.
-    """
+    `declared`: [pairs] steps as declared, and `jumps` among them. `count`: number of stripes that the projector shows. `outside`:
+    whether stripes lie beyond the projector as declared."""
     steps, flat = pairs.steps(numbers), numbers.ravel()
     if (flat[pairs.first] >= count).mean() > BEYOND_SHARE or not steps.any():
         return None

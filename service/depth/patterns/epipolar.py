@@ -29,7 +29,7 @@ ROUNDS = 6
 
 
 class Contradiction(NamedTuple):
-    """What systematic residuals say of a calibration."""
+    """Evidence of systematic residuals against a calibration."""
 
     size_px: float
     """Distance of the decoded places from the epipolar lines that the fit explains, root mean square."""
@@ -72,12 +72,8 @@ def _derivatives(projector: Projector, points: np.ndarray) -> tuple[np.ndarray, 
 
 def contradiction(projector: Projector, points: np.ndarray, places: np.ndarray, deviations: np.ndarray) -> Contradiction | None:
     """Return how decoded places contradict the calibration of a projector, None where noise explains them.
-
-    Args:
-        points: [pixels, 3] metres, camera frame, as triangulated.
-        places: [pixels, 2] decoded columns and rows, continuous projector pixels.
-        deviations: [pixels, 2] their standard deviations.
-    """
+    `points`: [pixels, 3] metres, camera frame, as triangulated. `places`: [pixels, 2] decoded columns and rows, continuous projector
+    pixels. `deviations`: [pixels, 2] their standard deviations."""
     if len(points) < ENOUGH:
         return None
     chosen = slice(None, None, -(-len(points) // MOST_PIXELS))

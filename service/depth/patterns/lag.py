@@ -49,7 +49,7 @@ LAG_BYTES_PER_PIXEL = 2000
 
 
 class LagFinding(NamedTuple):
-    """What an axis shows of light below surfaces."""
+    """The evidence of an axis for light below surfaces."""
 
     sigma: np.ndarray  # [rows, cols] float32, by how much places may be off, projector pixels
     usual_px: float

@@ -72,11 +72,8 @@ class PatternCodes(NamedTuple):
 def solve_patterns(capture: Capture, mask: np.ndarray, request: DepthRequest, device: str,
                    timings: Timings) -> DepthSolution | DecodedSolution:
     """Decode the projector's columns, rows or both, and intersect them with the lines of sight where the capture is calibrated.
-
-    Returns:
-        Depth, OUT_OF_RANGE outside the request's span; or the decoded coordinates alone, where the capture is not calibrated or where no
-        decoded pixel has a depth.
-    """
+    Returns the depth, OUT_OF_RANGE outside the request's span; or the decoded coordinates alone, where the capture is not calibrated or
+    where no decoded pixel has a depth."""
     missing = missing_calibration(capture)
     projector = check_projector(capture) if missing is None else None
     if missing is not None:

@@ -33,11 +33,8 @@ class PatternsResult(NamedTuple):
 
 def make_patterns(request: PatternsRequest, progress: Progress | None = None) -> PatternsResult:
     """Write PNG images and patterns.json.
-
-    Raises:
-        RequestError: an option that does not belong to the code, or that the code refuses.
-        StorageError: a file cannot be written.
-    """
+    Raises RequestError: an option that does not belong to the code, or that the code refuses. Raises StorageError: a file cannot be
+    written."""
     for option, codes in CODES_OF_OPTION.items():
         if option in request.model_fields_set and request.code not in codes:
             raise RequestError(f"{option} says nothing about {request.code}: it is an option of {', '.join(codes)}")
@@ -76,10 +73,7 @@ def patterns_of(request: PatternsRequest) -> tuple[Pattern, ...]:
 
 def make_plan(request: PlanRequest) -> tuple[planner.Plan, ...]:
     """Return the planner's table: lighting point by point and line by line, then every code.
-
-    Raises:
-        RequestError: baseline, distance and focal length are not given together, or the planner refuses a value.
-    """
+    Raises RequestError: baseline, distance and focal length are not given together, or the planner refuses a value."""
     rig = None
     if request.baseline is not None and request.distance is not None and request.focal is not None:
         rig = planner.Rig(request.baseline, request.distance, request.focal)

@@ -27,11 +27,7 @@ LEAST_CHANGE = 0.02
 
 def exponent_of_swing(grey: np.ndarray, shifts: Sequence[float], period_px: float, exponents: Sequence[float], noise: NoiseModel) -> float:
     """Return the exponent γ of light = level^γ that explains how the modulation changes along the wave; 1.0 where it does not change so.
-
-    Args:
-        grey: [frames, pixels] readings of one period, without saturated ones.
-        shifts: of each frame in turns.
-    """
+    `grey`: [frames, pixels] readings of one period, without saturated ones. `shifts`: of each frame in turns."""
     own = np.array(shifts)
     table = weights(own, period_px)
     mean, along, across = table.T @ grey

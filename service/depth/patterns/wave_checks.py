@@ -73,7 +73,7 @@ class Waves(NamedTuple):
 
 
 class WaveFindings(NamedTuple):
-    """What the check says."""
+    """Results of the check."""
 
     wrong: str | None
     """A sentence if the waves are declared otherwise than they were shown."""

@@ -67,10 +67,7 @@ class Rectification(NamedTuple):
 
     def rows_of(self, image: np.ndarray, *, other: bool) -> tuple[np.ndarray, np.ndarray]:
         """Resample an image [rows, cols] float32 of one of the two cameras.
-
-        Returns:
-            The rectified image, [rows, cols] float32, and [rows, cols] bool, False where the camera saw nothing.
-        """
+        Returns the rectified image, [rows, cols] float32, and [rows, cols] bool, False where the camera saw nothing."""
         grid, camera = (self.right, self.other) if other else (self.left, self.reference)
         turn = self.rectified_from_other if other else self.rectified_from_reference
         values = np.zeros((grid.height, grid.width), np.float32)
@@ -95,11 +92,8 @@ class Rectification(NamedTuple):
 
     def positions(self, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where pixels of the reference camera lie in its rectified image.
-
-        Returns:
-            Column and row in the left image, whole at the centres of its pixels; and the depth of the rectified frame at depth 1 of the
-            reference camera. Each [rows, cols] float64.
-        """
+        Returns column and row in the left image, whole at the centres of its pixels; and the depth of the rectified frame at depth 1 of
+        the reference camera. Each [rows, cols] float64."""
         u, v = np.meshgrid(np.arange(self.reference.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
         x, y = self.reference.plane_at(u, v)
         towards = np.stack([x, y, -np.ones_like(x)], axis=-1) @ self.rectified_from_reference.T
@@ -109,14 +103,8 @@ class Rectification(NamedTuple):
 
 def rectify(reference: Camera, other: OtherCamera, *, where: str) -> Rectification:
     """Return how the images of two cameras are rectified.
-
-    Args:
-        where: the file and the field of the other camera, for messages.
-
-    Raises:
-        ManifestError: the other camera is not calibrated; the cameras stand at one place or implausibly far apart, one behind the other,
-            or look in different directions.
-    """
+    `where`: the file and the field of the other camera, for messages. Raises ManifestError: the other camera is not calibrated; the
+    cameras stand at one place or implausibly far apart, one behind the other, or look in different directions."""
     if other.camera_from_other is None:
         raise ManifestError(f"{where}: {other.name} has no focal_px and no camera_from_other: depth needs its lens and pose; "
                             "relit calibrate stereo measures them")
@@ -194,12 +182,8 @@ class RectifiedFrames(NamedTuple):
 def rectified_frames(capture: Capture, frames: Sequence[Frame], other: int, rectification: Rectification, *, cache: Path | None = None,
                      progress: Callable[[int], None] | None = None) -> Iterator[RectifiedFrames]:
     """Read and rectify the frames of the reference camera and of one other, and yield images that exist until the block ends.
-
-    Args:
-        other: index of the other camera.
-        cache: the folder for the scratch file; None stands for `.relit` in the folder of the capture. No file is left in it.
-        progress: called after every frame with the count of frames that have been read.
-    """
+    `other`: index of the other camera. `cache`: the folder for the scratch file; None stands for `.relit` in the folder of the capture.
+    No file is left in it. `progress`: called after every frame with the count of frames that have been read."""
     grids = rectification.left, rectification.right
     size = 4 * len(frames) * sum(grid.width * grid.height for grid in grids)
     with scratch_arrays(size, capture, cache) as allocate:

@@ -16,8 +16,16 @@ from kernels.stereo.probe import probe
 from kernels.stereo.refine import refine
 from kernels.structured.pattern_frames import NoiseModel
 from service.depth.stereo.rectification import RectifiedFrames
-from service.depth.stereo.row_offset import row_offsets
+from stage.motion.resample import bicubic
 
+REACH = 5
+"""Half side of the window: 11 × 11 pixels."""
+STEPS = 3
+"""Gauss-Newton steps."""
+MOST_PX = 2.0
+"""Larger offsets are no longer found by steps from zero, and left out."""
+LEAST_GRADIENT = 1e-12
+"""Least sum of squared vertical differences in a window, as a fraction of the square of the largest reading."""
 VOLUME_BYTES = 192 << 20
 """Bytes of the costs of one band of rows, which bound the memory whatever the resolution."""
 BYTES_PER_LABEL = 3
@@ -140,11 +148,7 @@ def range_of(places: Places) -> tuple[float, float] | None:
 
 def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel, device: str) -> Iterator[tuple[int, Disparity]]:
     """Match two rectified images band by band; yield how many rows are done, and the disparity of the whole image, final in those rows.
-
-    Args:
-        least, most: the disparities that are considered.
-        noise: of a reading before smoothing.
-    """
+    `least, most`: the disparities that are considered. `noise`: of a reading before smoothing."""
     _, rows, cols = images.left.shape
     labels = Labels.covering(least, most, device)
     result = Disparity.empty((rows, cols))
@@ -166,7 +170,6 @@ def match(images: RectifiedFrames, least: float, most: float, noise: NoiseModel,
 
 
 def _match_rows(images: RectifiedFrames, rows: slice, labels: Labels, noise: NoiseModel, device: str) -> Disparity:
-    """Match some rows and judge every pixel."""
     left, right = (np.ascontiguousarray(each[:, rows]) for each in (images.left, images.right))
     right_seen = images.right_seen[rows]
     volume = matching_cost(left, right, right_seen, labels, device=device)
@@ -225,11 +228,7 @@ def box_mean(values: np.ndarray, reach: int) -> np.ndarray:
 
 def contrast(images: np.ndarray, reach: int) -> np.ndarray:
     """Return the standard deviation of the readings in a square around each pixel, root mean square over the frames: [rows, cols] float32.
-
-    Args:
-        images: [frames, rows, cols] float32.
-        reach: half side of the square.
-    """
+    `images`: [frames, rows, cols] float32. `reach`: half side of the square."""
     total = np.zeros(images.shape[1:])
     for image in images:
         readings = image.astype(np.float64) - float(image.mean())
@@ -242,14 +241,8 @@ def bend(disparity: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
     A surface of curvature k lies k x² / 2 above its tangent at a distance x, and the plane of least squares k/2 times the mean of x² above
     it in the middle. The curvature is the second difference over the window, averaged over the pixels around.
-
-    Args:
-        disparity: [rows, cols] float32, each fitted as a plane.
-        usable: [rows, cols] bool, where it holds.
-
-    Returns:
-        [rows, cols] float64; 0 where too few neighbours hold.
-    """
+    `disparity`: [rows, cols] float32, each fitted as a plane. `usable`: [rows, cols] bool, where it holds. Returns [rows, cols] float64;
+    0 where too few neighbours hold."""
     total = np.zeros(disparity.shape)
     for axis in (0, 1):
         before, after = (np.roll(disparity, shift, axis) for shift in (WINDOW_REACH, -WINDOW_REACH))
@@ -262,3 +255,56 @@ def bend(disparity: np.ndarray, usable: np.ndarray) -> np.ndarray:
         mean = box_mean(np.where(known, second, 0), WINDOW_REACH) / np.maximum(share, 1e-9)
         total += np.where(share > LEAST_KNOWN, mean, 0) / WINDOW_REACH**2
     return total / 2 * MEAN_SQUARE
+
+
+# The offset between the rows of two rectified images, which a wrong calibration leaves, measured at matched places.
+
+def row_offsets(left: np.ndarray, right: np.ndarray, disparity: np.ndarray, slope_x: np.ndarray, slope_y: np.ndarray, usable: np.ndarray, *,
+                most: int) -> np.ndarray:
+    """Measure by how many rows the right image lies lower than the left one.
+
+    Args:
+        left: [rows, cols] float32.
+        right: [rows, right cols] float32.
+        disparity, slope_x, slope_y: [rows, cols] float32, refined.
+        usable: [rows, cols] bool, where the disparity holds.
+        most: of how many places at most, evenly drawn.
+
+    Returns:
+        [places] float32, pixels.
+
+    Source:
+        Lucas and Kanade, "An iterative image registration technique with an application to stereo vision", IJCAI 1981, with a gain and an
+        offset of brightness; the disparity stays as it is.
+    """
+    inner = np.zeros_like(usable)
+    inner[REACH:-REACH, REACH:-REACH] = usable[REACH:-REACH, REACH:-REACH]
+    row, col = np.nonzero(inner)
+    if not len(row):
+        return np.zeros(0, np.float32)
+    chosen = np.linspace(0, len(row) - 1, min(most, len(row))).astype(int)
+    row, col = row[chosen], col[chosen]
+    dy, dx = (grid.ravel() for grid in np.mgrid[-REACH:REACH + 1, -REACH:REACH + 1])
+    plane = disparity[row, col][:, None] + slope_x[row, col][:, None] * dx + slope_y[row, col][:, None] * dy
+    values = left[row[:, None] + dy, col[:, None] + dx].astype(np.float64)
+    values -= values.mean(axis=1, keepdims=True)
+    x = (col[:, None] + dx - plane).astype(np.float32)
+    offset = np.zeros(len(row))
+    for _ in range(STEPS):
+        y = (row[:, None] + dy + offset[:, None]).astype(np.float32)
+        here, below, above = (_at(right, x, y + shift) for shift in (0.0, 0.5, -0.5))
+        here -= here.mean(axis=1, keepdims=True)
+        gain = (values * here).sum(axis=1) / np.maximum((here**2).sum(axis=1), 1e-30)
+        slope = gain[:, None] * (below - above)
+        slope -= slope.mean(axis=1, keepdims=True)
+        weight = (slope**2).sum(axis=1)
+        floor = LEAST_GRADIENT * float(np.abs(left).max()) ** 2
+        offset += np.where(weight > floor, (slope * (values - gain[:, None] * here)).sum(axis=1) / np.maximum(weight, 1e-30), 0)
+        offset = np.clip(offset, -MOST_PX, MOST_PX)
+    return offset[np.abs(offset) < MOST_PX].astype(np.float32)
+
+
+def _at(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return an image at places, which are clamped to it: float64 in the shape of x."""
+    return bicubic(image, np.clip(x, 0, image.shape[1] - 1).astype(np.float32), np.clip(y, 0, image.shape[0] - 1).astype(np.float32)
+                   ).astype(np.float64)

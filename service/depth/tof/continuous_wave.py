@@ -98,8 +98,6 @@ def estimate_noise(images: np.ndarray, modulation_hz: Sequence[float] | np.ndarr
 
 
 class _Pairs(NamedTuple):
-    """Levels and the squared noise at them, from one estimator."""
-
     levels: list[np.ndarray]
     squares: list[np.ndarray]
 
@@ -155,11 +153,7 @@ of square waves, 11 %, bends phases by two thirds of it."""
 def solve_correlations(frames: CorrelationImages, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
                        far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
     """Return the range of each pixel from correlation images, of every pixel from which one can be decoded, however unsurely.
-
-    Args:
-        near_m, far_m: the span of ranges; None: 0, and as far as the frequencies tell apart.
-        limit: saturation, in recorded values.
-    """
+    `near_m, far_m`: the span of ranges; None: 0, and as far as the frequencies tell apart. `limit`: saturation, in recorded values."""
     rows, cols = usable.shape
     weights(frames.modulation_hz, frames.reference_phase_rad, frames.scale)  # faults of the frames come before those of the options
     nearest = near_m or 0.0

@@ -91,11 +91,7 @@ def interlaced(position: np.ndarray, there: np.ndarray, width: float) -> np.ndar
     """Return where a pixel agrees with the second pixels on both sides and the ones between agree with each other alone, [rows, cols] bool.
 
     These are the pixels of both kinds, along rows or columns; none at all where fewer than LEAST_PART of the pixels are.
-
-    Args:
-        position: [rows, cols] times in bins.
-        width: of the pulse, in bins.
-    """
+    `position`: [rows, cols] times in bins. `width`: of the pulse, in bins."""
     unit = max(width, 1.0)
     found = np.zeros(position.shape, dtype=bool)
     for axis in (0, 1):
@@ -149,12 +145,8 @@ MISFIT_PIXELS = 0.2
 def solve_histograms(frames: Histograms, options: TofOptions, calibration: TofCalibration, *, near_m: float | None,
                      far_m: float | None, limit: float | None, usable: np.ndarray, device: str) -> RangeImage:
     """Return the range of each pixel from photon histograms.
-
-    Args:
-        near_m, far_m: the span of half paths; None: that of the histogram.
-        limit: counts at or above it are a full counter.
-        usable: [rows, cols] bool mask: the others decide on nothing.
-    """
+    `near_m, far_m`: the span of half paths; None: that of the histogram. `limit`: counts at or above it are a full counter. `usable`:
+    [rows, cols] bool mask: the others decide on nothing."""
     bin_m = range_of_delay_m(frames.bin_s)
     start_m = range_of_delay_m(frames.start_s)
     end_m = start_m + bin_m * frames.counts.shape[1]

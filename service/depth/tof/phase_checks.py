@@ -59,11 +59,7 @@ class Phases(NamedTuple):
 
 def misread_frequencies(phases: Phases, declared: float, agreeing: Callable[[Phases], float]) -> str | None:
     """Return how frequencies are declared wrongly, as a sentence; None if none is, or no other reading fits.
-
-    Args:
-        declared: share of the pixels whose frequencies agree as declared.
-        agreeing: of other phases.
-    """
+    `declared`: share of the pixels whose frequencies agree as declared. `agreeing`: of other phases."""
     if declared >= AGREE or len(phases.hz) < 2:
         return None
     tried = [(agreeing(other), words) for other, words in _readings(phases)]
@@ -97,7 +93,6 @@ def _readings(phases: Phases) -> Iterator[tuple[Phases, str]]:
 
 
 def _words(declared_hz: float, found_hz: float, *, backwards: bool) -> str:
-    """Return what is wrong with one frequency, and what to check."""
     declared = f"{declared_hz / 1e6:g} MHz"
     what = [f"{declared} are {found_hz / 1e6:g} MHz: check modulation_hz"] if found_hz != declared_hz else []
     return " and ".join([*what, f"the phases of {declared} run backwards: check reference_phase_rad"] if backwards else what)

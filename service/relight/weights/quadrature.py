@@ -51,10 +51,8 @@ REMEMBERED = 4
 
 def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Share a lat-long map out over the lights by kernel quadrature; arguments are those of weighting.integrate.
-
-    Returns:
-        [frames, lights, 3] float64 energy of each light, 0 or above; it sums to that of the map. Of lights in one place the first gets all.
-    """
+    Returns [frames, lights, 3] float64 energy of each light, 0 or above; it sums to that of the map. Of lights in one place the first
+    gets all."""
     directions, rotations = check(environment, directions, rotations)
     parts = ceil(MIN_ROWS / len(environment))
     samples = sample_environment(environment if parts == 1 else environment.repeat(parts, axis=0).repeat(parts, axis=1), SAMPLES)
@@ -65,11 +63,8 @@ def integrate_kernel(environment: np.ndarray, directions: np.ndarray, rotations:
 
 def share_kernel(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Share the energy [n, channels] of samples, 0 or above, out over the captured lights by kernel quadrature.
-
-    Returns:
-        [lights, channels] float64, 0 or above; its sum is that of the samples. Of lights in one place the first gets all. If the lights are
-        fewer than four or all in one plane, light from beyond them is shared out by the kernel too.
-    """
+    Returns [lights, channels] float64, 0 or above; its sum is that of the samples. Of lights in one place the first gets all. If the
+    lights are fewer than four or all in one plane, light from beyond them is shared out by the kernel too."""
     kept = first_of_equals(directions)
     towards = np.ascontiguousarray(directions[kept], dtype=np.float64)
     given = np.zeros((len(directions), energy.shape[1]))
@@ -141,12 +136,8 @@ def _covariance(a: np.ndarray, b: np.ndarray, length: float) -> np.ndarray:
 
 def _non_negative(inverse: np.ndarray, best: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of least expected error among those that are not negative, and which of them are held at zero.
-
-    Args:
-        inverse: [lights, lights] block of the bordered inverse.
-        best: [lights] weights of least expected error whatever their signs; they sum to one.
-        held: [lights] bool, a guess of those that are held at zero.
-    """
+    `inverse`: [lights, lights] block of the bordered inverse. `best`: [lights] weights of least expected error whatever their signs;
+    they sum to one. `held`: [lights] bool, a guess of those that are held at zero."""
     held = held.copy()
     fewest, patience = len(best) + 1, PATIENCE
     for _ in range(MOST_EXCHANGES):

@@ -45,13 +45,8 @@ CHUNK = 4096
 
 def triangulate_sphere(directions: np.ndarray) -> SphereTriangles:
     """Return the spherical Delaunay triangles of the lights; the centre lies inside their hull.
-
-    Args:
-        directions: [lights, 3] unit vectors, no two of them closer than a ten-thousandth of a radian.
-
-    Raises:
-        ArrayError: fewer than four lights, or all in one plane.
-    """
+    `directions`: [lights, 3] unit vectors, no two of them closer than a ten-thousandth of a radian. Raises ArrayError: fewer than four
+    lights, or all in one plane."""
     unit = np.ascontiguousarray(directions, dtype=np.float64)
     return _remembered(unit.tobytes(), len(unit))
 
@@ -113,10 +108,7 @@ def share_smooth(samples: np.ndarray, energy: np.ndarray, directions: np.ndarray
 
 def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the three lights, of four or more not in one plane, whose triangle each sample lies in.
-
-    Returns:
-        [n, 3] int32 lights and [n, 3] float32 shares that sum to one; where lights are missing the nearest stand for the corners.
-    """
+    Returns [n, 3] int32 lights and [n, 3] float32 shares that sum to one; where lights are missing the nearest stand for the corners."""
     kept, triangles = first_of_equals(directions), triangles_between(directions)
     nearest = kept[np.argmax(triangles.vertex @ directions[kept].T, axis=1)]
     nearest[: len(kept)] = kept
@@ -126,11 +118,8 @@ def lights_around(directions: np.ndarray, samples: np.ndarray) -> tuple[np.ndarr
 
 def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lights that each light [lights, 3] would be predicted from if it were missing, and their shares.
-
-    Returns:
-        [lights, 3] int32 and [lights, 3] float32. Taken from the neighbours of the light: of the triangles between them that hold it,
-        the one whose farthest corner is nearest. Where none holds it, at the rim of a dome, all shares are 0.
-    """
+    Returns [lights, 3] int32 and [lights, 3] float32. Taken from the neighbours of the light: of the triangles between them that hold
+    it, the one whose farthest corner is nearest. Where none holds it, at the rim of a dome, all shares are 0."""
     kept, triangles = first_of_equals(directions), triangles_between(directions)
     real = len(kept)
     around: list[set[int]] = [set() for _ in range(len(triangles.vertex))]
@@ -158,11 +147,8 @@ def left_out(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _faces(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the faces of the hull of points in an order that no implementation of the hull changes.
-
-    Returns:
-        [faces, 3] corners, counterclockwise seen from outside; [faces, 3] unit normals; and [faces] the angular radius of the circle of
-        the corners, radians.
-    """
+    Returns [faces, 3] corners, counterclockwise seen from outside; [faces, 3] unit normals; and [faces] the angular radius of the circle
+    of the corners, radians."""
     if len(points) < 4:
         raise ArrayError(f"smooth weighting needs lights in four different places, got {len(points)}: choose cells")
     across = points - points[0]

@@ -49,11 +49,8 @@ def integrate(environment: np.ndarray, directions: np.ndarray, rotations: np.nda
 
 def integrate_smooth(environment: np.ndarray, directions: np.ndarray, rotations: np.ndarray, *, device: str) -> LightEnergy:
     """Share a lat-long map out over the lights, each direction to the three around it; arguments are those of `integrate`.
-
-    Returns:
-        Energy of each light, and the integral of its share over the sphere; both sum to those of the whole map. Of lights in one
-        place the first gets all. Where lights are missing, energy goes to those around the hole (service.relight.weights.triangulation).
-    """
+    Returns energy of each light, and the integral of its share over the sphere; both sum to those of the whole map. Of lights in one
+    place the first gets all. Where lights are missing, energy goes to those around the hole (service.relight.weights.triangulation)."""
     directions, rotations = check(environment, directions, rotations)
     kept, triangles = first_of_equals(directions), triangles_between(directions)
 

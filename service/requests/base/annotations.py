@@ -38,7 +38,7 @@ class FragmentSelector(_Part):
 
 
 class Target(_Part):
-    """What an annotation is about."""
+    """The subject of an annotation."""
 
     selector: Annotated[PointSelector | FragmentSelector, Field(discriminator="type")]
 

@@ -70,8 +70,6 @@ class _Mesh(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """The standard deviations that weight the least squares."""
-
     sigma: np.ndarray  # [V] metres, of the depth
     tilt: np.ndarray  # [V] radians, standard deviation of the photometric normals
     slope: float  # variance of the normals of the depth
@@ -276,9 +274,5 @@ def compared(bands: Bands, difference: np.ndarray, noise: np.ndarray, pixel_m: f
 
 def unlike_noise(bands: Bands, move: np.ndarray, sigma: np.ndarray, agree: np.ndarray, pixel_m: float) -> np.ndarray:
     """Return [V] bool, where the motions of the vertices around are larger than the noise of the depth explains.
-
-    Args:
-        move, sigma: [V] metres; sigma is the standard deviation of the depth.
-        agree: [V] bool, the vertices that moved.
-    """
+    `move, sigma`: [V] metres; sigma is the standard deviation of the depth. `agree`: [V] bool, the vertices that moved."""
     return np.asarray(agree & (bands.averaged((move / sigma)[:, None] ** 2, MOTION_PX * pixel_m, agree)[:, 0] > MOTION))

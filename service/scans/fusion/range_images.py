@@ -69,12 +69,8 @@ def channels(names: tuple[str, ...]) -> dict[str, slice]:
 
 def prepare_scan(scan: Scan, folder: Path, voxel_m: float | None = None) -> PreparedScan:
     """Return a scan as a range image with the layers that it has, its arrays in files of a folder.
-
-    Args:
-        scan: a range image with a pose.
-        voxel_m: metres, to which pixels that are far smaller are joined in squares, unless the scan has maps or an orthographic camera;
-            None: they stay.
-    """
+    `scan`: a range image with a pose. `voxel_m`: metres, to which pixels that are far smaller are joined in squares, unless the scan has
+    maps or an orthographic camera; None: they stay."""
     pose, camera = scan.pose, scan.camera
     assert pose is not None and camera is not None
     parallel = camera.projection == "orthographic"

@@ -69,13 +69,8 @@ def read_ply_points(path: Path) -> PlyPoints:
 
 def read_ply_faces(path: Path, vertices: int) -> np.ndarray | None:
     """Return the faces of a PLY file whose vertices they follow, [F, 3] int64 numbers of vertices, or None if it has none.
-
-    Args:
-        vertices: number of vertices that were read.
-
-    Raises:
-        ResultError: it has faces that are no triangles, or of vertices that are not there or were left out.
-    """
+    `vertices`: number of vertices that were read. Raises ResultError: it has faces that are no triangles, or of vertices that are not
+    there or were left out."""
     with storage("read", path), open(path, "rb") as stream:
         order, elements, further, start = _header(stream, path)
         if not further or not further[0].entries:

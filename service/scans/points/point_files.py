@@ -34,11 +34,7 @@ class PointScan(NamedTuple):
 
 def read_point_scans(path: Path) -> list[PointScan]:
     """Read the scans of a file, one or, from PTS, PTX and E57, as many as it holds. Points that are not finite are left out.
-
-    Raises:
-        ResultError: the file is not what its ending says, or a scan in it has no points.
-        StorageError: it cannot be read.
-    """
+    Raises ResultError: the file is not what its ending says, or a scan in it has no points. Raises StorageError: it cannot be read."""
     with storage("read", path), open(path, "rb") as stream:
         scans = list(READERS[path.suffix.lower()](stream, path))
     if not scans or any(not len(scan.points) for scan in scans):
@@ -120,7 +116,6 @@ def _pcd(stream: io.BufferedReader, path: Path) -> Iterator[PointScan]:
 
 
 def _las(_: io.BufferedReader, path: Path) -> Iterator[PointScan]:
-    """Yield the scan of a LAS or LAZ file."""
     points, colours = read_las(path)
     yield PointScan(points, colours)
 

@@ -81,7 +81,6 @@ def _cut(values: np.ndarray, side: int) -> np.ndarray:
 
 
 def _means(depth: np.ndarray, sigma: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth and its standard deviation of the squares of some rows."""
     def mean(values: np.ndarray) -> np.ndarray:
         return np.asarray(values.mean(axis=(1, 3)))
 

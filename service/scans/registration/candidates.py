@@ -45,12 +45,8 @@ class Overlaps:
 
     def __init__(self, outlines: Mapping[int, Outline], poses: Mapping[int, np.ndarray], near_cells: float) -> None:
         """Make the bound for scans at poses.
-
-        Args:
-            outlines: of the scans.
-            poses: world_from_scan [4, 4] of those that have one.
-            near_cells: how far points may be apart, in cells.
-        """
+        `outlines`: of the scans. `poses`: world_from_scan [4, 4] of those that have one. `near_cells`: how far points may be apart, in
+        cells."""
         self._outlines, self._poses, self._near = outlines, poses, near_cells
         self._cells: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
         self._ways: dict[tuple[int, float], tuple[np.ndarray, np.ndarray]] = {}
@@ -109,13 +105,8 @@ class Overlaps:
 def overlapping(numbers: Iterable[int], overlaps: Overlaps, least_overlap: float, *, count: int, wanted: Callable[[int, int], bool]
                 ) -> list[tuple[int, int]]:
     """Return the pairs of scans that may overlap, each once, the lower number first; of many scans those that overlap most.
-
-    Args:
-        numbers: the scans that have poses.
-        count: of all scans; beyond ALL_PAIRS each is tried with PARTNERS others of its scale and OTHER_PARTNERS of other scales, and with
-            more where it is among those of these.
-        wanted: returns whether a pair is to be considered.
-    """
+    `numbers`: the scans that have poses. `count`: of all scans; beyond ALL_PAIRS each is tried with PARTNERS others of its scale and
+    OTHER_PARTNERS of other scales, and with more where it is among those of these. `wanted`: returns whether a pair is to be considered."""
     most = {(a, b): overlaps.most(a, b) for a, b in combinations(sorted(numbers), 2) if wanted(a, b)}
     found = {pair: overlap for pair, overlap in most.items() if overlap >= least_overlap}
     if count <= ALL_PAIRS:

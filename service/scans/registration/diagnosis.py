@@ -36,11 +36,7 @@ def odd_scans(extents: Sequence[float]) -> set[int]:
 def why_alone(scan: Scan, others: Sequence[Callable[[], Prepared]], *, extent: float, others_extent: float, cell_m: float,
               least_overlap: float) -> str | None:
     """Return what makes a scan fit others, as words after its name, or None if neither a mirror nor another unit does.
-
-    Args:
-        others: return the scans that could, prepared.
-        cell_m: side of the cells of the rough scale, metres.
-    """
+    `others`: return the scans that could, prepared. `cell_m`: side of the cells of the rough scale, metres."""
     def fits(changed: Scan) -> bool:
         ready = prepare(changed, cell_m=cell_m)
         return any(search(other(), ready, numbers=(0, 1), cell_m=cell_m, least_overlap=least_overlap).state is PairState.JOINED

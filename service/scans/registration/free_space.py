@@ -91,11 +91,8 @@ def _of_squares(values: np.ndarray, step: int, least: np.ufunc) -> np.ndarray:
 
 def sight(image: DepthRange, points: np.ndarray, pose: np.ndarray, tolerance: np.ndarray | float) -> Sight:
     """Compare points of another scan with what a range image says of the space before and behind its surface.
-
-    Args:
-        pose: [4, 4] from the frame of the points to that of the image.
-        tolerance: [n] metres: how far before the surface a point may lie without a contradiction.
-    """
+    `pose`: [4, 4] from the frame of the points to that of the image. `tolerance`: [n] metres: how far before the surface a point may lie
+    without a contradiction."""
     before, on, judged = _seen(image, points, pose, tolerance)
     return Sight(int(on.sum()), int(before.sum()), int(judged.sum()))
 

@@ -39,10 +39,7 @@ def looks_alike_turned(scan: Prepared, cell_m: float) -> bool:
 
 def told_from_turned(a: Prepared, b: Prepared, best: Pair, *, cell_m: float, least_overlap: float, accept: bool) -> Pair:
     """Return a joined pair, refused if another pose, by a turn of one scan that looks alike then, passes all tests as well.
-
-    Args:
-        accept: take the pair all the same, with a σ that reaches the other pose.
-    """
+    `accept`: take the pair all the same, with a σ that reaches the other pose."""
     if best.state is not PairState.JOINED or best.fit is None:
         return best
     turns = [*_turned_selves(b, cell_m)]

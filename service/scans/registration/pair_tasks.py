@@ -50,11 +50,8 @@ class PairTask(NamedTuple):
 
 def register_pair(task: PairTask, a: Prepared, b: Prepared, *, cell_m: tuple[float, float], least_overlap: float) -> Pair:
     """Register two scans as a task says.
-
-    Args:
-        cell_m: side of the cells of the rough scale of each, metres. If they differ, the part of the larger scan around the smaller one is
-            taken at the scale of that, which takes a start.
-    """
+    `cell_m`: side of the cells of the rough scale of each, metres. If they differ, the part of the larger scan around the smaller one is
+    taken at the scale of that, which takes a start."""
     numbers, cell = (task.a, task.b), min(cell_m)
     if task.start is None and cell_m[0] != cell_m[1]:
         return Pair(*numbers, PairState.NO_POSE, None, 0.0, 0.0, "are of different scales, and no pose is given to start from")

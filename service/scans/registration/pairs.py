@@ -144,10 +144,7 @@ def refine(a: Prepared, b: Prepared, start: np.ndarray, *, numbers: tuple[int, i
     """Register two scans from a start, a_from_b [4, 4], that is right to about a cell; otherwise as `search`.
 
     The fine scale is tried at once. The rough scale has few points, and only leads there where the start does not.
-
-    Args:
-        decides: whether the start is taken in directions that the surfaces leave open.
-    """
+    `decides`: whether the start is taken in directions that the surfaces leave open."""
     pair = _best(a, b, iter([start]), numbers, cell_m, least_overlap, start=start, decides=decides)
     if pair.state in (PairState.JOINED, PairState.AMBIGUOUS):
         return pair

@@ -98,11 +98,7 @@ class NoneJoinedError(ScanError):
 
     def __init__(self, names: Sequence[str], alone: dict[int, str], pairs: tuple[Pair, ...]) -> None:
         """Say why each scan is alone.
-
-        Args:
-            names: of all scans.
-            alone: the reasons by the number of the scan, in words after its name.
-        """
+        `names`: of all scans. `alone`: the reasons by the number of the scan, in words after its name."""
         super().__init__(*(f"{names[number]}: {words}" for number, words in alone.items()))
         self.alone, self.pairs = alone, pairs
 
@@ -110,12 +106,8 @@ class NoneJoinedError(ScanError):
 def register(scans: Sequence[Scan], starts: Sequence[np.ndarray | None], options: RegistrationOptions, *,
              table: Turntable | None = None, advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object, all of which are in memory.
-
-    Args:
-        starts: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
-        table: the turntable, if its axis is right and only the angles are to be found.
-        advance: told how far the work is, from 0 to 1.
-    """
+    `starts`: world_from_scan [4, 4] of each that is right to about a cell of the rough scale and some degrees; None: nothing is known.
+    `table`: the turntable, if its axis is right and only the angles are to be found. `advance`: told how far the work is, from 0 to 1."""
     with ThreadPoolExecutor(options.threads) as pool:
         return register_by(_InMemory(scans, pool), [scan.name for scan in scans], [extent_of(scan) for scan in scans], starts, options,
                            table=table, targets={number: scan.targets for number, scan in enumerate(scans)}, advance=advance)
@@ -125,11 +117,7 @@ def register_by(work: ScanWork, names: Sequence[str], extents: Sequence[float], 
                 options: RegistrationOptions, *, table: Turntable | None = None, targets: Mapping[int, Sequence[Target]] | None = None,
                 advance: Advance = lambda done: None) -> Registration:
     """Find the poses of scans of one object, whose names are for messages; other arguments as of `register`.
-
-    Args:
-        extents: of the scans, as `extent_of` returns it.
-        targets: the targets that each scan shows. None: there are none.
-    """
+    `extents`: of the scans, as `extent_of` returns it. `targets`: the targets that each scan shows. None: there are none."""
     count = len(names)
     cells = dict(cells_of(extents, starts, options.cell_m))
     usual = usual_extent(extents)

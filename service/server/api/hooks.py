@@ -1,5 +1,6 @@
 """Routes of hooks: set a URL that is told how the jobs of the project have ended, look at it, test it, delete it."""
 
+from functools import partial
 from typing import Annotated
 
 import sqlalchemy as sa
@@ -60,27 +61,16 @@ def get_hook(service: ServiceDep, caller: Admin, hook: HookName) -> HookView:
 def send_test(service: ServiceDep, caller: Admin, hook: HookName) -> DeliveryView:
     """Queue a delivery of the type `hook.test`, which is signed, sent and tried again as the others are, and end the pause of the hook."""
     service.limiter.take(caller.key, CREATION_COST - 1)
-
-    def work(connection: sa.Connection) -> sa.RowMapping:
-        made = hooks.record_test(connection, caller.project, hook)
-        if made is None:
-            raise _missing(hook)
-        audit.record(connection, caller, "hook.test", hook)
-        return made
-
-    return DeliveryView.model_validate(dict(service.database.transact(work)))
+    made = audit.recorded(service.database, caller, "hook.test", hook, partial(hooks.record_test, project=caller.project, hook=hook))
+    if made is None:
+        raise _missing(hook)
+    return DeliveryView.model_validate(dict(made))
 
 
 @router.delete("/{hook}", status_code=204, responses=responses(404), summary="Delete a hook")
 def delete_hook(service: ServiceDep, caller: Admin, hook: HookName) -> None:
     """Delete a hook; deliveries that wait are not sent any more."""
-    def work(connection: sa.Connection) -> bool:
-        done = hooks.remove(connection, caller.project, hook)
-        if done:
-            audit.record(connection, caller, "hook.delete", hook)
-        return done
-
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, "hook.delete", hook, partial(hooks.remove, project=caller.project, hook=hook)):
         raise _missing(hook)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Annotated
 
@@ -72,11 +73,7 @@ def _views(service: Service, rows: Sequence[sa.RowMapping]) -> list[IntakeView]:
 
 
 def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) -> IntakeView:
-    """Let a capture or environment take no more files while a job looks at it, or refuse the request.
-
-    Args:
-        action: as the audit log names it.
-    """
+    """Let a capture or environment take no more files while a job looks at it, or refuse the request; `action` is for the audit log."""
     intake = job.intake
     before = row_of(service, caller, intake)
 
@@ -86,10 +83,9 @@ def begin_check(service: Service, caller: Caller, job: CheckJob, action: str) ->
         if (file := uploads.unfinished(connection, intake)) is not None:
             raise ApiError("conflict", f"{intake}: {shown(file['path'])} is not complete: go on with {file['id']}, or delete it")
         submit(service, caller, job, connection, [intake])
-        audit.record(connection, caller, action, intake)
         return True
 
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, action, intake, work):
         raise ApiError("conflict", f"{intake} is {before['state']} already")
     return _view(service, caller, intake)
 
@@ -204,14 +200,8 @@ def create_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, w
 def delete_annotation(service: ServiceDep, caller: Writer, capture: CaptureId, annotation: AnnotationId) -> None:
     """Delete an annotation of a capture."""
     row_of(service, caller, capture)
-
-    def work(connection: sa.Connection) -> bool:
-        done = annotations.remove(connection, capture, annotation)
-        if done:
-            audit.record(connection, caller, "annotation.delete", annotation)
-        return done
-
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, "annotation.delete", annotation,
+                          partial(annotations.remove, capture=capture, identifier=annotation)):
         raise ApiError("not-found", f"there is no {annotation} of {capture}")
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any
 
 import sqlalchemy as sa
@@ -20,7 +21,6 @@ from service.server.api.json_body import JsonRoute
 from service.server.api.problems import ApiError, responses
 from service.server.api.submission import inputs_of, require_queue, spelled_out, submit
 from service.server.database import audit, idempotency, jobs, quotas
-from service.server.database.job_view import job_view
 from service.server.database.keys import Caller
 from service.server.storage import layout
 
@@ -99,7 +99,7 @@ def list_jobs(service: ServiceDep, caller: Reader, state: States = (), kind: Kin
             raise ApiError("not-found", f"before: {before} is not in this project")
         after = row["created_at"], row["id"]
     rows = jobs.latest(service.database, caller.project, states=state, kinds=kind, limit=limit + 1, before=after)
-    return JobPage(jobs=[job_view(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
+    return JobPage(jobs=[JobView.of(row) for row in rows[:limit]], next=rows[limit - 1]["id"] if len(rows) > limit else None)
 
 
 @router.get("/{job}", responses=responses(404), summary="Look at a job")
@@ -119,7 +119,7 @@ def get_log(service: ServiceDep, caller: Reader, job: JobName) -> JobLog:
 def cancel_job(service: ServiceDep, caller: Writer, job: JobName) -> JobView:
     """Cancel a job: at once if it is queued, else at its next sign of progress. Its results stay."""
     before = view(service, caller, job)
-    if not service.database.transact(lambda connection: _told(connection, caller, "job.cancel", job, jobs.cancel(connection, job))):
+    if not audit.recorded(service.database, caller, "job.cancel", job, partial(jobs.cancel, job=job)):
         raise ApiError("conflict", f"{job} is {before.state}: it has ended")
     service.queue.cancel(job, before.attempt)
     return view(service, caller, job)
@@ -147,10 +147,9 @@ def change_priority(service: ServiceDep, caller: Writer, job: JobName,
         attempt = jobs.set_priority(connection, job, wanted.priority)
         if attempt is not None:
             service.queue.set_priority(connection, job, attempt, wanted.priority)
-            audit.record(connection, caller, "job.priority", job)
         return attempt is not None
 
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, "job.priority", job, work):
         raise ApiError("conflict", f"{job} is {before.state}: only a queued job has a priority to change")
     return view(service, caller, job)
 
@@ -163,9 +162,9 @@ def delete_job(service: ServiceDep, caller: Writer, job: JobName) -> None:
     def work(connection: sa.Connection) -> bool:
         if users := jobs.users_of(connection, job, active=True):
             raise ApiError("conflict", f"{job} is read by {users[0]}, which has not ended")
-        return _told(connection, caller, "job.delete", job, jobs.remove(connection, job))
+        return jobs.remove(connection, job)
 
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, "job.delete", job, work):
         raise ApiError("conflict", f"{job} is {before.state}: cancel it first")
     service.storage.remove(layout.results(caller.project, job))
     service.storage.remove(layout.shared(caller.project, job))
@@ -177,14 +176,7 @@ def view(service: Service, caller: Caller, job: str) -> JobView:
     row = jobs.find(service.database, job, caller.project)
     if row is None:
         raise ApiError("not-found", f"there is no {job} in this project")
-    return job_view(row)
-
-
-def _told(connection: sa.Connection, caller: Caller, action: str, job: str, done: bool) -> bool:
-    """Write a change that was made into the audit log, and return whether it was."""
-    if done:
-        audit.record(connection, caller, action, job)
-    return done
+    return JobView.of(row)
 
 
 def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
@@ -200,9 +192,8 @@ def _again(service: Service, caller: Caller, job: str, state: str) -> JobView:
             service.queue.enqueue(connection, job, attempt, request, before.priority, caller.project)
             require_queue(service, caller, connection)
             quotas.require(connection, service.settings, quotas.JOBS, caller.project, 0)
-            audit.record(connection, caller, "job.again", job)
         return attempt is not None
 
-    if not service.database.transact(work):
+    if not audit.recorded(service.database, caller, "job.again", job, work):
         raise ApiError("conflict", f"{job} is {before.state}, not {state}")
     return view(service, caller, job)

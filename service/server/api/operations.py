@@ -3,21 +3,20 @@
 import shutil
 import threading
 import time
+from functools import partial
 from typing import Annotated, Literal
 
-import sqlalchemy as sa
 from fastapi import APIRouter, Depends, Path, Query, Request, Response, Security
 from fastapi.security import HTTPAuthorizationCredentials
 from pydantic import BaseModel
 
-from service.requests.answers import AuditEntry, AuditPage, DiskView, MachinesView, ProjectView, WorkerView
+from service.requests.answers import AuditEntry, AuditPage, DiskView, JobView, MachinesView, ProjectView, WorkerView
 from service.requests.keys import Scope
 from service.server.api.context import Admin, Reader, Service, ServiceDep, authenticated, bearer, has_space, require_local
 from service.server.api.metrics import CONTENT_TYPE
 from service.server.api.problems import ApiError, responses
 from service.server.database import audit, jobs, workers
 from service.server.database.engine import UNANSWERED
-from service.server.database.job_view import job_view
 from service.server.database.keys import Caller
 from service.server.jobs.queue import job_and_attempt
 from stage.errors import StorageError
@@ -147,13 +146,9 @@ def _end_worker(service: Service, caller: Caller, worker: str, what: str) -> Wor
         raise ApiError("not-found", f"there is no worker {worker}")
     if found.busy and found.job is None:
         raise ApiError("conflict", f"{worker} does a job of another project")
-
-    def work(connection: sa.Connection) -> None:
-        if not workers.ask(connection, worker, what):
-            raise ApiError("not-found", f"there is no worker {worker}")
-        audit.record(connection, caller, f"worker.{what}", worker[-MOST_OBJECT:])
-
-    service.database.transact(work)
+    if not audit.recorded(service.database, caller, f"worker.{what}", worker[-MOST_OBJECT:],
+                          partial(workers.ask, worker=worker, what=what)):
+        raise ApiError("not-found", f"there is no worker {worker}")
     return found.model_copy(update={"asked": what})
 
 
@@ -163,5 +158,5 @@ def _workers(service: Service, caller: Caller) -> list[WorkerView]:
     for row in workers.seen_lately(service.database):
         workflows = taken.get(row["id"], [])
         shown = [job for name in workflows if (job := jobs.find(service.database, job_and_attempt(name)[0], caller.project)) is not None]
-        found.append(WorkerView.model_validate({**row, "busy": bool(workflows), "job": job_view(shown[0]) if shown else None}))
+        found.append(WorkerView.model_validate({**row, "busy": bool(workflows), "job": JobView.of(shown[0]) if shown else None}))
     return found

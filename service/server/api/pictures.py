@@ -43,7 +43,6 @@ async def result_picture(file: Annotated[Opened, Depends(opened)], if_match: Tag
 
 
 def _jpeg(path: Path, name: str) -> bytes:
-    """Return the picture of an open file."""
     import numpy as np
 
     from stage.colour.colour import convert

@@ -14,7 +14,7 @@ from stage.model import Line, Strict
 
 
 class Stage(Protocol):
-    """What the page asks of a stage; service.acquisition.remote_control has it."""
+    """The stage as the page uses it; service.acquisition.remote_control has it."""
 
     def described(self) -> dict[str, Any]:
         """Return the rig."""
@@ -65,7 +65,7 @@ class Named(Strict):
 
 
 class Step(Strict):
-    """What a capture is to be calibrated by: ball or chart."""
+    """The target by which a capture is to be calibrated: ball or chart."""
 
     step: Line
 

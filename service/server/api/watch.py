@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
+from service.requests.answers import JobView
 from service.requests.base.identifiers import JOB, KEY
 from service.requests.states import ENDED
 from service.server.api.problems import RETRY_S, ApiError
 from service.server.base.log import logger
 from service.server.database import jobs, keys
 from service.server.database.engine import UNANSWERED, Database, message_of
-from service.server.database.job_view import job_view
 from service.server.database.keys import Caller
 
 TICK_S = 0.25
@@ -159,7 +159,7 @@ class Watcher:
         if self._seen.get(row["id"]) == (row["project"], row["revision"]):
             listeners = {listener for listener in listeners if listener.fresh}
         if listeners:
-            change = Change(row["id"], row["revision"], row["state"] in ENDED, job_view(row).model_dump_json(by_alias=True))
+            change = Change(row["id"], row["revision"], row["state"] in ENDED, JobView.of(row).model_dump_json(by_alias=True))
             for listener in listeners:
                 listener.offer(change)
 

@@ -7,6 +7,8 @@ delete a line; who may change the schema of the database can drop them, as `prun
 import getpass
 import time
 from collections import Counter
+from collections.abc import Callable
+from typing import TypeVar
 
 import sqlalchemy as sa
 import structlog
@@ -15,6 +17,7 @@ from service.server.database.engine import Database, begin_writing
 from service.server.database.keys import DAY_S, Caller
 from service.server.database.tables import audit
 
+T = TypeVar("T")
 ANONYMOUS = "anonymous"
 REFUSAL = "the audit log is append-only"
 MOST_A_DAY = 10_000
@@ -30,6 +33,16 @@ def record(connection: sa.Connection, caller: Caller, action: str, target: str) 
     """Write that a caller changed an object, in the transaction of the change; an action is such as `job.cancel`."""
     request = structlog.contextvars.get_contextvars().get("request")
     _insert(connection, caller.project, caller.key or ANONYMOUS, action, target, request)
+
+
+def recorded(database: Database, caller: Caller, action: str, target: str, change: Callable[[sa.Connection], T]) -> T:
+    """Make a change in a transaction of its own, write that the caller made it, unless it returns nothing, and return what it returns."""
+    def work(connection: sa.Connection) -> T:
+        if made := change(connection):
+            record(connection, caller, action, target)
+        return made
+
+    return database.transact(work)
 
 
 def record_operator(connection: sa.Connection, project: str, action: str, target: str) -> None:

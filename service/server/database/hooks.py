@@ -15,11 +15,11 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from service.requests.answers import JobView
 from service.requests.base.identifiers import DELIVERY, HOOK, new_id
 from service.requests.hooks import HookEvent, NewHook
 from service.requests.states import CANCELLED, FAILED, SUCCEEDED
 from service.server.database.engine import Database, begin_writing
-from service.server.database.job_view import job_view
 from service.server.database.tables import deliveries, hooks, jobs
 
 EVENTS = {SUCCEEDED: HookEvent.FINISHED, FAILED: HookEvent.FAILED, CANCELLED: HookEvent.CANCELLED}
@@ -59,7 +59,7 @@ def record_end(connection: sa.Connection, job: str) -> None:
     wanted = sa.select(hooks.c.id, hooks.c.events).where(hooks.c.project == row["project"])
     for hook in connection.execute(wanted.with_for_update(read=True, key_share=True)).all():  # it is not deleted meanwhile
         if event in hook.events:
-            body = body or _body(f"job.{event}", now, job_view(row).model_dump(mode="json"))
+            body = body or _body(f"job.{event}", now, JobView.of(row).model_dump(mode="json"))
             _insert_delivery(connection, hook.id, event, job, now, body)
 
 

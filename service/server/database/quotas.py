@@ -51,13 +51,10 @@ def _bytes(connection: sa.Connection, project: str) -> int:
     return int(connection.execute(files).scalar_one()) + int(connection.execute(results).scalar_one())
 
 
-def _captures(connection: sa.Connection, project: str) -> int:
-    return connection.execute(sa.select(sa.func.count()).where(intakes.c.project == project)).scalar_one()
-
-
-def _jobs(connection: sa.Connection, project: str) -> int:
-    theirs = jobs.c.project == project, jobs.c.state.in_(ACTIVE), jobs.c.request["kind"].as_string() != "check"
-    return connection.execute(sa.select(sa.func.count()).where(*theirs)).scalar_one()
+def _rows_of(table: sa.Table, *counted: "sa.ColumnElement[bool]") -> Callable[[sa.Connection, str], int]:
+    """Return the function that counts the rows of a project for which all of some conditions hold."""
+    return lambda connection, project: connection.execute(
+        sa.select(sa.func.count()).where(table.c.project == project, *counted)).scalar_one()
 
 
 def _pixels(connection: sa.Connection, project: str) -> int:
@@ -65,10 +62,7 @@ def _pixels(connection: sa.Connection, project: str) -> int:
     return sum(pixels_of(facts) for facts in rows)
 
 
-def _hooks(connection: sa.Connection, project: str) -> int:
-    return connection.execute(sa.select(sa.func.count()).where(hooks.c.project == project)).scalar_one()
-
-
 USED: dict[str, Callable[[sa.Connection, str], int]] = {
-    BYTES: _bytes, CAPTURES: _captures, JOBS: _jobs, PIXELS: _pixels, HOOKS: _hooks}
+    BYTES: _bytes, PIXELS: _pixels, CAPTURES: _rows_of(intakes), HOOKS: _rows_of(hooks),
+    JOBS: _rows_of(jobs, jobs.c.state.in_(ACTIVE), jobs.c.request["kind"].as_string() != "check")}
 UNITS = {BYTES: "bytes", CAPTURES: "captures and environments", JOBS: "jobs", PIXELS: "pixels", HOOKS: "hooks"}

@@ -69,7 +69,6 @@ def _has_tables(connection: sa.Connection) -> bool:
 
 
 def _revision(connection: sa.Connection) -> str | None:
-    """Return the revision of the tables; None: there are none, or they are older than the first revision."""
     if not sa.inspect(connection).has_table(REVISIONS):
         return None
     version = sa.column("version_num", sa.String)  # as Alembic names it

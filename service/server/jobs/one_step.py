@@ -5,14 +5,18 @@ Those that calibrate write manifests and reports among the results, and leave th
 
 import tempfile
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from service.reporting.provenance import name_place
 from service.requests import calibrate, calibration_jobs, jobs
 from service.requests.base.base import JobRequest, Options
 from service.requests.basis import BasisKind
+from service.requests.depth import SeparateRequest
 from service.requests.light.light_keys import LightKeys
+from service.requests.shade import ShadeRequest
+from service.requests.solve import JoinRequest
 from service.server.jobs.places import StepFiles, file_within
 from service.server.storage import layout
 from stage.capture.manifest import FILE_NAME
@@ -31,6 +35,15 @@ TOF_FILE = "tof.json"
 """Name of the calibration of a time-of-flight camera."""
 
 
+def _product(function: str, model: type[Options], file: str = "", **given: Any) -> Callable[[JobRequest, StepFiles], None]:
+    """Return the function of jobs whose product, a `module:function` that is loaded when it is called, is given nothing but its request."""
+    def make(request: JobRequest, files: StepFiles) -> None:
+        module, _, name = function.partition(":")
+        getattr(import_module(module), name)(files.request(model, request, out=files.out / file, **given), files.progress)
+
+    return make
+
+
 def export(request: jobs.ExportJob, files: StepFiles) -> None:
     """Make an asset of solved maps or a depth."""
     from service.export.export import export as make_asset
@@ -38,20 +51,6 @@ def export(request: jobs.ExportJob, files: StepFiles) -> None:
 
     make_asset(files.request(ExportRequest, request, out=files.out / f"{layout.ASSET}.{request.format}"), files.progress)
     files.write_annotations(request.rig or request.maps)
-
-
-def _join(request: jobs.JoinJob, files: StepFiles) -> None:
-    from service.joining.join import join
-    from service.requests.solve import JoinRequest
-
-    join(files.request(JoinRequest, request, out=files.out), files.progress)
-
-
-def _shade(request: jobs.ShadeJob, files: StepFiles) -> None:
-    from service.relight.shade import shade
-    from service.requests.shade import ShadeRequest
-
-    shade(files.request(ShadeRequest, request, out=files.out / layout.PICTURE), files.progress)
 
 
 def _view(request: jobs.ViewJob, files: StepFiles) -> None:
@@ -74,13 +73,6 @@ def _basis(request: jobs.BasisJob, files: StepFiles) -> None:
     options = {name: value for name, value in dict(request.options).items() if name != "basis"}
     make_basis(BasisRequest(capture=files.intake(request.capture), out=files.out / f"{BASIS}{SUFFIXES[kind]}", kind=kind,
                             device=files.device, cache=files.cache(request.capture), **options), files.progress)
-
-
-def _separate(request: jobs.SeparateJob, files: StepFiles) -> None:
-    from service.depth.separate import separate
-    from service.requests.depth import SeparateRequest
-
-    separate(files.request(SeparateRequest, request, out=files.out), files.progress)
 
 
 def _scan(request: jobs.ScanJob, files: StepFiles) -> None:
@@ -142,24 +134,6 @@ def _gauge_board(request: jobs.GaugeBoardJob, files: StepFiles) -> None:
         gauge_board(GaugeBoardRequest(study=folder / STUDY_FILE, out=files.out), files.progress)
 
 
-def _calibrate(request: JobRequest, files: StepFiles) -> None:
-    from service.calibrate import lights, response, sensor, white_balance
-
-    products: dict[type[JobRequest], tuple[Callable[..., object], type[Options]]] = {
-        calibration_jobs.MirrorBallJob: (lights.mirror_ball, calibrate.MirrorBallRequest),
-        calibration_jobs.LightPositionsJob: (lights.light_positions, calibrate.LightPositionsRequest),
-        calibration_jobs.GreyBallJob: (lights.grey_ball, calibrate.GreyBallRequest),
-        calibration_jobs.IntensityJob: (lights.intensity, calibrate.IntensityRequest),
-        calibration_jobs.DarkJob: (sensor.dark, calibrate.DarkRequest),
-        calibration_jobs.FlatFieldJob: (sensor.flat_field, calibrate.FlatFieldRequest),
-        calibration_jobs.SaturationJob: (sensor.saturation, calibrate.SaturationRequest),
-        calibration_jobs.WhiteBalanceJob: (white_balance.white_balance, calibrate.WhiteBalanceRequest),
-        calibration_jobs.ResponseJob: (response.response, calibrate.ResponseRequest)}
-    product, model = products[type(request)]
-    given = {"write": True} if model is calibrate.SaturationRequest else {}
-    product(files.request(model, request, out=files.out / FILE_NAME, **given), files.progress)
-
-
 def _calibrate_chart(request: calibration_jobs.ChartJob, files: StepFiles) -> None:
     from service.calibrate.chart import calibrate_chart
     from service.requests.chart import ChartRequest
@@ -210,11 +184,23 @@ def _calibrate_tof(request: calibration_jobs.TofCalibrationJob, files: StepFiles
 MEASURE = "measure"
 RIGS = (calibration_jobs.ProcamJob, calibration_jobs.StereoCalibrationJob, calibration_jobs.LaserPlanesJob)
 ONE_STEP: dict[type[JobRequest], tuple[str, Callable[[Any, StepFiles], None]]] = {
-    **dict.fromkeys(get_args(calibration_jobs.AnyCalibration), (MEASURE, _calibrate)),
+    calibration_jobs.MirrorBallJob: (MEASURE, _product("service.calibrate.lights:mirror_ball", calibrate.MirrorBallRequest, FILE_NAME)),
+    calibration_jobs.LightPositionsJob: (MEASURE, _product("service.calibrate.lights:light_positions", calibrate.LightPositionsRequest,
+                                                           FILE_NAME)),
+    calibration_jobs.GreyBallJob: (MEASURE, _product("service.calibrate.lights:grey_ball", calibrate.GreyBallRequest, FILE_NAME)),
+    calibration_jobs.IntensityJob: (MEASURE, _product("service.calibrate.lights:intensity", calibrate.IntensityRequest, FILE_NAME)),
+    calibration_jobs.DarkJob: (MEASURE, _product("service.calibrate.sensor:dark", calibrate.DarkRequest, FILE_NAME)),
+    calibration_jobs.FlatFieldJob: (MEASURE, _product("service.calibrate.sensor:flat_field", calibrate.FlatFieldRequest, FILE_NAME)),
+    calibration_jobs.SaturationJob: (MEASURE, _product("service.calibrate.sensor:saturation", calibrate.SaturationRequest, FILE_NAME,
+                                                       write=True)),
+    calibration_jobs.WhiteBalanceJob: (MEASURE, _product("service.calibrate.white_balance:white_balance", calibrate.WhiteBalanceRequest,
+                                                         FILE_NAME)),
+    calibration_jobs.ResponseJob: (MEASURE, _product("service.calibrate.response:response", calibrate.ResponseRequest, FILE_NAME)),
     **dict.fromkeys(RIGS, (MEASURE, _calibrate_rig)), calibration_jobs.TofCalibrationJob: (MEASURE, _calibrate_tof),
     calibration_jobs.RigCalibrationJob: (MEASURE, _calibrate_lamps), calibration_jobs.ChartJob: (MEASURE, _calibrate_chart),
-    jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _join), jobs.ShadeJob: ("shade", _shade), jobs.ViewJob: ("view", _view),
+    jobs.ExportJob: ("export", export), jobs.JoinJob: ("join", _product("service.joining.join:join", JoinRequest)),
+    jobs.ShadeJob: ("shade", _product("service.relight.shade:shade", ShadeRequest, layout.PICTURE)), jobs.ViewJob: ("view", _view),
     jobs.InspectBoardJob: ("inspect", _inspect_board), jobs.GaugeBoardJob: ("gauge", _gauge_board), jobs.DriveJob: ("drive", _drive),
-    jobs.BasisJob: (MEASURE, _basis), jobs.SeparateJob: (MEASURE, _separate), jobs.ScanJob: (MEASURE, _scan),
-    jobs.PatternsJob: (MEASURE, _patterns)}
+    jobs.BasisJob: (MEASURE, _basis), jobs.ScanJob: (MEASURE, _scan), jobs.PatternsJob: (MEASURE, _patterns),
+    jobs.SeparateJob: (MEASURE, _product("service.depth.separate:separate", SeparateRequest))}
 """The name of the step of each of these kinds of jobs, and the function that does it."""

@@ -181,7 +181,6 @@ def _examples(option: Option) -> list[Any]:
 
 
 def _bare(kind: Any) -> Any:
-    """Return a type without what it is annotated with."""
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
 
 

@@ -188,7 +188,6 @@ class Housekeeper:
 
 
 def _forget(connection: sa.Connection, job: str) -> bool:
-    """Delete a job; return False if a job that has not ended reads its results, or it was queued again meanwhile."""
     return not jobs.users_of(connection, job, active=True) and jobs.remove(connection, job)
 
 

@@ -70,7 +70,6 @@ def _add(database: Database, storage: Storage, request: JobRequest, files: Seque
 
 
 def _registered(database: Database, queue: JobQueue, kind: str, path: Path) -> str:
-    """Return the identifier of a path, which is registered if it is not yet."""
     for row in intakes.latest(database, DEFAULT_PROJECT, kind, limit=500):
         if row["folder"] == str(path) and row["state"] != REFUSED:
             return str(row["id"])

@@ -41,14 +41,8 @@ go as it happens, and take 60 KB each."""
 def serve(settings: Settings, *, before_answering: Callable[[str, Database, JobQueue, Storage], None] | None = None,
           set_stage: Stage | None = None) -> None:
     """Serve until SIGTERM or SIGINT, then let steps and requests end.
-
-    Args:
-        before_answering: gets the address and the parts of the service.
-        set_stage: takes captures at this machine, for the page /set.
-
-    Raises:
-        RequestError: the service cannot listen.
-    """
+    `before_answering`: gets the address and the parts of the service. `set_stage`: takes captures at this machine, for the page /set.
+    Raises RequestError: the service cannot listen."""
     supervisors: list[Supervisor] = []
     asked = hear_signals(supervisors)
     configure(settings)

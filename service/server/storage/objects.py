@@ -142,7 +142,6 @@ class Scratch:
 
 
 def _state(path: Path) -> list[object]:
-    """Return size and time of a file; an empty list if there is none."""
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):

@@ -53,11 +53,8 @@ class Batch(NamedTuple):
 
 def each_span(given: SolveInput, bytes_per_pixel: int, work: Callable[[int, int, str], None], results: Results) -> None:
     """Do the pixel ranges of the image that touch the mask on the devices, and say how far it is.
-
-    Args:
-        bytes_per_pixel: what the work allocates for each pixel beside the stack.
-        work: takes the range's first pixel, the pixel after its last, padding included, and the device, and stores what it finds.
-    """
+    `bytes_per_pixel`: what the work allocates for each pixel beside the stack. `work`: takes the range's first pixel, the pixel after
+    its last, padding included, and the device, and stores what it finds."""
     inside, total = given.mask.reshape(-1), given.stack.shape[2]
     spans = [(start, stop) for start, stop in given.images[given.device].spans(bytes_per_pixel) if inside[start:stop].any()]
     _deal(given, spans, lambda span, device: work(*span, device), results, size=lambda span: span[1] - span[0],
@@ -86,10 +83,7 @@ def _deal(given: SolveInput, pieces: Sequence[Piece], work: Callable[[Piece, str
 
 def each_band(given: SolveInput, lights: Lights, field: NearField | None, work: Callable[[ReadBand], None], results: Results) -> None:
     """Do the image band by band on the devices, without the bands that lie outside the mask, and say how far it is.
-
-    Args:
-        results: where the work stores what it finds, and what that follows from besides the arguments.
-    """
+    `results`: where the work stores what it finds, and what that follows from besides the arguments."""
     stack, inside = given.stack, given.mask.reshape(-1)
     factors = grey_factors(lights, GREY_WEIGHTS)
 

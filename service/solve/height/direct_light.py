@@ -82,12 +82,8 @@ class DirectLight(NamedTuple):
 def direct_light(given: SolveInput, lights: Lights, field: NearField | None, normal: np.ndarray, material: Material,
                  bouncing: np.ndarray, solved: np.ndarray, *, shadows: bool, interreflection: bool, parts: bool) -> DirectLight | None:
     """Find what the object does to its own light, or return None when no pixel is solved.
-
-    Args:
-        normal: [3, pixels] float32, found so far.
-        bouncing: [3, pixels] albedo of the light that other surfaces send.
-        parts: whether parts are moved in depth to where their shadows agree with the images; not under near lights.
-    """
+    `normal`: [3, pixels] float32, found so far. `bouncing`: [3, pixels] albedo of the light that other surfaces send. `parts`: whether
+    parts are moved in depth to where their shadows agree with the images; not under near lights."""
     surface = integrate(given, normal, solved, stage="surface")
     if surface is None:
         return None

@@ -96,8 +96,6 @@ class NearFit(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """Readings of a grid of pixels."""
-
     mask: np.ndarray  # [rows, cols] bool
     x: np.ndarray  # [rows, cols] slopes of the lines of sight
     y: np.ndarray
@@ -121,10 +119,7 @@ class _Sample(NamedTuple):
 
 def find_distance(capture: Capture, stack: Stack, device: str) -> Distance:
     """Return a capture with the depth of the surface that its images tell; an orthographic camera whose images do not keeps z = 0.
-
-    Raises:
-        ManifestError: the images of a perspective camera do not tell the depth, or the lights are not usable.
-    """
+    Raises ManifestError: the images of a perspective camera do not tell the depth, or the lights are not usable."""
     try:
         return _found(capture, stack, device)
     except NotTold as error:
@@ -202,7 +197,6 @@ def _span(capture: Capture) -> float:
 
 
 def _sample(capture: Capture, stack: Stack) -> _Sample:
-    """Read a grid of pixels."""
     camera, mask = capture.camera, capture.mask()
     rows, cols = np.nonzero(mask)
     step = max(1, int(np.ceil((max(np.ptp(rows), np.ptp(cols)) + 1) / ACROSS)))

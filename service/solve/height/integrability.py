@@ -44,12 +44,8 @@ parts, and its readings tell that only partly. On path-traced scenes a tenth of 
 
 def doubt(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the standard deviation of normals, in degrees, that their misfit to a surface shows, [rows, cols] float32.
-
-    Args:
-        normal: [rows, cols, 3] unit.
-        height: [rows, cols] camera-frame z, integrated from them.
-        part: [rows, cols] int, the number of the part of each pixel that has both, from 1; 0 elsewhere. No surface leads from part to part.
-    """
+    `normal`: [rows, cols, 3] unit. `height`: [rows, cols] camera-frame z, integrated from them. `part`: [rows, cols] int, the number of
+    the part of each pixel that has both, from 1; 0 elsewhere. No surface leads from part to part."""
     found = misfit(normal, height, part, camera)
     found *= SHARED * found / (found + NOISE)
     return np.hypot(found / np.hypot(1, found / LARGEST_TRACE), PIXEL)
@@ -57,11 +53,7 @@ def doubt(normal: np.ndarray, height: np.ndarray, part: np.ndarray, camera: Came
 
 def beside_parts(sigma: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Return the standard deviation of normals, [rows, cols] in degrees, with that of pixels beside another part raised.
-
-    Args:
-        sigma: [rows, cols] standard deviation without this.
-        part: as for `doubt`.
-    """
+    `sigma`: [rows, cols] standard deviation without this. `part`: as for `doubt`."""
     framed, (rows, cols) = np.pad(part, 1), part.shape
     around = [framed[down : down + rows, right : right + cols] for down in range(3) for right in range(3)]
     beside = (part > 0) & np.any([(side > 0) & (side != part) for side in around], axis=0)

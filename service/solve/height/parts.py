@@ -125,12 +125,8 @@ class Material(NamedTuple):
 def place_parts(given: SolveInput, lights: Lights, normal: np.ndarray, material: Material, height: np.ndarray,
                 part: np.ndarray) -> Placement:
     """Move the parts of a surface along the line of sight to where their shadows agree with the images.
-
-    Args:
-        normal: [3, pixels] float32.
-        height: [rows, cols] float32, camera-frame z, 0 outside.
-        part: [rows, cols] int, the part of each pixel, -1 outside.
-    """
+    `normal`: [3, pixels] float32. `height`: [rows, cols] float32, camera-frame z, 0 outside. `part`: [rows, cols] int, the part of each
+    pixel, -1 outside."""
     size = np.bincount(part[part >= 0])
     order = np.argsort(-size, kind="stable")
     moved = order[1 : 1 + MOST_PARTS]

@@ -49,10 +49,7 @@ class Axes(NamedTuple):
 
 def sites(mask: np.ndarray) -> np.ndarray:  # -> [4, sites] int64
     """Return places spread over a mask: the row-major positions of the pixels to the right, to the left, above and below.
-
-    Args:
-        mask: [rows, cols] bool, pixels that have a normal.
-    """
+    `mask`: [rows, cols] bool, pixels that have a normal."""
     step = max(1, round(np.sqrt(np.count_nonzero(mask)) / STEPS_ACROSS))
     rows, cols = mask.shape
     if min(rows, cols) <= 2 * step:
@@ -74,11 +71,8 @@ def wrong_axes(normals: np.ndarray, *, strict: bool = False) -> Axes | None:
     At every place the four sums and differences of the derivatives of the slopes are scaled to the length 1, so that edges and rims
     count no more than other places. Their mean squares then say how far each rule is broken, and the turn with the least is an
     eigenvector of a 2 by 2 matrix.
-
-    Args:
-        normals: [4, 3, sites] at the pixels of `sites`, z towards the viewer of that pixel.
-        strict: ask for more, where few lights gave the normals.
-    """
+    `normals`: [4, 3, sites] at the pixels of `sites`, z towards the viewer of that pixel. `strict`: ask for more, where few lights gave
+    the normals."""
     good = (normals[:, 2] > LEAST_TOWARD).all(axis=0)
     if good.sum() < LEAST_SITES:
         return None

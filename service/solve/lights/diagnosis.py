@@ -4,20 +4,81 @@ A wrong manifest seldom stops a solver: it finds normals that are wrong everywhe
 sentence that names the field, and raises the standard error of every normal by the angle that the finding asks for.
 """
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from kernels.photometric.lambertian.readings import pad_lights
 from kernels.photometric.model.samples import evenly
-from service.light_estimation.explanations import PIXELS, Cause, Sample, better_explanation, explanation_sentence, fit_manifest
+from service.light_estimation.explanations import (
+    PIXELS,
+    Cause,
+    Sample,
+    better_explanation,
+    explanation_sentence,
+    fit_manifest,
+    grey_readings,
+)
+from service.light_estimation.lambertian import SHADOW, median_of, normal_equations
 from service.solve.base.solution import PIXELS_AT_ONCE, Solution, SolveInput, raise_error, suspect_lights
+from service.solve.height.distance import NOISE, SQUARES, SURE, Lamps, NearFit, fit_near
 from service.solve.lights.orientation import LightAxes, find_axes, find_inversion
-from service.solve.lights.other_lights import find_other_lights
 from stage.capture.capture import Capture
 from stage.capture.gradients import GradientFrames
 from stage.capture.lighting import ExtendedLights
 from stage.capture.point_lights import DistantLights, PlacedLights
+
+TRIED_PIXELS = 600
+"""Pixels, spread over the object, that are compared."""
+DISTANCES = tuple(np.geomspace(0.8, 16, 14).tolist())
+"""Distances from the middle of the object that are tried, in its half widths, 26 % apart."""
+LEAST_LIGHTS, LEAST_LIT = 5, 5
+"""Least count of lights, and of lit readings of a pixel that is compared: two to spare."""
+LEAST_PIXELS = 60
+LEAST_SLANT = 0.2
+"""Least z of a direction to a lamp on a plane in front of the object."""
+LEAST_GAIN, LEAST_GAIN_NEAR, NEAR = 0.3, 0.1, 8.0
+"""Least part of the cost that other lights take away: where the declared ones are right, at most 0.02 goes in scenes, of bare metal, and
+0.05 of real objects; lights within so many half widths take 0.14 away of a glossy object, and 0.7 to 0.9 of matt ones, and the right
+strength 0.5 to 0.99. The lights of a real rig 12 to 16 half widths away, which is far enough, take 0.08 to 0.15."""
+EXPLAINED = 2.5
+"""Largest cost of half of the pixels under other lights, that of a residual of three times the noise: on bare metal, which no
+Lambertian fit explains, it is 3.2 and more, and near lights then take up to a quarter away of what they do not explain; on glossy objects
+at most 2."""
+LEAST_FACTOR = 1.2
+"""Least factor of the strength of one light: less turns normals by a few degrees."""
+STRENGTH_ROUNDS = 4
+"""Fits with the strength of one light, each found from the one before."""
+MOST_STRENGTHS = 4
+"""The most lights whose strength is fitted: those of which the readings are farthest from what the other lights predict."""
+MOST_LEVERAGE = 0.9
+"""A reading with more leverage is not predicted by the others."""
+NEIGHBOURS = 8
+"""Compared pixels from which the error of a pixel between them is taken."""
+
+
+class OtherLights(NamedTuple):
+    """Lights that explain the readings much better than those that are declared."""
+
+    sentence: str
+    gain: float
+    """The part of the cost of the readings that they take away."""
+    degrees: np.ndarray  # [pixels of the image] float32, angle between the normals under these and under the declared; 0 outside the mask
+
+
+class _Sample(NamedTuple):
+    readings: np.ndarray  # [lights, pixels] float64, radiance over irradiance
+    usable: np.ndarray  # [lights, pixels] bool
+    points: np.ndarray  # [pixels, 3] from the middle of the object, in its half widths
+
+
+class _Trial(NamedTuple):
+    fit: NearFit
+    sentence: str
+    least_gain: float = LEAST_GAIN
+
 
 UNORDERED = (Cause.REVERSED, Cause.SHIFTED, Cause.DIRECTIONS)
 """Causes after which the normals say nothing about the axes."""
@@ -29,11 +90,8 @@ FIELDS = {DistantLights: "frames[].light.direction", PlacedLights: "frames[].lig
 
 def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, solution: Solution) -> None:
     """Add a warning for everything that is wrong with the lights or the encoding, and make the normals less sure by it.
-
-    Args:
-        lights: the lights with which the normals were solved; readings are examined under distant ones.
-        declared: the lights of the manifest, which may have other intensities.
-    """
+    `lights`: the lights with which the normals were solved; readings are examined under distant ones. `declared`: the lights of the
+    manifest, which may have other intensities."""
     field = FIELDS.get(type(lights), "the capture of the reference ball")
     fit = None
     if isinstance(lights, DistantLights):
@@ -68,7 +126,6 @@ def diagnose(given: SolveInput, capture: Capture, lights: Any, declared: Any, so
 
 
 def _sample(given: SolveInput, capture: Capture, lights: DistantLights) -> Sample:
-    """Return the readings of pixels that are spread over the mask."""
     stack = given.stack
     inside = np.flatnonzero(given.mask)
     radiance, usable = stack.pick_radiance(inside[evenly(len(inside), PIXELS)])
@@ -86,3 +143,124 @@ def _turned_by(normal: np.ndarray, axes: LightAxes) -> np.ndarray:
             cosine = np.clip((part * (matrix.astype(np.float32) @ part)).sum(axis=0), -1, 1)
             squares[first : first + PIXELS_AT_ONCE] += np.degrees(np.arccos(cosine)) ** 2 / len(axes.matrices)
     return np.sqrt(squares)
+
+
+# Tell distant lights that are declared wrongly in a way that few numbers mend: all of them stand near, or one is of another strength.
+#
+# A light at distance d lights the near side of an object of extent s more by some 3 s / d, and from another direction. The normals of a fit
+# under distant lights take up a part of that, and the rest is left at every pixel. The declared directions are kept, and places along them
+# are tried, on a sphere about the object and on a plane in front of it, as domes and frames of lamps have them: one number is free. One
+# light of another strength is found by the readings that the others predict, also where they are too few to measure the strength of every
+# light.
+
+def find_other_lights(given: SolveInput, lights: DistantLights) -> OtherLights | None:
+    """Return lights that explain the images much better than these, or None where nothing speaks against them."""
+    row, col = np.nonzero(given.mask)
+    if len(lights.direction) < LEAST_LIGHTS or len(row) < LEAST_PIXELS:
+        return None
+    half = max(float(np.ptp(row)), float(np.ptp(col)), 1.0) / 2
+    place = np.stack([col - col.mean(), row.mean() - row], axis=1) / half
+    chosen = evenly(len(row), TRIED_PIXELS)
+    radiance, usable = given.stack.pick_radiance(np.flatnonzero(given.mask)[chosen])
+    readings = grey_readings(radiance, lights.irradiance)
+    told = (usable & (readings > 0)).sum(axis=0) >= LEAST_LIT
+    if told.sum() < LEAST_PIXELS:
+        return None
+    at = place[chosen][told]
+    sample = _Sample(readings[:, told], usable[:, told], np.concatenate([at, np.zeros((len(at), 1))], axis=1))
+    far = _fit(sample, _at_infinity(lights.direction))
+    cost, least = _cost(far), np.inf
+    best: _Trial | None = None
+    for trial in (*_near(sample, lights.direction), *_one_strength(sample, lights.direction, far, given.stack.frames)):
+        if (total := float(_cost(trial.fit).sum())) < least:
+            best, least = trial, total
+    if best is None or np.median(_cost(best.fit)) > EXPLAINED:
+        return None
+    gain = 1 - least / max(float(cost.sum()), 1e-12)
+    square = np.clip((at + 1) * SQUARES / 2, 0, SQUARES - 1).astype(int)
+    less = np.bincount(square[:, 0] * SQUARES + square[:, 1], weights=cost - _cost(best.fit))
+    if gain < best.least_gain or less.sum() < SURE * np.sqrt((less**2).sum()):
+        return None
+    turned = np.degrees(np.arccos(np.clip((far.normal * best.fit.normal).sum(axis=0), -1, 1)))
+    degrees = np.zeros(given.mask.size, np.float32)
+    _, nearest = cKDTree(at).query(place, k=min(NEIGHBOURS, len(at)))
+    degrees[np.flatnonzero(given.mask)] = np.sqrt((turned**2)[nearest].mean(axis=-1))
+    return OtherLights(f"{best.sentence}; the readings then cost {100 * gain:.0f} % less", gain, degrees)
+
+
+def _near(sample: _Sample, directions: np.ndarray) -> Iterator[_Trial]:
+    """Yield the best fit of lights on a sphere about the object, and of lights on a plane in front of it.
+
+    One at the nearest distance that is tried is none: something else than a distance makes up for what the model lacks.
+    """
+    ways = [directions]
+    if (directions[:, 2] > LEAST_SLANT).all():
+        ways.append(directions / directions[:, 2:])
+    for way in ways:
+        fits = [_fit(sample, np.concatenate([distance * way, np.ones((len(way), 1))], axis=1)) for distance in DISTANCES]
+        best = int(np.argmin([_cost(fit).sum() for fit in fits]))
+        if best == 0:
+            continue
+        median = DISTANCES[best] * float(np.median(np.linalg.norm(way, axis=1)))
+        yield _Trial(fits[best], (
+            f"frames[].light.type: the lights look near, {median:.2g} half widths of the object away, and distant ones are declared: "
+            "their light falls off over the image; declare point lights (relit calibrate light-positions measures them)"),
+            LEAST_GAIN_NEAR if median < NEAR else LEAST_GAIN)
+
+
+def _one_strength(sample: _Sample, directions: np.ndarray, start: NearFit, images: tuple[str, ...]) -> Iterator[_Trial]:
+    """Yield a fit for each light that stands out among the others, with the strength that the readings ask for."""
+    place = _at_infinity(directions)
+    off = np.abs(np.log(_left_out(sample, directions, start.lit)))
+    for light in np.argsort(-off)[:MOST_STRENGTHS]:
+        image, factor = images[light], 1.0
+        for number in range(STRENGTH_ROUNDS):
+            # without this light first: the others say what it should be
+            readings, usable = sample.readings.copy(), sample.usable
+            readings[light] /= factor
+            if number == 0:
+                usable = usable.copy()
+                usable[light] = False
+            fit = _fit(sample._replace(readings=readings, usable=usable), place)
+            cosine = directions[light] @ fit.normal
+            others = np.delete(np.arange(len(directions)), light)
+            level = median_of(readings[others] / np.maximum(directions[others] @ fit.normal, SHADOW), fit.lit[others])
+            seen = sample.usable[light] & (cosine > SHADOW) & (level > 0)
+            ratio = sample.readings[light, seen] / (cosine * level)[seen]
+            if len(ratio) < LEAST_PIXELS or not (factor := float(np.median(ratio))) > 0:
+                break
+        else:
+            if max(factor, 1 / factor) >= LEAST_FACTOR:
+                yield _Trial(fit, f"frames[].light.irradiance: {image} looks {factor:.2g} times as bright as declared beside the others; "
+                                  "check its irradiance and exposure_s, or leave it out")
+
+
+def _left_out(sample: _Sample, directions: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Return by which factor each light [lights] reads more than the other lights predict by least squares; 1 where nothing tells."""
+    inverse = np.linalg.pinv(normal_equations(lit.astype(np.float64), directions), rcond=1e-6, hermitian=True)
+    vector = np.einsum("pab,lb,lp->pa", inverse, directions, np.where(lit, sample.readings, 0))
+    leverage = np.einsum("la,pab,lb->lp", directions, inverse, directions)
+    # the prediction without a reading, by its leverage: Cook and Weisberg, Residuals and Influence in Regression, 1982, equation 2.2.9
+    predicted = (directions @ vector.T - leverage * sample.readings) / np.maximum(1 - leverage, 1e-6)
+    found = np.ones(len(directions))
+    for light, told in enumerate(lit & (predicted > 0) & (leverage < MOST_LEVERAGE)):
+        if told.sum() >= LEAST_PIXELS:
+            found[light] = np.median(sample.readings[light, told] / predicted[light, told])
+    return found
+
+
+def _at_infinity(directions: np.ndarray) -> np.ndarray:
+    return np.concatenate([directions, np.zeros((len(directions), 1))], axis=1)
+
+
+def _fit(sample: _Sample, place: np.ndarray) -> NearFit:
+    """Fit normals under lights at these places, each as strong at the middle of the object as a distant one."""
+    strength = np.where(place[:, 3] == 1, (place[:, :3] ** 2).sum(axis=1), 1.0)
+    return fit_near(sample.readings, sample.usable, Lamps(place, strength, np.zeros((len(place), 4))), sample.points)
+
+
+def _cost(fit: NearFit) -> np.ndarray:
+    """Return the cost of each pixel: mean over its lit readings of ln(1 + (residual / noise)²)."""
+    count = fit.lit.sum(axis=0)
+    total = np.where(fit.lit, np.log1p((fit.residual / NOISE) ** 2), 0).sum(axis=0)
+    return np.where(count >= LEAST_LIT, total / np.maximum(count, 1), 0.0)

@@ -98,14 +98,8 @@ def integrable(b: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
 
     The slopes of A b, with rows a₁ a₂ a₃, are integrable where ∂/∂y (a₁·b/a₃·b) = ∂/∂x (a₂·b/a₃·b). With w = b × ∂b this is
     (a₃ × a₁)·w_y = (a₃ × a₂)·w_x, linear in six numbers.
-
-    Args:
-        b: [3, places] at some places of the image.
-        right, up: [3, places] differences of b along +x and +y, in one unit.
-
-    Raises:
-        CalibrationError: there are too few places, or no matrix is told from others, as on a plane.
-    """
+    `b`: [3, places] at some places of the image. `right, up`: [3, places] differences of b along +x and +y, in one unit. Raises
+    CalibrationError: there are too few places, or no matrix is told from others, as on a plane."""
     if b.shape[1] < LEAST_SITES:
         raise CalibrationError(f"{b.shape[1]} pixels of the object have neighbours on all sides: unknown lights need {LEAST_SITES}")
     scale = np.maximum((b**2).sum(axis=0), 1e-300)

@@ -36,11 +36,7 @@ def outline(normal: np.ndarray, mask: np.ndarray) -> Outline:
     """Compare the normals along the outline of a mask with its outward direction.
 
     Free-standing objects have an `outward` of 0.8 to 0.98 (cut coins 0.7), bowls of -0.4 to -0.85.
-
-    Args:
-        normal: [3, rows, cols] unit, x right, y up; 0 where there is none.
-        mask: [rows, cols] bool.
-    """
+    `normal`: [3, rows, cols] unit, x right, y up; 0 where there is none. `mask`: [rows, cols] bool."""
     width = max(1, round(np.sqrt(np.count_nonzero(mask)) / EDGE))
     if min(mask.shape) <= 6 * width:  # the border is all of the image
         return Outline(0.0, 0.0, 0)

@@ -60,8 +60,6 @@ class LightAxes(NamedTuple):
 
 
 class _Map(NamedTuple):
-    """A small map of the surface."""
-
     normal: np.ndarray  # [3, rows, cols] float32, z towards the viewer of each pixel; 0 outside
     mask: np.ndarray  # [rows, cols] bool
     pixels: np.ndarray  # [rows, cols] row-major positions in the image
@@ -69,11 +67,8 @@ class _Map(NamedTuple):
 
 def find_axes(given: SolveInput, solution: Solution, lights: DistantLights | None, fit: Fit | None) -> LightAxes | None:
     """Return which axes of the lights are exchanged, mirrored or turned, or None.
-
-    Args:
-        lights: the distant lights; None: other lights, whose readings are not fitted again.
-        fit: the fit of some pixels under these lights, or None.
-    """
+    `lights`: the distant lights; None: other lights, whose readings are not fitted again. `fit`: the fit of some pixels under these
+    lights, or None."""
     if lights is not None and fit is not None and len(lights.direction) >= LEAST_LIGHTS and fit.facing < FACING:
         return _exchanged(given, lights, fit)
     estimated = np.isin(solution.status, ESTIMATED).reshape(given.mask.shape)
@@ -212,7 +207,6 @@ def _grid(mask: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _map_of(given: SolveInput, normal: np.ndarray, mask: np.ndarray) -> _Map:
-    """Return a small map of solved normals."""
     pixels, inside = _grid(mask, MAP_SIZE)
     flat = _toward_viewer(given.camera, normal[:, pixels.reshape(-1)], pixels.reshape(-1)).reshape(3, *pixels.shape)
     return _Map(np.where(inside, flat, 0).astype(np.float32), inside, pixels)

@@ -24,10 +24,7 @@ APART = 2
 
 def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Solution:
     """Solve every pixel of the mask for normal and diffuse albedo.
-
-    Args:
-        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
-    """
+    `fit_normals`: `solve_lambert` or `solve_robust`, which fits the normals of a band."""
     given.timings.stage("normals", given.stack.shape[2])
     result = Solution.empty(given.stack.pixel_count)
     misfit = _object_misfit(given, lights, field, fit_normals=fit_normals)
@@ -49,10 +46,7 @@ def solve_diffuse(given: SolveInput, lights: Lights, field: NearField | None = N
 
 def _object_misfit(given: SolveInput, lights: Lights, field: NearField | None = None, *, fit_normals: Callable[..., NormalFit]) -> Misfit:
     """Return the misfit of an object, from fits to pairs of its pixels.
-
-    Args:
-        fit_normals: `solve_lambert` or `solve_robust`, which fits the normals of a band.
-    """
+    `fit_normals`: `solve_lambert` or `solve_robust`, which fits the normals of a band."""
     first = np.zeros(given.mask.shape, dtype=bool)
     first[:, :-APART] = given.mask[:, :-APART] & given.mask[:, APART:]
     start = np.flatnonzero(first)

@@ -189,7 +189,6 @@ class _Walk:
 
     @property
     def _stored(self) -> list[np.ndarray]:
-        """Return what the searches have found, each [..., pixels]."""
         return [values.T for values in self._found]
 
     def _batches(self, stage: str, chosen: np.ndarray, work: Callable[[_Part, Batch], None], results: Results) -> None:

@@ -104,7 +104,6 @@ def view_vectors(camera: Camera, padded: int) -> np.ndarray:
 
 def _facts(frames: GradientFrames, result: Solution, length: np.ndarray, separated: np.ndarray,
            metal: np.ndarray) -> dict[str, Any]:
-    """Return what the report says beside the statistics that every method has."""
     solved = result.status == Status.OK
     how = "colour" if not frames.polarised else "polarisation" if frames.parallel is not None else "crossed polariser"
     facts: dict[str, Any] = {"separation": how, "pixels_separated": int((solved & separated).sum()),

@@ -53,13 +53,8 @@ class Rounds(NamedTuple):
 
 def solve_near(given: SolveInput, lights: PlacedLights, *, series: Sequence[Rounds]) -> Solution:
     """Solve every pixel of the mask under lights of which some are near, and its height with it.
-
-    Args:
-        series: the rounds of each solver; a solver begins with the surface on which the one before it has settled.
-
-    Returns:
-        The last round; the solution's facts say how many there were and how far the last one moved the surface.
-    """
+    `series`: the rounds of each solver; a solver begins with the surface on which the one before it has settled. Returns the last round;
+    the solution's facts say how many there were and how far the last one moved the surface."""
     camera, mask = given.camera, given.mask
     padded = pad_lights(lights.direction, lights.strength, given.stack.scale)
     places = pad_places(lights.place, lights.lobe)

@@ -80,12 +80,8 @@ class OpenSources(NamedTuple):
 def open_sources(given: SolveInput, lights: ExtendedLights, padded: Lights, status: np.ndarray, found: Found,
                  view: View) -> OpenSources | None:
     """Find what the object does to its own light, or return None when it does nothing to any pixel.
-
-    Args:
-        padded: the lights, padded, with their irradiance.
-        status: [pixels] of kernels.status.
-        found: normals and materials of all pixels of the image.
-    """
+    `padded`: the lights, padded, with their irradiance. `status`: [pixels] of kernels.status. `found`: normals and materials of all
+    pixels of the image."""
     solved = (status == Status.OK).reshape(given.mask.shape)
     surface = integrate(given, np.ascontiguousarray(found.normal.T), solved, stage="surface")
     if surface is None:

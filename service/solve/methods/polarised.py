@@ -56,10 +56,7 @@ class Separated(NamedTuple):
 
 def separate_pairs(stack: Stack, capture: Capture, lights: DistantLights | PlacedLights, mask: np.ndarray) -> Separated:
     """Take the images of polarised pairs apart.
-
-    Raises:
-        ManifestError: the images of a pair are swapped, shifted, or not of the same light; names them.
-    """
+    Raises ManifestError: the images of a pair are swapped, shifted, or not of the same light; names them."""
     declared = capture.manifest.polarizer_leak
     leak, sources = declared or 0.0, capture.sources()
 

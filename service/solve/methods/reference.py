@@ -43,11 +43,8 @@ class ReferenceFit(NamedTuple):
 
 def solve_reference(samples: Samples, table: wp.array, view: np.ndarray) -> ReferenceFit:
     """Estimate the normals of sampled pixels, whose readings are in the units of the ball's; waits for the device.
-
-    Args:
-        table: [nodes, lights, 1] float32, the readings of the ball at each of response_table.nodes.
-        view: [n, 3] unit directions to the viewer.
-    """
+    `table`: [nodes, lights, 1] float32, the readings of the ball at each of response_table.nodes. `view`: [n, 3] unit directions to the
+    viewer."""
     model = bounded(table, samples)
     starts = find_modes(samples, model, view)
     near = [search_normals(samples, start, shape=Diffuse(), options=AROUND_OPTIONS, wide=AROUND[0], fine=AROUND[1:], table=table).normal

@@ -31,13 +31,8 @@ class ReferenceBall(NamedTuple):
 
     def pixel_of(self, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the position in the image at which the ball shows each normal, at least RIM_PX inside the outline.
-
-        Args:
-            normal: [n, 3] unit, camera frame.
-
-        Returns:
-            column and row, each [n] float64, in array elements: the centre of the first pixel is (0, 0).
-        """
+        `normal`: [n, 3] unit, camera frame. Returns column and row, each [n] float64, in array elements: the centre of the first pixel
+        is (0, 0)."""
         camera = self.capture.camera
         across = normal[:, :2] / np.maximum(np.linalg.norm(normal[:, :2], axis=1, keepdims=True), 1e-12)
         radius = np.minimum(np.linalg.norm(normal[:, :2], axis=1), 1 - RIM_PX / self.ball.radius_px)
@@ -49,12 +44,8 @@ class ReferenceBall(NamedTuple):
 
 def reference_ball(capture: Capture, reference: Capture) -> ReferenceBall:
     """Check that the capture of a reference ball fits the capture that is solved, and find the ball in it.
-
-    Raises:
-        ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is
-            perspective, or the reference has no mask.
-        CalibrationError: the mask shows no ball.
-    """
+    Raises ManifestError: an image has one pixel, the lights or their order differ, a light is a point light, a camera is perspective, or
+    the reference has no mask. Raises CalibrationError: the mask shows no ball."""
     where = reference.folder / FILE_NAME
     check_surface(capture)
     ours, theirs = capture.sources(), reference.sources()

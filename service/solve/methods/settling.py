@@ -172,12 +172,8 @@ class Settled(NamedTuple):
 
 def settle(light: DirectLight, normal: np.ndarray, shape: Diffuse, pick: Callable[[np.ndarray], Samples], *, relative: bool) -> Settled:
     """Find the light that an object throws on itself from the surface without it.
-
-    Args:
-        light: of the first search, with arriving light, as `normal` [3, pixels] is.
-        pick: gives the readings of a few pixels by their positions.
-        relative: whether the scale of the lights, and so of albedo, is unknown.
-    """
+    `light`: of the first search, with arriving light, as `normal` [3, pixels] is. `pick`: gives the readings of a few pixels by their
+    positions. `relative`: whether the scale of the lights, and so of albedo, is unknown."""
     assert light.arriving is not None
     solved = light.solved.numpy() > 0
     pixels = np.flatnonzero(solved)

@@ -39,11 +39,7 @@ class LeftOut(NamedTuple):
 
 def leave_out(samples: Samples, start: np.ndarray) -> LeftOut:
     """Predict the readings of each light from those of the others.
-
-    Args:
-        samples: some hundreds of pixels, spread over the object, under four lights or more.
-        start: [n, 3] unit normals to begin from.
-    """
+    `samples`: some hundreds of pixels, spread over the object, under four lights or more. `start`: [n, 3] unit normals to begin from."""
     lights = samples.light_count
     readings = host_values(samples, samples.grey).astype(np.float64)
     toward = np.stack([host_values(samples, samples.toward[axis]) for axis in range(3)], axis=-1).astype(np.float64)

@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from service.depth.stereo.row_offset import row_offsets
-from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast
+from service.depth.stereo.stereo_pair import WINDOW_REACH, bend, box_mean, contrast, row_offsets
 from stage.results.depth_maps import DepthMaps
 from tests.reference import projector as reference
 from tests.scenes.captures import edit_manifest

@@ -8,7 +8,7 @@ import pytest
 from service.errors import RequestError
 from service.requests.register import FuseRequest, RegisterRequest
 from service.scans.fusion.fuse import fuse
-from service.scans.fusion.point_sets import as_range_image
+from service.scans.fusion.prepared_scans import as_range_image
 from service.scans.points.planes import local_planes
 from service.scans.points.ply_points import read_ply_points
 from service.scans.read import read_scan

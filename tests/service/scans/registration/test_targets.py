@@ -9,7 +9,7 @@ from service.scans.points.rigid import applied, exponential, inverse, step_betwe
 from service.scans.points.scan import Scan, Target
 from service.scans.registration.pairs import Evidence, PairState
 from service.scans.registration.registration import Registration, RegistrationOptions, register
-from service.scans.registration.targets import TargetPose, pose_by_targets
+from service.scans.registration.target_pairs import TargetPose, pose_by_targets
 from tests.scenes.turntable import MM, View, figure, pose, see, vase
 from tests.service.scans.registration.test_registration import off, scan_of, seen
 

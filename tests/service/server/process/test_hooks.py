@@ -18,7 +18,6 @@ from service.server.api.hooks import send_test
 from service.server.api.problems import ApiError
 from service.server.base import outgoing
 from service.server.database import hooks, jobs
-from service.server.database.job_view import job_view
 from service.server.database.jobs import Claim
 from service.server.database.keys import Caller
 from service.server.process.hook_sender import LEASE_S, OF_PROJECT, PATIENCE_S, HookSender
@@ -105,7 +104,7 @@ def test_the_end_of_a_job_is_told_signed_and_with_its_view(site, receiver):
     assert site.database.transact(lambda connection: jobs.cancel(connection, cancelled))
     for _ in range(3):
         site.send()
-    views = {job: job_view(jobs.find(site.database, job)) for job in (done, failed, cancelled)}
+    views = {job: JobView.of(jobs.find(site.database, job)) for job in (done, failed, cancelled)}
     told = {each.event["data"]["id"]: each for each in receiver.received}
     assert {job: each.event["type"] for job, each in told.items()} == {
         done: "job.finished", failed: "job.failed", cancelled: "job.cancelled"}
