@@ -5,9 +5,10 @@ diffuse lobe, f_s the GGX lobe without Fresnel and s Schlick's rise; both are fi
 The roughness of least cost is taken from a grid and halved steps about its best.
 
 Highlights of dielectrics have the colour of the light, so the three channels share one F0, as low as that of dielectrics is, unless
-that costs clearly more and the surface is a metal, without diffuse reflection. Pixels that saw no highlight cannot tell F0 from
-roughness: they take the materials that the object's pixels share (`shared_materials`), in the mixture that explains them, wherever that
-explains them about as well as a material of their own.
+that costs clearly more. Then the surface is a metal, without diffuse reflection, or lies between both, as textures blend them: of base
+colour b and metalness m the albedo is (1 - m) b and F0 is (1 - m) F + m b, with F of the dielectric, which has as many unknowns as one F0
+beside an albedo. Pixels that saw no highlight cannot tell F0 from roughness: they take the materials that the object's pixels share
+(`shared_materials`), in the mixture that explains them, wherever that explains them about as well as a material of their own.
 
 A pixel of a dielectric whose F0 is far above those that the object's dielectrics share is searched again. For a narrow highlight, which few
 lights show, several roughnesses are local minima of the robust cost, and weights that begin with those of another roughness can take the
@@ -16,7 +17,7 @@ in roughness than in F0. The shared F0 is taken where it explains the pixel abou
 
 Sources: the BRDF is that of `kernels.microfacet` (Walter et al., EGSR 2007; Heitz, JCGT 2014; Schlick 1994; Burley 2012); non-negative
 least squares after Lawson and Hanson, "Solving Least Squares Problems", 1974, chapter 23; highlights of the light's colour after Shafer,
-"Using color to separate reflection components", Color Research and Application 1985.
+"Using color to separate reflection components", Color Research and Application 1985; base colour and metalness after Burley 2012.
 """
 
 from typing import NamedTuple
@@ -27,7 +28,7 @@ import warp as wp
 from kernels import device as devices
 from kernels.errors import ArrayError
 from kernels.packs import pack_type
-from kernels.photometric.material.material_kernel import GIVEN, GIVEN_F0, NEUTRAL, TINTED, material_kernel
+from kernels.photometric.material.material_kernel import GIVEN, GIVEN_F0, METALLIC, NEUTRAL, TINTED, material_kernel
 from kernels.photometric.model.chosen_samples import choose
 from kernels.photometric.model.lobes import direction_reflectance
 from kernels.photometric.model.response_table import COLUMNS
@@ -40,10 +41,15 @@ NEUTRAL_RISE = 1.25
 """Factor by which the cost may rise when the channels share one F0: on coloured metals it rises at least 1.3 fold and mostly several fold,
 on dielectrics hardly at all (95 % of their pixels below 1.1)."""
 BRIGHTEST_DIELECTRIC = 0.2
-"""Largest F0 of a dielectric: that of diamond is 0.17, and no coat is brighter, so that a surface with more is a metal."""
+"""Largest F0 of a dielectric: that of diamond is 0.17, and no coat is brighter, so that a surface with more is a metal, or partly one."""
 METAL_DIFFUSE = 0.25
 """Largest diffuse albedo of a metal, as a fraction of its F0. A metal has no diffuse reflection, but dirt and interreflection may look like
-this much; with more, a bright lobe replaces what the diffuse one misses, above all at the rim."""
+this much; with more, a bright lobe replaces what the diffuse one misses, above all at the rim. So a dielectric takes no shared metal
+beside a larger one."""
+USUAL_F0 = 0.04
+"""F0 of a dielectric whose object does not tell it: that of a refractive index of 1.5."""
+UNFIT = 1e6
+"""Cost of a material that a pixel cannot have."""
 MATT = np.array([0.0, 0.0, 0.0, 1.0], dtype=np.float32)
 """F0 and roughness of a surface whose readings do not say that it is anything but matt."""
 SHARED_RISE = 1.4
@@ -80,33 +86,49 @@ def fit_material(samples: Samples, normal: np.ndarray, *, shape: Diffuse, option
         normal: [n, 3] unit normals.
         options: noise and shadows, as in the search.
         table: of response_table, for lights that are not of one direction each; its diffuse lobe is Lambert's whatever the shape.
-        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials; None: every pixel has a material of its own.
+        shared: [materials, 4] F0 and roughness of shared_materials.choose_materials, not beside a table; None: every pixel has a
+            material of its own.
     """
     tinted = _fit(samples, normal, shape, options, table, TINTED)
     bound = BRIGHTEST_DIELECTRIC if table is None else 1.0  # extended lights show the whole lobe, so that F0 needs no bound
     neutral = _fit(samples, normal, shape, options, table, NEUTRAL, np.full(4, bound))
-    metal = neutral.cost > NEUTRAL_RISE * tinted.cost + COST_FLOOR
-    if table is None:
-        metal &= tinted.diffuse_albedo.mean(axis=1) < METAL_DIFFUSE * tinted.specular.mean(axis=1)
+    explained = neutral.cost <= NEUTRAL_RISE * tinted.cost + COST_FLOOR
+    if table is not None:
+        return _where(explained, neutral, tinted)
+    metal = ~explained & (tinted.diffuse_albedo.mean(axis=1) < METAL_DIFFUSE * tinted.specular.mean(axis=1))
     own = _where(metal, tinted, neutral)
+    tried = ~explained
+    if shared is not None and not is_dielectric(shared).all():
+        tried |= neutral.specular[:, 0] >= bound  # beside metals, a pixel on the bound lies beyond it
+    metal |= _fit_metallic(samples, normal, own, tinted, tried, usual_f0(shared), shape=shape)
     if shared is None or not len(shared):
         return own
-    blend = _blend([fit_given(samples, normal, material, shape=shape) for material in shared])
-    explained = explains(blend, own)
-    found = _where(explained, blend, own)
+    fits = [fit_given(samples, normal, material, shape=shape) for material in shared]
+    for fit, dielectric in zip(fits, is_dielectric(shared), strict=True):
+        if not dielectric:
+            fit.cost[explained & (fit.diffuse_albedo.mean(axis=1) > METAL_DIFFUSE * fit.specular.mean(axis=1))] = UNFIT
+    blend = _blend(fits)
+    alike = explains(blend, own)
+    found = _where(alike, blend, own)
     common = np.unique(shared[is_dielectric(shared), 0])
     if not len(common):
         return found
-    doubtful = np.flatnonzero(~explained & ~metal & outlying(own.specular, common))
+    doubtful = np.flatnonzero(~alike & ~metal & outlying(own.specular, common))
     if not len(doubtful):
         return found
     few, there = choose(samples, doubtful), normal[doubtful]
     cold = _fit(few, there, shape, options, None, NEUTRAL, np.full(4, BRIGHTEST_DIELECTRIC), anew=True)
     one_f0 = [fit_given_f0(few, there, f0, shape=shape) for f0 in common]
     again = _reconcile(_pick(own, doubtful), cold, one_f0, _pick(blend, doubtful), common)
-    for plane, better in zip(found, again, strict=True):
-        plane[doubtful] = better
+    _put(found, doubtful, again)
     return found
+
+
+def usual_f0(shared: np.ndarray | None) -> float:
+    """Return F0 of the dielectric that explains most of the object: the first of [materials, 4] shared ones."""
+    if shared is None or not len(known := shared[is_dielectric(shared) & (shared[:, 0] > 0), 0]):
+        return USUAL_F0
+    return float(known[0])
 
 
 def outlying(specular: np.ndarray, common: np.ndarray) -> np.ndarray:
@@ -160,6 +182,25 @@ def _fit(samples: Samples, normal: np.ndarray, shape: Diffuse, options: SearchOp
                     values[:, 7] / samples.light_count)
 
 
+def _fit_metallic(samples: Samples, normal: np.ndarray, own: Material, tinted: Material, tried: np.ndarray, f0: float, *,
+                  shape: Diffuse) -> np.ndarray:
+    """Replace the materials in `own` of pixels between dielectric and metal, and return which they are.
+
+    Args:
+        own: what a dielectric or a metal makes of every pixel.
+        tinted: what an F0 of each channel beside any albedo makes of it.
+        tried: [n] bool.
+        f0: of the dielectric.
+    """
+    at = np.flatnonzero(tried)
+    if len(at):
+        found = _fit(choose(samples, at), normal[at], shape, None, None, METALLIC, np.full(4, f0))
+        better = (found.cost < own.cost[at]) & (found.cost <= NEUTRAL_RISE * tinted.cost[at] + COST_FLOOR)
+        at = at[better]
+        _put(own, at, _pick(found, np.flatnonzero(better)))
+    return np.isin(np.arange(len(tried)), at)
+
+
 def _reconcile(own: Material, cold: Material, one_f0: list[Material], blend: Material, common: np.ndarray) -> Material:
     """Return the materials of dielectric pixels whose own F0 is far above the `common` ones.
 
@@ -171,6 +212,12 @@ def _reconcile(own: Material, cold: Material, one_f0: list[Material], blend: Mat
         best = _where(other.cost < best.cost, other, best)
     found = _where(outlying(own.specular, common) & explains(best, own), best, own)
     return _where(explains(blend, own), blend, found)
+
+
+def _put(material: Material, positions: np.ndarray, values: Material) -> None:
+    """Replace the material of some pixels."""
+    for plane, replaced in zip(material, values, strict=True):
+        plane[positions] = replaced
 
 
 def _pick(material: Material, positions: np.ndarray) -> Material:

@@ -34,6 +34,11 @@ GIVEN = wp.constant(2)
 """Fit mode in which F0 and roughness are given and the albedo alone is fitted."""
 GIVEN_F0 = wp.constant(3)
 """Fit mode with free roughness and an F0 that is given."""
+METALLIC = wp.constant(4)
+"""Fit mode with free roughness, a base colour and how metallic the surface is: of base colour b and metalness m the albedo is (1 - m) b and
+F0 (1 - m) F + m b, with the given F0 F of a dielectric."""
+METALNESS_COUNT, METALNESS_HALVINGS = 9, 4
+"""Number of values of metalness that are tried from 0 to 1, and of times that their step is halved about the best: to 0.008."""
 
 
 @wp.func
@@ -54,6 +59,38 @@ def common_weight(dd: float, ds: wp.vec3, ss: wp.vec3, rd: wp.vec3, rs: wp.vec3,
             whole += ss[c]
         common = wp.where(bottom > 1.0e-6 * whole, wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, most), 0.0)
     return common
+
+
+@wp.func
+def metallic_base(m: float, f: float, closest: float, dd: float, ds: float, ss: float, rd: float, rs: float):
+    """Return the base colour of one channel at metalness m, 0…1, and what the squared misfit is beside that of f = 0 and no base.
+
+    Args: f of the dielectric; closest is the albedo of the Lambertian lobe for a diffuse weight of one; sums as in `common_weight`.
+    """
+    diffuse, dielectric = (1.0 - m) / wp.max(closest, 1.0e-3), (1.0 - m) * f
+    top = diffuse * rd + m * rs - dielectric * (diffuse * ds + m * ss)
+    bottom = diffuse * diffuse * dd + 2.0 * diffuse * m * ds + m * m * ss
+    base = wp.clamp(top / wp.max(bottom, 1.0e-20), 0.0, 1.0)
+    return base, dielectric * (dielectric * ss - 2.0 * rs) + base * (base * bottom - 2.0 * top)
+
+
+@wp.func
+def metalness(f: float, closest: float, dd: float, ds: float, ss: float, rd: wp.vec3, rs: wp.vec3) -> float:
+    """Return the metalness, 0…1, that three channels share beside a base colour of each."""
+    best, least, middle = float(0.0), float(1.0e30), float(0.5)
+    step = float(1.0 / (float(METALNESS_COUNT) - 1.0))
+    for trial in range(METALNESS_COUNT + 2 * METALNESS_HALVINGS):
+        late = trial - METALNESS_COUNT
+        if late >= 0 and late % 2 == 0:
+            step, middle = step * 0.5, best
+        m = wp.where(late < 0, step * float(trial), wp.clamp(middle + wp.where(late % 2 == 0, step, -step), 0.0, 1.0))
+        total = float(0.0)
+        for c in range(3):
+            _, misfit = metallic_base(m, f, closest, dd, ds, ss, rd[c], rs[c])
+            total += misfit
+        if total < least:
+            best, least = m, total
+    return best
 
 
 @once
@@ -82,6 +119,7 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
         nx, ny, nz = vector_at(normal, p)
         prepare(samples, table, criteria.form, nx, ny, nz, p, scratch)
         write_weights(samples, criteria.noise, p, held, scratch)
+        closest = lambertian(samples, criteria.form, nx, ny, nz, p)
         best_cost, best_rough = lane_type(1.0e30), lane_type()
         best_rho, best_f0 = channels(), channels()
         rho, f0 = channels(), channels()
@@ -166,7 +204,15 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                             alone_b = wp.where(gain_a >= gain_b, 0.0, only_b)
                             rho[c, k] = wp.where(both == 1, wp.where(full == 1, rest, a), alone_a)
                             f0[c, k] = wp.where(both == 1, wp.min(b, 1.0), alone_b)
-                if turn < rounds and freedom != TINTED:
+                if turn < rounds and freedom == METALLIC:
+                    for k in range(lanes):
+                        m = metalness(known[0], closest[k], dd[k], ds[k], ss[k], wp.vec3(rd[0, k], rd[1, k], rd[2, k]),
+                                      wp.vec3(rs[0, k], rs[1, k], rs[2, k]))
+                        for c in range(3):
+                            base, _ = metallic_base(m, known[0], closest[k], dd[k], ds[k], ss[k], rd[c, k], rs[c, k])
+                            rho[c, k] = (1.0 - m) * base / wp.max(closest[k], 1.0e-3)
+                            f0[c, k] = (1.0 - m) * known[0] + m * base
+                if turn < rounds and freedom != TINTED and freedom != METALLIC:
                     for k in range(lanes):
                         common = float(0.0)
                         if freedom == NEUTRAL:
@@ -185,7 +231,6 @@ def material_kernel(lanes: int, reflectance: Reflectance, bare: bool) -> Any:
                 for c in range(3):
                     best_rho[c, k] = wp.where(better, rho[c, k], best_rho[c, k])
                     best_f0[c, k] = wp.where(better, f0[c, k], best_f0[c, k])
-        closest = lambertian(samples, criteria.form, nx, ny, nz, p)
         for c in range(3):
             out = lane_type()
             for k in range(lanes):
