@@ -26,6 +26,7 @@ def pixels(page, source: str) -> np.ndarray:
 
 def picture(page) -> np.ndarray:
     """What is shown of a square capture, [rows, cols, 3], 0 to 1."""
+    page.wait_for_function("() => globalThis.relit !== undefined")  # a moment after the canvas is ready
     found = pixels(page, "relit.pixels()")
     side = round(len(found) ** 0.5)
     return (found.reshape(side, side, 4)[..., :3] / 255).astype(np.float64)
