@@ -83,8 +83,7 @@ def test_inspections_of_regions_are_studied_and_boards_that_cannot_be_are_refuse
     inspected = client.get(f"/v1/jobs/{runs[0]}/results/report.json").json()
     assert [region["name"] for region in inspected["regions"]] == ["left", "right"]
     assert all(abs(region["deviation_m"]) < 1e-6 for region in inspected["regions"])  # board.exr has floats, of heights of 0.1 m
-    job = submit(client, kind="gauge-board", study=study(*runs))
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="gauge-board", study=study(*runs)))
     assert made_by(client, job) == {"gauge.csv", "report.json"}
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert (report["study"]["parts"], report["study"]["trials"], report["inputs"]["name"]) == (2, 2, "pads")
@@ -124,8 +123,7 @@ BOARD = {"board": "9x6", "square_m": 0.03}
 def test_a_board_calibrates_cameras_as_the_command_does(server, client, tmp_path):
     folder = write_board(tmp_path / "board", 4)
     identifier = sent(server, client, folder)
-    job = submit(client, kind="calibrate-stereo", capture=identifier, options=BOARD)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="calibrate-stereo", capture=identifier, options=BOARD))
     assert made_by(client, job) == {"calibration.json", f"{identifier}.capture.json"}
     stereo(StereoRequest(capture=folder, **BOARD))
     found = client.get(f"/v1/jobs/{job['id']}/results/{identifier}.capture.json").json()
@@ -146,8 +144,7 @@ def test_depth_of_two_cameras(server, client, tmp_path):
     rng = np.random.default_rng(0)
     pair = [[scenes.recorded(scenes.render(parts, texture, *camera, side=2).images[0], rng)] for camera in ((), (scenes.OTHER, POSE))]
     identifier = sent(server, client, scenes.write_pair(tmp_path / "pair", *pair))
-    job = submit(client, kind="depth", capture=identifier)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="depth", capture=identifier))
     assert {"depth.exr", "points.ply", "report.json"} <= made_by(client, job)
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert report["method"] == "stereo" and report["pixels"]["ok"] > 0.8 * report["pixels"]["mask"]
@@ -157,8 +154,7 @@ def test_depth_of_two_cameras(server, client, tmp_path):
 def test_depth_beside_a_second_camera_under_one_projector(server, client, tmp_path):
     truth = two_captures(tmp_path)
     first, second = (sent(server, client, tmp_path / name) for name in ("first", "second"))
-    job = submit(client, kind="depth", capture=first, beside=second)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="depth", capture=first, beside=second))
     (tmp_path / "depth.exr").write_bytes(client.get(f"/v1/jobs/{job['id']}/results/depth.exr").raise_for_status().content)
     found = DepthMaps.read(tmp_path / "depth.exr")
     assert np.median(np.abs(found.depth - truth.depth)[found.mask]) < 1e-3  # metres, as of the command

@@ -98,8 +98,7 @@ def test_results_are_those_of_the_command(server, client, sensor, uploaded, tmp_
     here = Path(shutil.copytree(sensor, tmp_path / "cap"))
     given = {name: tuple(here / each for each in value) for name, value in fields.items() if name != "options"} | fields.get("options", {})
     product(model(capture=here, **given, **({"write": True} if kind == "saturation" else {})))
-    job = submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind=f"calibrate-{kind}", capture=uploaded, **fields))
     compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", made) if name}, {here: uploaded})
 
 
@@ -110,8 +109,7 @@ def test_the_colours_of_a_chart(server, client, tmp_path):
         f"{row['name']},{r},{g},{b}" for row, (r, g, b) in zip(table(), reflectances(), strict=True)))
     uploaded = sent(server, client, here)
     calibrate_chart(ChartRequest(capture=here, reflectances=here / "chart.csv"))
-    job = submit(client, kind="calibrate-chart", capture=uploaded, reflectances="chart.csv")
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="calibrate-chart", capture=uploaded, reflectances="chart.csv"))
     compare(client, job, here, {name: name for name in ("capture.json", "calibration.json", "chart.png")}, {here: uploaded})
 
 
@@ -120,8 +118,7 @@ def test_the_time_of_flight_of_a_sweep(server, client, tmp_path):
     steps = [(f"d{k}", depth, 0.05 + 0.01 * depth, None) for k, depth in enumerate((1.0, 8.0))]
     path = sweep(tmp_path / "sweep", steps, lambda view: pulsed_frames(tof.histogram(view, 1e6, seed=0)))
     calibrate_tof(requests.TofCalibrationRequest(sweep=path, out=tmp_path / "camera.json", device="cpu"))
-    job = submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent))
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="calibrate-tof", capture=sent(server, client, path.parent)))
     compare(client, job, tmp_path, {"tof.json": "camera.json"}, {})
 
 
@@ -176,8 +173,7 @@ def test_the_planes_of_a_laser(server, client, tmp_path):
     folders = laser_boards(tmp_path)
     ids = [sent(server, client, folder) for folder in folders]
     board = {"board": "x".join(map(str, boards.BOARD)), "square_m": boards.SQUARE}
-    job = submit(client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="calibrate-laser-planes", captures=ids[:3], apply_to=ids[3:], options=board))
     laser_planes(requests.LaserPlanesRequest(captures=tuple(folders[:3]), apply_to=tuple(folders[3:]), device="cpu", **board))
     report = calibrated(client, job, ids, folders)["laser-planes"]
     assert [board["capture"] for board in report["boards"]] == ids[:3]
@@ -217,8 +213,7 @@ def test_images_or_a_ball_that_are_not_there(server, client, uploaded, dome):
 
 @pytest.mark.long
 def test_the_brightness_of_lights(server, client, dome):
-    job = submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="calibrate-intensity", capture=dome, options={"pixels": 100}))
     assert made_by(client, job) == {"capture.json", "calibration.json"}
     measured = client.get(f"/v1/jobs/{job['id']}/results/calibration.json").json()["intensity"]
     assert len(measured["lights"]) == len(client.get(f"/v1/jobs/{job['id']}/results/capture.json").json()["frames"])

@@ -31,8 +31,7 @@ def test_a_solve_and_an_export_that_brings_lights_along(server, client, dome, so
     assert made_by(client, job) == {"maps.exr", "report.json"}
     report = client.get(f"/v1/jobs/{solved}/results/report.json").raise_for_status().json()
     assert report["method"] == "lambert"
-    exported = submit(client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky)
-    finish(server, client, exported)
+    exported = finish(server, client, submit(client, kind="export", maps=solved, format="usdz", rig=dome, environment=sky))
     lights = {"asset_lights/rig.usda", "asset_lights/environment.usda", "asset_lights/environment.exr"}
     assert made_by(client, exported) == {"asset.usdz", *lights}
     rig = client.get(f"/v1/jobs/{exported['id']}/results/asset_lights/rig.usda").raise_for_status()
@@ -45,15 +44,13 @@ def test_a_depth_and_views_of_it_of_maps_and_of_a_capture_alone(server, client, 
     assert (job["request"]["name"], job["request"]["options"]["max_residual_px"]) == ("the rig", 2.5)
     finish(server, client, job)
     assert made_by(client, job) == {"depth.exr", "points.ply", "report.json"}
-    exported = submit(client, kind="export", maps=job["id"], format="usdc", options={"geometry": "points"})
-    finish(server, client, exported)
+    exported = finish(server, client, submit(client, kind="export", maps=job["id"], format="usdc", options={"geometry": "points"}))
     layers = {f"asset_layers/{name}" for name in ("payload.usda", "geometry.usdc", "materials.usda")}
     assert made_by(client, exported) == {"asset.usdc", *layers, "asset_textures/base_color.png"}
     shown = {}
     for name, request in {"maps": {"capture": dome, "maps": solved, "options": {"terms": 4}},
                           "depth": {"capture": rig, "maps": job["id"]}, "capture": {"capture": dome}}.items():
-        view = submit(client, kind="view", **request)
-        finish(server, client, view)
+        view = finish(server, client, submit(client, kind="view", **request))
         lit = set() if name == "depth" else {"card_lights.jpg"}
         assert made_by(client, view) == {"view.json", "view.bin", "thumbnails.jpg", "card.jpg"} | lit
         results = f"/v1/jobs/{view['id']}/results"
@@ -115,8 +112,7 @@ def test_jobs_are_listed_a_page_at_a_time_the_newest_first(client, solved):
 @pytest.mark.long
 def test_what_a_job_reads_has_to_be_there_and_ready(server, client, dome, sky, solved, rig):
     receiving = client.post("/v1/captures", json={"name": "to come"}).raise_for_status().json()["id"]
-    waiting = submit(client, kind="depth", capture=rig)
-    finish(server, client, waiting)
+    waiting = finish(server, client, submit(client, kind="depth", capture=rig))
     nowhere, nothing = new_id("cap"), new_id("env")
 
     def ask(**request) -> httpx2.Response:

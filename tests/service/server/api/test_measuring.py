@@ -42,22 +42,19 @@ def scan_files(shots: int = 90) -> dict[str, bytes]:
 @pytest.mark.long
 @pytest.mark.parametrize(("options", "file"), [({}, "basis.exr"), ({"basis": "hsh", "count": 4}, "basis.rti")])
 def test_a_basis(server, client, dome, options, file):
-    job = submit(client, kind="basis", capture=dome, options=options)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="basis", capture=dome, options=options))
     assert made_by(client, job) == {file, f"{file}.json"}
 
 
 @pytest.mark.long
 def test_a_separation_and_a_scan(server, client, rig):
-    job = submit(client, kind="separate", capture=rig, options={"period_px": 16})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="separate", capture=rig, options={"period_px": 16}))
     assert made_by(client, job) == {"separation.exr", "report.json"}
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert report["options"]["period_px"] == 16 and str(server.data) not in json.dumps(report)
     capture = upload(server, client, scan_files())
     assert capture["facts"]["shots"] == 90
-    job = submit(client, kind="scan", capture=capture["id"], options={"near_m": 1})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="scan", capture=capture["id"], options={"near_m": 1}))
     assert made_by(client, job) >= {"points.ply", "points.usdc", "report.json"}
     assert client.get(f"/v1/jobs/{job['id']}/results/report.json").json()["shots"]["points"] == 90
     solve = submit(client, kind="solve", capture=capture["id"])
@@ -79,8 +76,7 @@ def test_scans_that_cannot_be(server, client, registered):
 
 
 def test_patterns_are_those_of_the_command(server, client, tmp_path):
-    job = submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "inverses": False})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="patterns", options={"code": "gray", "projector": [64, 40], "inverses": False}))
     make_patterns(PatternsRequest(code="gray", projector=(64, 40), inverses=False, out=tmp_path))
     assert made_by(client, job) == {path.name for path in tmp_path.iterdir()}
     for path in tmp_path.glob("*.png"):
@@ -112,8 +108,7 @@ def test_a_job_writes_the_cues_that_the_command_line_writes(server, client, regi
     write_exr(registered / "noise.exr", radiance)
     sky = admitted(server, client, registered / "noise.exr", kind="environments")["id"]
     options = {"frames": "5-7", "spin_degrees": 90.0}
-    job = submit(client, kind="drive", rig=lamps, environment=sky, options=options)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="drive", rig=lamps, environment=sky, options=options))
     assert made_by(client, job) == {"cues.csv", "cues.json", "preview.png", "report.json", "rig.json"}
 
     def result(name: str) -> bytes:
@@ -156,8 +151,7 @@ def test_a_chart_and_a_capture_come_with_a_job(server, client, relit, tmp_path):
 
 @pytest.mark.long
 def test_light_keys_drive_a_rig_alone_and_lie_beside_its_cues(server, client, lamps):
-    job = submit(client, kind="drive", rig=lamps, keys=SUN)
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="drive", rig=lamps, keys=SUN))
     assert "keys.json" in made_by(client, job)
     frame, = client.get(f"/v1/jobs/{job['id']}/results/cues.json").raise_for_status().json()["frames"]
     assert sum(frame["levels"]) == pytest.approx(3 * 0.05, abs=1e-3)  # .2 of 4; each level is off by half a step at most

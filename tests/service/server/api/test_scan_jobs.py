@@ -65,8 +65,7 @@ def test_depths_are_placed_and_named_by_their_jobs(client, server, depths, regis
 
 
 def test_registered_depths_become_one_mesh(client, server, depths, registered):
-    job = submit(client, kind="fuse", registered=registered, options={"texture_px": 128, "texture_faces": 1000})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="fuse", registered=registered, options={"texture_px": 128, "texture_faces": 1000}))
     assert made_by(client, job) >= {"mesh.ply", "asset.usdc", "report.json"}
     report = client.get(f"/v1/jobs/{job['id']}/results/report.json").json()
     assert [scan["name"] for scan in report["scans"]] == depths and all(scan["fused"] for scan in report["scans"])
@@ -97,14 +96,12 @@ def view(server, tmp_path_factory) -> dict[str, str]:
 
 
 def test_the_joined_maps_lie_where_the_depth_is_and_are_exported(server, client, view, tmp_path):
-    job = submit(client, kind="join", maps=view["lights"], depth=view["patterns"])
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="join", maps=view["lights"], depth=view["patterns"]))
     assert made_by(client, job) == {"maps.exr", "report.json"}
     (tmp_path / "maps.exr").write_bytes(client.get(f"/v1/jobs/{job['id']}/results/maps.exr").raise_for_status().content)
     found = SurfaceMaps.read(tmp_path / "maps.exr")
     assert found.height is not None and abs(np.median(found.height[found.mask]) + 0.5) < 0.02  # where the depth is, not the solve
-    asset = submit(client, kind="export", maps=job["id"], format="glb")
-    finish(server, client, asset)
+    asset = finish(server, client, submit(client, kind="export", maps=job["id"], format="glb"))
     assert "asset.glb" in made_by(client, asset)
 
 

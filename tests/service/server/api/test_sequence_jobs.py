@@ -51,8 +51,7 @@ def test_every_step_is_solved_and_joined(server, client, sequence, solved):
 
 
 def test_the_results_become_one_asset_with_time_samples(server, client, solved, tmp_path):
-    job = submit(client, kind="export", maps=solved, format="usdc")
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="export", maps=solved, format="usdc"))
     asset = tmp_path / "asset.usdc"
     asset.write_bytes(client.get(f"/v1/jobs/{job['id']}/results/asset.usdc").raise_for_status().content)
     stage = Usd.Stage.Open(str(asset))
@@ -67,12 +66,10 @@ def test_one_step_is_looked_at(server, client, sequence, solved, dome):
     def ask(**request):
         return client.post("/v1/jobs", json={"kind": "view", "capture": sequence, **request})
 
-    view = submit(client, kind="view", capture=sequence, maps=solved, step=2)
-    finish(server, client, view)
+    view = finish(server, client, submit(client, kind="view", capture=sequence, maps=solved, step=2))
     shown = client.get(f"/v1/jobs/{view['id']}/results/view.json").json()
     assert shown["name"] == "step01" and "normal" in {layer["name"] for layer in shown["layers"]}
-    alone = submit(client, kind="view", capture=sequence, step=3)
-    finish(server, client, alone)
+    alone = finish(server, client, submit(client, kind="view", capture=sequence, step=3))
     assert client.get(f"/v1/jobs/{alone['id']}/results/view.json").json()["name"] == "step02"
     for unfit in ({}, {"step": 4}):
         refused(ask(**unfit), 422, f"{sequence} is a sequence of 3 captures: give the number of one, 1")
@@ -97,8 +94,7 @@ def test_a_depth_of_a_sequence(server, client, tmp_path):
     for step in range(2):
         depths.write_patterns(tmp_path / f"s{step}", depths.make_scene(sphere=False), patterns, noise=0.01, seed=step)
     found = upload(server, client, files_of(tmp_path))
-    job = submit(client, kind="depth", capture=found["id"], sequence={"frame_rate": 12.5})
-    finish(server, client, job)
+    job = finish(server, client, submit(client, kind="depth", capture=found["id"], sequence={"frame_rate": 12.5}))
     made = made_by(client, job)
     assert made == {"sequence.json", "report.json", *results_of("s0", "depth.exr", "points.ply", "report.json"),
                     *results_of("s1", "depth.exr", "points.ply", "report.json")}
