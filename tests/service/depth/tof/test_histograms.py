@@ -1,4 +1,4 @@
-"""What nobody declared about photon histograms: pile-up, units of the counts, tails of the pulse, the camera's own light."""
+"""What nobody declared about photon histograms: pile-up, units and ceiling of the counts, tails of the pulse, the camera's own light."""
 
 import json
 
@@ -7,6 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from service.depth.depth import depth
+from service.depth.tof.histograms import full_count
 from service.requests.depth import DepthRequest, TofOptions
 from tests.reference import tof
 
@@ -166,3 +167,20 @@ def test_rows_that_disagree_in_turn_are_unsure(tmp_path):
     assert any("every second row" in sentence for sentence in result.warnings)
     assert result.maps.mask[2:-2, 1:15].mean() < 0.1
     assert result.maps.mask[:, 17:].mean() > 0.95
+
+
+RANDOM = np.random.default_rng(4)
+PLACES = RANDOM.uniform(12, 50, (700, 1))
+PULSES = np.exp(-0.5 * ((np.arange(64) - PLACES) / 1.5) ** 2)
+COUNTS = RANDOM.poisson(260 * RANDOM.uniform(0.1, 1.5, (700, 1)) * PULSES + 2).astype(np.float32)
+
+
+@pytest.mark.parametrize("counts", [COUNTS, COUNTS / COUNTS.max(axis=1, keepdims=True), np.minimum(COUNTS, 12)],
+                         ids=["photons", "each over its largest", "few"])
+def test_photons_show_no_ceiling(counts):
+    assert full_count(counts) is None
+
+
+@pytest.mark.parametrize("ceiling", [255, 150])
+def test_a_ceiling_is_found(ceiling):
+    assert full_count(np.minimum(COUNTS, ceiling)) == ceiling
