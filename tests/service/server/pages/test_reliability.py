@@ -16,8 +16,8 @@ from tests.service.server_process import Server, serving
 
 pytestmark = pytest.mark.long
 
-STEPS = 60
-STARTS = (19, 41)
+STEPS = 100
+STARTS = (31, 67)
 """Steps at which the server is killed and started again: starting takes seconds, so that chance does not choose them."""
 MOST_TABS = 3
 """Tabs that stay open: a browser gives a server six connections, and each tab that watches jobs holds one."""
