@@ -142,10 +142,14 @@ def _placed(corners: np.ndarray, chart: ChartReference, reference: np.ndarray, m
 
 def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipped: np.ndarray) -> _Placed:
     """Return the chart where most of its patches have its colours, of all places that are proposed.
-    Raises CalibrationError if there is none; says what is wrong with the first."""
+    Raises CalibrationError if there is none; says what is wrong with the first within the picture."""
     faults: list[CalibrationError] = []
     best: _Placed | None = None
     for corners in find_charts(mean, len(chart.names)):
+        try:
+            place_patches(chart.names, chart.grid, corners, mean.shape[1::-1])
+        except CalibrationError:
+            continue  # is no place within the picture
         try:
             found = _placed(corners, chart, reference, mean, clipped)
         except CalibrationError as error:
@@ -155,7 +159,8 @@ def _found(chart: ChartReference, reference: np.ndarray, mean: np.ndarray, clipp
         if best.agreeing >= SURE * len(chart.names):
             break
     if best is None:
-        raise faults[0]
+        raise faults[0] if faults else CalibrationError("no chart is found in the picture: give the centres of its corner patches as "
+                                                        "--corners")
     if best.agreeing < LEAST * len(chart.names):
         raise CalibrationError(f"{best.agreeing} of {len(chart.names)} patches of what looks like the chart have its colours: give the "
                                "centres of its corner patches as --corners, or cover other patches beside it")

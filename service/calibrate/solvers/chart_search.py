@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 
 from service.calibrate.solvers.chart_reference import GRIDS
-from stage.errors import CalibrationError
 
 KINDS = {24: cv2.mcc.MCC24, 140: cv2.mcc.SG140}
 ALIKE = 0.2
 """Parts of the size of a chart by which corners differ that are cut once."""
 CUTS = (0.5, 0.25, 0.75)
-"""Where across a found chart the picture is cut off to look for another: parts of the way from edge to edge."""
+"""Where across a found chart, and across the picture, it is cut off to look for another: parts of the way from edge to edge."""
 MOST_CHARTS = 3
 """The most charts that are proposed in one picture."""
 LONGEST = 1600
@@ -39,10 +38,10 @@ def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
     """Yield the centres of the corner patches of what may be the chart in a picture, the likeliest first.
 
     The detector takes patches that lie beside a chart in the same spacing, as those of the other page of an open Passport, for some of
-    its own. So what it finds is followed by what it finds where the picture is cut off across each of these.
+    its own, or finds none for them. So what it finds is followed by what it finds where the picture is cut off across each of these, and
+    across the picture itself.
     `picture`: [rows, cols, 3] float32, scene-linear. Yields [4, 2] float64 pixels (u, v), the centre of the first being (0.5, 0.5): the
-    first patch, the last of the first row, the last of the chart, the first of the last row, as OpenCV takes the chart to stand. Raises
-    CalibrationError if nothing is found."""
+    first patch, the last of the first row, the last of the chart, the first of the last row, as OpenCV takes the chart to stand."""
     step = max(picture.shape[:2]) / LONGEST
     small = cv2.resize(picture, None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA) if step > 1 else picture
     brightest = small.max(axis=-1)
@@ -54,15 +53,15 @@ def find_charts(picture: np.ndarray, patches: int) -> Iterator[np.ndarray]:
             if all(np.abs(corners - other).max() > ALIKE * np.ptp(corners, axis=0).max() for _, other in found):
                 found.append((shown, corners))
             yield (corners + 0.5) * max(step, 1.0)
-    if not found:
-        raise CalibrationError("no chart is found in the picture: give the centres of its corner patches as --corners")
-    for shown, corners in found:
+    rows, cols = brightest.shape
+    whole = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], np.float64)
+    for shown, corners in [*found, *((shown, whole) for shown in pictures)]:
         for ends in np.mean([corners, np.roll(corners, -1, axis=0)], axis=0).astype(np.float32)[[[0, 2], [2, 0], [1, 3], [3, 1]]]:
-            (u, v), (rows, cols) = ends[1] - ends[0], np.indices(shown.shape[:2])
-            along = ((cols - ends[0, 0]) * u + (rows - ends[0, 1]) * v) / (u * u + v * v)
+            (u, v), (y, x) = ends[1] - ends[0], np.indices(shown.shape[:2])
+            along = ((x - ends[0, 0]) * u + (y - ends[0, 1]) * v) / (u * u + v * v)
             for share in CUTS:
                 for part in _detected(np.where((along > share)[..., None], np.uint8(0), shown), patches):
-                    yield (part + 0.5) * max(step, 1.0)
+                            yield (part + 0.5) * max(step, 1.0)
 
 
 def _detected(shown: np.ndarray, patches: int) -> Iterator[np.ndarray]:
