@@ -69,11 +69,15 @@ def _detected(shown: np.ndarray, patches: int) -> Iterator[np.ndarray]:
     detector = cv2.mcc.CCheckerDetector.create()
     detector.setUseDnnModel(False)
     detector.setColorChartType(KINDS[patches])
-    if detector.process(shown, MOST_CHARTS):
-        columns = GRIDS[patches][0]
-        for chart in sorted(detector.getListColorChecker(), key=lambda each: each.getCost()):
-            centres = np.array(chart.getColorCharts(), np.float64).reshape(-1, 4, 2).mean(axis=1)
-            yield centres[[0, columns - 1, patches - 1, patches - columns]]
+    try:
+        if not detector.process(shown, MOST_CHARTS):
+            return
+    except cv2.error:  # of some pictures it takes parts that lie outside of them
+        return
+    columns = GRIDS[patches][0]
+    for chart in sorted(detector.getListColorChecker(), key=lambda each: each.getCost()):
+        centres = np.array(chart.getColorCharts(), np.float64).reshape(-1, 4, 2).mean(axis=1)
+        yield centres[[0, columns - 1, patches - 1, patches - columns]]
 
 
 def refine_corners(picture: np.ndarray, corners: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
