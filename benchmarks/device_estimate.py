@@ -145,18 +145,6 @@ def timed_launches() -> Iterator[Taken]:
         yield taken
 
 
-def count_graphs_once() -> None:
-    """Count the launches of a graph as one, for the rest of the process; the emulated device has no graphs."""
-    plain = devices.Repeated.run
-
-    def run(repeated: devices.Repeated) -> None:
-        before = emulated_device.counts["launches"]
-        plain(repeated)
-        emulated_device.counts["launches"] = before + 1
-
-    patch.object(devices.Repeated, "run", run).start()
-
-
 def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int | None = FEW_PATCHES) -> dict[str, float]:
     """Return what one small scene asks of the emulated device, or the processor seconds of kernels and host on the CPU.
     `patches`: of bounced light; None: as many of them and of blocks as the product takes."""
@@ -170,7 +158,6 @@ def measure(work: Work, side: int, frames: int, *, counted: bool, patches: int |
         run = work.run(frames)
         if counted:
             emulated_device.install()
-            count_graphs_once()
             shrink_limits(side * side / PIXELS)
             before = emulated_device.counts.copy()
             run(folder, folder / "out", emulated_device.NAME, device_ways.Counting())

@@ -1,6 +1,7 @@
 """Write docs/figures.md: every figure in it is measured here. A section whose data is not at hand keeps what it said before.
 
-    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--relighting DIR] [--rig DIR] [--large DIR] [--megapixels N] [--only NAME ...]
+    python -m benchmarks.figures [--data DIR] [--glossy DIR] [--relighting DIR] [--rig DIR] [--large DIR] [--before DIR]
+                                 [--megapixels N] [--only NAME ...]
 """
 
 import argparse
@@ -19,12 +20,15 @@ import numpy as np
 
 from benchmarks.ablation import ablation_table
 from benchmarks.accuracy import SolveError, compare, diligent_errors, read_truth, sample_errors
+from benchmarks.device_asked import asked_rows
 from benchmarks.device_estimate import estimate_rows
+from benchmarks.device_registers import register_rows
 from benchmarks.fresnel import fresnel_table
 from benchmarks.large import FRAMES, LIGHTS, MEGAPIXELS, large_table
 from benchmarks.left_out import left_out_table
 from benchmarks.materials import material_table
 from benchmarks.on_set import fault_table, time_table
+from benchmarks.paired import paired_rows
 from benchmarks.relighting import relighting_table
 from benchmarks.rig import rig_table
 from benchmarks.search_speed import search_rows
@@ -147,6 +151,21 @@ def estimate(_: argparse.Namespace) -> list[str]:
     return estimate_rows()
 
 
+def asked(_: argparse.Namespace) -> list[str]:
+    """Say per megapixel what products ask of a device."""
+    return asked_rows()
+
+
+def registers(_: argparse.Namespace) -> list[str]:
+    """Compare registers and warps of the hottest kernels with what launch bounds would make of them."""
+    return register_rows()
+
+
+def paired(given: argparse.Namespace) -> list[str] | None:
+    """Compare the processor seconds of products with an older version's."""
+    return None if given.before is None else paired_rows(given.before)
+
+
 def tof(_: argparse.Namespace) -> list[str]:
     """Measure the range errors of time of flight."""
     return [*accuracy_rows(), "", *bound_rows()]
@@ -211,6 +230,9 @@ SECTIONS: dict[str, tuple[str, Section]] = {
     "speed": ("Speed", speed),
     "gpu": ("On a GPU", gpu),
     "estimate": ("Estimate for a GPU", estimate),
+    "asked": ("Asked of a device", asked),
+    "registers": ("Registers of kernels", registers),
+    "paired": ("Speed beside an older version", paired),
     "tof": ("Depth from time of flight", tof),
     "depth_speed": ("Speed of depth", depth_speed),
     "demo": ("The demo", demo),
@@ -237,6 +259,7 @@ def main() -> None:
                                                            "two_parts and figure of samples/make_parts.py")
     parser.add_argument("--rig", type=Path, help="folder with the sets of samples/make_rig.py")
     parser.add_argument("--large", type=Path, help="folder where about 40 GB may be written and are removed again")
+    parser.add_argument("--before", type=Path, help="checkout of an older version, to compare the speed with")
     parser.add_argument("--megapixels", type=float, default=MEGAPIXELS, help="of --large")
     parser.add_argument("--lights", type=int, default=LIGHTS, help="of --large")
     parser.add_argument("--frames", type=int, default=FRAMES, help="of --large")

@@ -275,15 +275,15 @@ class Repeated:
     """
 
     def __init__(self, work: Callable[[], None], device: str) -> None:
-        self._work, self._device, self._graph = work, device, None
+        self._work, self.device, self._graph = work, device, None
 
     def run(self) -> None:
         """Do the launches; returns as `launch` does."""
-        if not has_graphs(self._device):
+        if not has_graphs(self.device):
             self._work()
             return
         if self._graph is None:
-            with wp.ScopedCapture(self._device) as capture:
+            with wp.ScopedCapture(self.device) as capture:
                 self._work()
             self._graph = capture.graph
         wp.capture_launch(self._graph)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from service.requests.shade import PointLight, ShadeRequest
 from service.requests.solve import Method, SolveRequest
 from service.scans.fusion.fuse import fuse
 from service.scans.points.ply_points import read_ply_points
+from service.solve.height import interreflection
+from service.solve.methods import settling
 from service.solve.solve import solve
 from stage.formats import exr
 from tests import emulated_device
@@ -37,8 +40,11 @@ from tests.service.depth.tof.test_tof import cw_frames, pulsed_frames
 from tests.service.depth.tof.test_tof import write as write_tof
 
 TABLE = Path(__file__).with_name("device_counts.txt")
-SIDES = 16, 48
-"""Pixels along the shorter side of the scenes that are counted."""
+SIDES = 16, 48, 64
+"""Pixels along the shorter side of the scenes that are counted. From 48 on, what is bounded by a number of pixels or patches is as many."""
+PATCHES = 16
+"""Patches of bounced light, and blocks whose middles settle it: as many at both sizes, and of more pixels than stand for a patch, as at
+the sizes of captures."""
 LIGHTS, FRAMES = 96, 3
 """The numbers of lights of the scene under distant lights, and of its relit frames."""
 HALF = 2
@@ -73,6 +79,20 @@ class Way(NamedTuple):
     """Write the scene into a folder, with so many pixels along its shorter side; return the bytes that were captured."""
     run: Callable[[Path, Path, str, Counting], object]
     """Make results of the scene in another folder, on a device."""
+    pixels: Callable[[int], int]
+    """Returns how many pixels the images of the scene have together that show different places."""
+
+
+def square(side: int) -> int:
+    return side * side
+
+
+def wide(side: int) -> int:
+    return side * (side * 4 // 3)
+
+
+def around(side: int) -> int:
+    return 6 * 3 * side * (9 * side // 4)
 
 
 def distant(folder: Path, side: int) -> int:
@@ -164,18 +184,18 @@ def fusing(folder: Path, out: Path, device: str, progress: Counting) -> object:
 
 
 WAYS = {
-    "solve lambert": Way(distant, solving(Method.LAMBERT)),
-    "solve robust": Way(distant, solving(Method.ROBUST)),
-    "solve svbrdf": Way(distant, solving(Method.SVBRDF)),
-    "solve near lights": Way(near, solving(Method.ROBUST)),
-    "relight cells": Way(distant, relighting(guided=False)),
-    "relight guided": Way(distant, relighting(guided=True)),
-    "shade": Way(distant, shading),
-    "depth patterns": Way(patterns, ranging),
-    "depth laser": Way(lasers, ranging),
-    "depth tof cw": Way(continuous, ranging),
-    "depth tof pulsed": Way(pulsed, ranging),
-    "fuse": Way(scans, fusing),
+    "solve lambert": Way(distant, solving(Method.LAMBERT), square),
+    "solve robust": Way(distant, solving(Method.ROBUST), square),
+    "solve svbrdf": Way(distant, solving(Method.SVBRDF), square),
+    "solve near lights": Way(near, solving(Method.ROBUST), square),
+    "relight cells": Way(distant, relighting(guided=False), square),
+    "relight guided": Way(distant, relighting(guided=True), square),
+    "shade": Way(distant, shading, square),
+    "depth patterns": Way(patterns, ranging, wide),
+    "depth laser": Way(lasers, ranging, wide),
+    "depth tof cw": Way(continuous, ranging, wide),
+    "depth tof pulsed": Way(pulsed, ranging, wide),
+    "fuse": Way(scans, fusing, around),
 }
 
 
@@ -201,10 +221,16 @@ class Row(NamedTuple):
         return f"{self.way:<18}{self.side:>4}{self.captured:>10}  {self.stage:<18}{numbers}"
 
 
+def run(way: str, folder: Path, out: Path, device: str, progress: Counting) -> None:
+    """Run a way on a device, with as many patches and blocks at both sizes: at the sizes of captures their number is bounded."""
+    with patch.object(interreflection, "PATCHES", PATCHES), patch.object(settling, "BLOCKS", PATCHES):
+        WAYS[way].run(folder, out, device, progress)
+
+
 def count(way: str, side: int, captured: int, folder: Path, out: Path, device: str) -> list[Row]:
     """Run a way on a device, and return the rows of its stages, which only the emulated device counts."""
     progress = Counting()
-    WAYS[way].run(folder, out, device, progress)
+    run(way, folder, out, device, progress)
     return [Row(way, side, captured, stage, tuple(counted[name] for name in emulated_device.COUNTED))
             for stage, counted in progress.close().items()]
 

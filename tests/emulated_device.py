@@ -17,7 +17,7 @@ import itertools
 import random
 from collections import Counter
 from collections.abc import Iterator
-from threading import RLock
+from threading import RLock, local
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ import warp as wp
 from warp._src import context
 from warp._src.codegen import StructInstance
 
+from kernels import device as devices
 from tests import emulated_streams
 from tests.emulated_streams import LAUNCHES, PINNED, Event, Stream
 
@@ -40,14 +41,18 @@ MEMORY = 8 << 30
 
 plain_launch, plain_load, plain_total_memory = context.launch, context.Module.load, context.Device.total_memory
 plain_copy, plain_empty, plain_from_data, plain_free_memory = wp.copy, wp.empty, wp.array._init_from_data, context.Device.free_memory
+plain_repeated = devices.Repeated.run
 WAITS = "synchronize", "synchronize_device", "synchronize_stream", "synchronize_event"
 
-COUNTED = {"launches": "launches of kernels", "waits": "copies to the host, and calls that do nothing but wait for the device",
+COUNTED = {"launches": "launches of kernels and of graphs", "graphed": "launches of kernels within graphs",
+           "waits": "copies to the host, and calls that do nothing but wait for the device",
            "up": "bytes copied to the device", "down": "bytes copied to the host",
            "touched": "bytes of the arrays that launches were given, each array once a launch"}
 counts: Counter[str] = Counter()
 """What all threads have asked of the device so far, by the names of COUNTED."""
 counts_lock = RLock()
+graph = local()
+"""Has a true `now` in a thread while it does what CUDA does as one graph; the emulated device has no graphs."""
 
 
 def note(**more: int) -> None:
@@ -139,7 +144,7 @@ class Launch:
 
     def launch(self) -> None:
         LAUNCHES.go_on()
-        note(launches=1, touched=self._touched)
+        note(**{"graphed" if getattr(graph, "now", False) else "launches": 1}, touched=self._touched)
         before = [place.copy() for place in self._memory]
         for part in reversed(self._parts):
             part.launch()
@@ -201,6 +206,17 @@ def counting_waits(synchronise: Any) -> Any:
     return wait
 
 
+def counting_graphs(repeated: devices.Repeated) -> None:
+    """Do the launches of a graph, which are one."""
+    if repeated.device == NAME:
+        note(launches=1)
+        graph.now = True
+    try:
+        plain_repeated(repeated)
+    finally:
+        graph.now = False
+
+
 def is_same(device: Any, other: Any) -> bool:
     """Compare devices; Warp compares their contexts, of which neither the CPU nor the emulated device has one."""
     return device.alias == str(other)
@@ -222,6 +238,7 @@ def install() -> None:
     wp.launch = context.launch = launch
     wp.copy = context.copy = copy_array
     wp.empty = context.empty = empty
+    devices.Repeated.run = counting_graphs
     atexit.register(Stream.forget)
     wp.Stream, wp.Event, wp.get_stream, wp.synchronize_event = Stream, Event, lambda device=None: LAUNCHES, Event.synchronize
     for name in WAITS:

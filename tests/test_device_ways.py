@@ -4,13 +4,16 @@ of the device is what device_counts.txt says.
 A change that asks for more or less writes the table anew: python -m tests.device_ways.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from benchmarks.device_asked import asked_rows
 from tests import emulated_device
-from tests.device_ways import SIDES, WAYS, Counting, count, read, results
+from tests.device_ways import SIDES, WAYS, Counting, count, read, results, run
 
-SMALL, LARGE = SIDES
+SMALL, *LARGE = SIDES
 ITERATED = "diagnosis", "height", "surface", "start"
 """Stages whose solvers stop at a residual: how many iterations they take depends on the last bits of the processor, and so do all counts
 but the bytes uploaded."""
@@ -38,7 +41,7 @@ def compare(rows, way, side):
 def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
     """Lanes of a pack stop their iterations together, and packs differ in width: a value in a hundred may be off by 1e-3 of the largest."""
     captured = WAYS[way].write(tmp_path, SMALL)
-    WAYS[way].run(tmp_path, tmp_path / "cpu", "cpu", Counting())
+    run(way, tmp_path, tmp_path / "cpu", "cpu", Counting())
     rows = count(way, SMALL, captured, tmp_path, tmp_path / "out", device)
     known, found = results(tmp_path / "cpu"), results(tmp_path / "out")
     assert known and known.keys() == found.keys()
@@ -49,9 +52,15 @@ def test_a_product_finds_what_it_finds_on_the_cpu(way, device, tmp_path):
         compare(rows, way, SMALL)
 
 
-@pytest.mark.long
+@pytest.mark.parametrize("side", LARGE)
 @pytest.mark.parametrize("way", WAYS)
-def test_what_a_larger_scene_asks_of_the_device(way, device, tmp_path):
+def test_what_a_larger_scene_asks_of_the_device(way, side, device, tmp_path):
     if device != emulated_device.NAME:
         pytest.skip("counted on the emulated device")
-    compare(count(way, LARGE, WAYS[way].write(tmp_path, LARGE), tmp_path, tmp_path / "out", device), way, LARGE)
+    compare(count(way, side, WAYS[way].write(tmp_path, side), tmp_path, tmp_path / "out", device), way, side)
+
+
+def test_the_figures_per_megapixel_are_those_of_the_counts(device):
+    page = (Path(__file__).parents[1] / "docs" / "figures.md").read_text(encoding="utf-8")
+    section = page.partition("## Asked of a device\n\n")[2]
+    assert section.startswith("\n".join(asked_rows())), "python -m benchmarks.figures --only asked writes it anew"

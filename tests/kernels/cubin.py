@@ -5,6 +5,7 @@ format, attribute, size and value), the instructions, of 16 bytes each since Vol
 """
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ REGISTERS, FRAME = 0x2F, 0x11
 """Attributes of a kernel: registers of a thread, and bytes of its stack."""
 VALUED = 4
 """Format of attributes whose value follows them."""
-LOAD_LOCAL, STORE_LOCAL, LOAD_GLOBAL = 0x983, 0x387, 0x981
+LOAD_LOCAL, STORE_LOCAL, LOAD_GLOBAL, NOTHING = 0x983, 0x387, 0x981, 0x918
 """Operation codes, the lowest 12 bits of an instruction."""
 WIDTHS = 8, 8, 16, 16, 32, 64, 128, 128
 """Bits that a load moves, by bits 73 to 75 of its instruction."""
@@ -36,17 +37,40 @@ class Resources(NamedTuple):
         return min(65536 // per_block * CUDA_BLOCK, 2048) // 32
 
 
-def resources(path: Path) -> Resources:
-    """Return what the kernels of a cubin take."""
+class Issued(NamedTuple):
+    """How the instructions of a kernel follow each other."""
+
+    instructions: int
+    stalls: int
+    """Cycles that pass after each before the next, in all."""
+
+
+def _sections(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the names of a file's sections with what is in them."""
     data = path.read_bytes()
     table, = struct.unpack_from("<Q", data, 0x28)
     size, count, names_at = struct.unpack_from("<HHH", data, 0x3A)
     headers = [struct.unpack_from("<IIQQQQIIQQ", data, table + k * size) for k in range(count)]
     bodies = [data[header[4] : header[4] + header[5]] for header in headers]
+    for header, body in zip(headers, bodies, strict=True):
+        yield bodies[names_at][header[0] :].split(b"\0", 1)[0], body
+
+
+def issued(path: Path) -> Issued:
+    """Return how the instructions of the longest kernel of a cubin follow each other."""
+    kernels = [list(struct.iter_unpack("<QQ", body)) for name, body in _sections(path) if name.startswith(b".text.")]
+    for codes in kernels:
+        while codes and codes[-1][0] & 0xFFF == NOTHING:  # fills the section
+            codes.pop()
+    codes = max(kernels, key=len)
+    return Issued(len(codes), sum(high >> 41 & 0xF for _, high in codes))
+
+
+def resources(path: Path) -> Resources:
+    """Return what the kernels of a cubin take."""
     found = []
     attributes: dict[int, int] = {REGISTERS: 0, FRAME: 0}
-    for header, body in zip(headers, bodies, strict=True):
-        name = bodies[names_at][header[0] :].split(b"\0", 1)[0]
+    for name, body in _sections(path):
         if name == b".nv.info":
             at = 0
             while at < len(body):
