@@ -191,25 +191,35 @@ def joined_groups(count: int, pairs: Iterable[Pair]) -> list[set[int]]:
     return sorted(groups, key=lambda members: (-len(members), min(members)))
 
 
-def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
-    """Return first poses: along the joined pairs with the most agreeing loops and the most matches, from that of the reference."""
+def worths(pairs: Sequence[Pair]) -> dict[tuple[int, int], float]:
+    """Return what joined pairs are worth, by both orders of their scans: the more loops of three agree, and the more points match."""
     relative: dict[tuple[int, int], np.ndarray] = {}
+    beside: dict[int, set[int]] = defaultdict(set)
     worth: dict[tuple[int, int], float] = {}
     for pair in pairs:
         assert pair.fit is not None
         relative[pair.a, pair.b], relative[pair.b, pair.a] = pair.fit.pose, inverse(pair.fit.pose)
-    beside: dict[int, set[int]] = defaultdict(set)
-    for a, b in relative:
-        beside[a].add(b)
+        beside[pair.a].add(pair.b)
+        beside[pair.b].add(pair.a)
     for pair in pairs:
         assert pair.fit is not None
         loops = [_closed(relative[pair.a, pair.b], relative[pair.b, third], relative[third, pair.a], pair.fit.pivot)
                  for third in beside[pair.a] & beside[pair.b]]
         share = (sum(loops) + 0.5) / (len(loops) + 1)
         worth[pair.a, pair.b] = worth[pair.b, pair.a] = share * (1 + sum(loops)) * np.sqrt(pair.fit.matches)
+    return worth
+
+
+def tree_poses(pairs: Sequence[Pair], members: set[int], reference: int, pose: np.ndarray) -> dict[int, np.ndarray]:
+    """Return first poses: along the joined pairs that are worth most, from that of the reference."""
+    worth = worths(pairs)
+    relative: dict[tuple[int, int], np.ndarray] = {}
+    for pair in pairs:
+        assert pair.fit is not None
+        relative[pair.a, pair.b], relative[pair.b, pair.a] = pair.fit.pose, inverse(pair.fit.pose)
     poses = {reference: pose}
     while len(poses) < len(members):
-        a, b = max(((a, b) for a in poses for b in beside[a] if b not in poses), key=lambda ab: (worth[ab], -ab[0], -ab[1]))
+        a, b = max(((a, b) for a, b in relative if a in poses and b not in poses), key=lambda ab: (worth[ab], -ab[0], -ab[1]))
         poses[b] = poses[a] @ relative[a, b]
     return {number: poses[number] for number in sorted(poses)}
 

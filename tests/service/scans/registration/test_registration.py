@@ -174,6 +174,15 @@ def test_a_statue_whose_body_is_symmetric_is_joined_all_around():
     assert np.linalg.norm(wrong[:, 3:], axis=1).max() < 0.1 * MM and np.degrees(np.linalg.norm(wrong[:, :3], axis=1)).max() < 0.02
 
 
+@pytest.mark.long
+def test_no_coarse_scan_of_such_a_statue_is_placed_turned():
+    """Wrong pairs close loops of their own here; scans further apart would have parts where the other camera saw through."""
+    views = statues(12, 96, range(12))
+    found = registered(views)
+    assert len(found.poses) >= 10
+    assert np.degrees(np.linalg.norm(off(views, found)[:, :3], axis=1)).max() < 0.1
+
+
 def test_outliers_do_not_move_poses():
     views = seen(figure, 0, 40)
     scans = []
