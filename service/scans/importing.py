@@ -5,31 +5,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from service.requests.imports.scans import ScansImport, ScanUnit
+from service.scans.depth_frames import write_frames
 from service.scans.points.ply_points import read_ply_points
 from service.scans.points.point_files import read_point_scans
 from service.scans.points.rigid import nearest_rigid
 from service.scans.viewpoints import LEAST_POINTS, find_viewpoints
-from stage.capture.camera import Camera
 from stage.errors import ManifestError, ResultError, storage
-from stage.formats.images import read_recorded
-from stage.formats.ply import POINTS_FILE, PointCloud, write_ply
+from stage.formats.ply import PointCloud, write_ply
+from stage.importers.depth_frames import DEPTH, frame_layout
 from stage.importers.guess import POINT_FILES
 from stage.importers.layout import Imported, natural_order, place_images, read_lines
-from stage.results.depth_maps import DEPTH_FILE, DepthMaps
 from stage.sets.scan_set import SCAN_SET_FILE, UNITS_M, ScanEntry, ScanSet, write_scan_set
-from stage.transforms import OPENCV_FROM_CAMERA, ROTATION_ROUNDING, off_rotation, scaled_rotation
+from stage.transforms import ROTATION_ROUNDING, off_rotation, scaled_rotation
 
-DEPTH = ".depth.png"
-INTRINSICS = "camera-intrinsics.txt"
-NONE = (0, 65535)
-"""Values of a depth image that are no depth."""
-EDGE, EDGE_RADIUS_PX = 0.03, 3
-"""Depths in a neighbourhood that differ by this part are an edge: a plane seen at 77° by a camera of 60° is none."""
-SIGMA_PER_M2 = 0.005
-"""σ of a depth over the square of the depth, 1/m: between .004 and .006 the pairs of six real frames of a room are explained."""
 FAR_AWAY = 100.0
 """Coordinates of more than so many times the size of a scan are counted from another origin."""
 LARGE_M, SMALL_M = 50.0, 0.001
@@ -66,17 +56,18 @@ def import_scans(request: ScansImport) -> Imported:
     metric = [name for name in names if name.lower().endswith(".e57")]
     if metric and request.unit is not ScanUnit.M:
         raise ManifestError(f"{source / metric[0]}: E57 files are in metres: leave --unit {request.unit} out, and import other files apart")
-    images, tables = depth_names(listed), [source / name for name in listed if name.lower().endswith(".conf")]
+    layout, tables = frame_layout(source), [source / name for name in listed if name.lower().endswith(".conf")]
     path = folder / SCAN_SET_FILE
     converted = [name for name in names if not name.lower().endswith(".ply")]
-    if folder == source and (converted or (images and not names)):
+    if folder == source and (converted or (layout and not names)):
         raise ManifestError(f"{source}: {converted[0] if converted else 'depth images'} are converted: give another folder for the scans")
-    if images and not names:
-        frames, said = write_frames(request, images)
+    if layout is not None and not names:
+        frames, said = write_frames(request, layout)
         write_scan_set(ScanSet(schema="relit.scan-set/1", name=source.resolve().name, scans=tuple(frames)), path)
         return Imported(path, tuple(said))
     if not names:
-        raise ManifestError(f"{source}: holds neither point files ({', '.join(POINT_FILES)}) nor images named *{DEPTH}")
+        raise ManifestError(f"{source}: holds neither point files ({', '.join(POINT_FILES)}) nor images named *{DEPTH}, nor frames of "
+                            "TUM or Redwood")
     table = request.poses or (tables[0] if len(tables) == 1 else None)
     poses = {} if table is None else _conf_poses(table)
     scans, moved = _read(request, [name for name in names if name in poses] or names, poses)
@@ -211,87 +202,3 @@ def _conf_poses(path: Path) -> dict[str, np.ndarray]:
     if not poses:
         raise ManifestError(f"{path}: names no scans in lines of bmesh")
     return poses
-
-
-# Import of the frames of a depth camera beside a colour camera (Kinect and its like): depth images, intrinsics and poses, as scans.
-#
-# A pixel at an edge of depth shows a mixture of both sides, which is no surface, and is left out. The noise of structured light grows with
-# the square of the distance (Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors 12, 2012, equation 10: σ =
-# .0014 z² for z in metres). What the calibration of the depth leaves is alike over parts of the image, and larger.
-
-def depth_names(names: list[str]) -> list[str]:
-    """Return the names of depth images among those of a folder."""
-    return [name for name in names if name.lower().endswith(DEPTH)]
-
-
-def write_frames(request: ScansImport, names: list[str]) -> tuple[list[ScanEntry], list[tuple[str, str]]]:
-    """Write each frame as a folder with a depth.exr, and with the colours as points.ply, and return the scans and what was understood.
-    Raises ManifestError: intrinsics are missing, or a pose or an image is wrong; names the file."""
-    folder, chosen = request.source, names[:: request.every]
-    matrix = _matrix(folder / INTRINSICS, 3)
-    if matrix is None:
-        raise ManifestError(f"{folder}: has depth images and no {INTRINSICS}: write the 3 x 3 matrix of the depth camera into it")
-    entries, turned, dropped, total = [], 0.0, 0, 0
-    for name in chosen:
-        stem = name[: -len(DEPTH)]
-        recorded = read_recorded(folder / name)
-        if recorded.dtype != np.uint16:
-            raise ManifestError(f"{folder / name}: is no image of 16 bits, as depths are")
-        depth = recorded[..., 0].astype(np.float64)
-        there = ~np.isin(depth, NONE) & np.isfinite(depth)
-        depth = np.where(there, depth * request.depth_unit_m, 0)
-        kept = there & ~_edges(depth, there)
-        dropped, total = dropped + int((there & ~kept).sum()), total + int(there.sum())
-        if not kept.any():
-            raise ManifestError(f"{folder / name}: holds no depth")
-        camera = Camera(projection="perspective", resolution=(depth.shape[1], depth.shape[0]), focal_px=(matrix[0, 0], matrix[1, 1]),
-                        principal_px=(matrix[0, 2] + 0.5, matrix[1, 2] + 0.5))
-        maps = DepthMaps(camera=camera, mask=kept, depth=np.where(kept, depth, 0).astype(np.float32),
-                         sigma=np.where(kept, SIGMA_PER_M2 * depth**2, 0).astype(np.float32))
-        maps.write(request.folder / stem / DEPTH_FILE)
-        if (colours := _colours(folder, stem, kept)) is not None:
-            write_ply(PointCloud(camera.points(-maps.depth)[kept].astype(np.float32), colours), request.folder / stem / POINTS_FILE)
-        pose = _matrix(folder / f"{stem}.pose.txt", 4)
-        if pose is not None:
-            turned = max(turned, off_rotation(pose))
-            pose = nearest_rigid(pose)
-            pose[:3, :3] = pose[:3, :3] @ OPENCV_FROM_CAMERA
-        entries.append(ScanEntry.model_validate({"name": stem, "path": stem, **({} if pose is None else {"scan_to_world": pose.tolist()})}))
-    placed = sum(entry.scan_to_world is not None for entry in entries)
-    facts = [("scans", f"{len(entries)} depth images of {depth.shape[1]}x{depth.shape[0]} pixels, {request.depth_unit_m:g} m a unit"),
-             ("edges", f"{dropped / total:.1%} of the depths lie at edges, where they mix two surfaces, and are left out"),
-             ("sigma", f"{SIGMA_PER_M2:g} z², z in metres, of a Kinect"),
-             ("poses", f"{placed} of {len(entries)} from .pose.txt files")]
-    if turned > ROTATION_ROUNDING:
-        facts.append(("turned", f"rotations were off orthonormal by up to {turned:.1g}: the nearest are taken"))
-    return entries, facts
-
-
-def _edges(depth: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Return the pixels [h, w] near which depths jump."""
-    size = 2 * EDGE_RADIUS_PX + 1
-    farthest = maximum_filter(np.where(there, depth, 0), size)
-    nearest = minimum_filter(np.where(there, depth, np.inf), size)
-    return farthest - nearest > EDGE * depth
-
-
-def _colours(folder: Path, stem: str, kept: np.ndarray) -> np.ndarray | None:
-    """Return the colours [n, 3] uint8 of pixels from the colour image of the same size beside a depth image, or None."""
-    found = next((path for ending in ("jpg", "png", "jpeg") if (path := folder / f"{stem}.color.{ending}").is_file()), None)
-    if found is None:
-        return None
-    recorded = read_recorded(found)
-    return recorded[kept] if recorded.shape[:2] == kept.shape and recorded.dtype == np.uint8 else None
-
-
-def _matrix(path: Path, size: int) -> np.ndarray | None:
-    """Return a matrix of numbers in a text file, or None where there is no file."""
-    if not path.is_file():
-        return None
-    try:
-        matrix = np.array([[float(word) for word in line.replace(",", " ").split()] for _, line in read_lines(path)])
-    except ValueError:
-        matrix = np.empty(0)
-    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
-        raise ManifestError(f"{path}: must hold a matrix of {size} x {size} numbers")
-    return matrix

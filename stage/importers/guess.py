@@ -15,6 +15,7 @@ from stage.errors import ManifestError, storage
 from stage.importers import guess_images, kinect
 from stage.importers.camera_options import AMBIENT_WORDS, MASK_WORDS, refuse_twins, words_of
 from stage.importers.content import Pictures
+from stage.importers.depth_frames import frame_layout, read_intrinsics
 from stage.importers.folder import Folder, Guess, arrays_of, encoding, group_of, lit, made, tried
 from stage.importers.laser import NAMES as PLANES
 from stage.importers.laser import OFF_WORDS, read_planes
@@ -114,11 +115,14 @@ def _kinect(folder: Folder) -> Guess | None:
 
 
 def _scans(folder: Folder) -> Guess | None:
-    depths = [name for name in folder.names if name.lower().endswith(".depth.png")]
-    if depths:
-        return made("frames of a depth camera", f"it has {len(depths)} depth images, as {depths[0]}", ["scans", folder.path], folder.path,
-                    solve=False, assumed=("depths are in millimetres: else --depth-unit-m",))._replace(
-                        then="relit register SCAN_SET --out registered")
+    if (layout := frame_layout(folder.path)) is not None:
+        words: tuple[object, ...] = ("scans", folder.path)
+        assumed = [f"a unit of depth is {layout.unit_m:g} m: else --depth-unit-m"]
+        if read_intrinsics(folder.path) is None:
+            words += ("--intrinsics", "FX,FY,CX,CY")
+            assumed.append("FX,FY,CX,CY is the depth camera in pixels, of the first Kinect about 525,525,319.5,239.5")
+        return made("frames of a depth camera", f"it has {layout.value}", [*words], folder.path, solve=False,
+                    assumed=tuple(assumed))._replace(then="relit register SCAN_SET --out registered")
     clouds = [name for name in folder.names if name.lower().endswith(POINT_FILES)]
     if not clouds or folder.pictures:
         return None

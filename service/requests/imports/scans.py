@@ -26,9 +26,13 @@ class ScansImport(ImportRequest):
     """The unit of the coordinates."""
     viewpoint_m: Annotated[tuple[Finite, Finite, Finite] | None, Commas, Spelling(flag="--viewpoint", metavar="X,Y,Z")] = None
     """Where the scanner stood in the frame of every scan, metres; None: it is estimated."""
-    poses: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE.conf")] = None
-    """Poses of the scans, in the format of the Stanford 3D Scanning Repository; None: the only .conf file of SRC, if there is one."""
+    poses: Annotated[Path | None, Role.INPUT, Spelling(metavar="FILE")] = None
+    """Poses of the scans: a .conf file of the Stanford 3D Scanning Repository, of frames groundtruth.txt or a trajectory .log; None: that
+    of SRC, if there is one."""
+    intrinsics_px: Annotated[tuple[Positive, Positive, Finite, Finite] | None, Commas, Spelling(flag="--intrinsics", metavar="FX,FY,CX,CY")
+                             ] = None
+    """Focal lengths and middle of the depth camera, pixels, whose centres have whole numbers; None: those of SRC."""
     every: Count = 1
     """Take the first of so many depth images."""
-    depth_unit_m: Positive = 0.001
-    """Metres in one unit of a depth image."""
+    depth_unit_m: Positive | None = None
+    """Metres in one unit of a depth image; None: 0.001, of TUM's 0.0002."""

@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pye57
 import pytest
@@ -13,7 +12,6 @@ from service.scans.points.rigid import inverse
 from service.scans.viewpoints import find_viewpoints
 from stage.formats.las import write_las
 from stage.formats.ply import PointCloud, read_ply, write_ply
-from stage.results.depth_maps import DepthMaps
 from tests.scenes.turntable import DISTANCE_M, View, figure, turntable
 from tests.service.scans.test_register import off
 
@@ -133,33 +131,6 @@ def test_a_missing_viewpoint_whose_origin_lies_among_the_points_is_told(relit, t
     relit("register", folder, "--out", tmp_path / "out")
     said = json.loads((tmp_path / "out" / "report.json").read_text())["warnings"] if (tmp_path / "out" / "report.json").exists() else []
     assert any("s0, s1: viewpoint_m is missing" in warning for warning in said)
-
-
-def test_frames_of_a_depth_camera(relit, tmp_path, views):
-    """Millimetres, edges that are left out, and poses in the axes of OpenCV, a little off a rotation."""
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    focal = views[0].camera.focal_px[0]
-    height, width = views[0].mask.shape
-    (folder / "camera-intrinsics.txt").write_text(f"{focal} 0 {width / 2 - 0.5}\n0 {focal} {height / 2 - 0.5}\n0 0 1\n")
-    for number, view in enumerate(views[:2]):
-        cv2.imwrite(str(folder / f"f{number}.depth.png"), np.where(view.mask, 1000 * view.true_depth, 0).round().astype(np.uint16))
-        pose = view.world_from_scan @ np.diag([1.0, -1, -1, 1])
-        pose[:3, :3] *= 1 + 1e-4
-        np.savetxt(folder / f"f{number}.pose.txt", pose)
-    said = relit.done("import", "scans", folder, tmp_path / "set").out
-    assert "2 depth images" in said and "nearest" in said
-    scans = json.loads((tmp_path / "set" / "scan-set.json").read_text())["scans"]
-    for entry, view in zip(scans, views, strict=False):
-        assert np.array(entry["scan_to_world"]) == pytest.approx(view.world_from_scan, abs=1e-6)
-        depth = DepthMaps.read(tmp_path / "set" / entry["path"] / "depth.exr")
-        assert np.abs(depth.depth - view.true_depth)[depth.mask].max() < 0.0006  # half a millimetre is rounded
-        assert 0.3 < depth.mask.sum() / view.mask.sum() < 1 and not depth.mask[~view.mask].any()
-        points, truth = depth.camera.points(-depth.depth), view.camera.points(-view.true_depth)
-        assert np.abs(points - truth)[depth.mask].max() < 0.001
-    assert "depth images are converted" in relit.refused("import", "scans", folder)
-    (folder / "camera-intrinsics.txt").write_text("1 2 3")
-    assert "camera-intrinsics.txt" in relit.refused("import", "scans", folder, tmp_path / "other")
 
 
 def test_one_point_is_no_scan(relit, tmp_path):
